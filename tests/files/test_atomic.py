@@ -1,0 +1,132 @@
+"""A file is the old one or the new one, whatever happens in between."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.atomic import (
+    environment_failures,
+    fault_point,
+    publish,
+    sha256_of,
+    temporary_beside,
+    write_text_atomic,
+)
+
+ROOT = Path(__file__).parents[2]
+
+
+def run_python(code, *arguments, fault=""):
+    search = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": search, "USDBRDF_FAULT": fault},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_publish_replaces_and_readers_keep_the_old_file(tmp_path):
+    final, staged = tmp_path / "final", tmp_path / "staged"
+    final.write_text("old")
+    staged.write_text("new")
+    with final.open() as reader:
+        publish(staged, final)
+        assert reader.read() == "old"
+    assert final.read_text() == "new"
+    assert not staged.exists()
+
+
+def test_sha256(tmp_path):
+    content = bytes(range(256)) * 10_000
+    (tmp_path / "x").write_bytes(content)
+    assert sha256_of(tmp_path / "x") == hashlib.sha256(content).hexdigest()
+
+
+def test_text_is_utf8_and_has_ordinary_permissions(tmp_path):
+    path = tmp_path / "椅子.txt"
+    write_text_atomic(path, "é\n")
+    assert path.read_bytes() == b"\xc3\xa9\n"
+    (tmp_path / "plain").touch()
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+
+
+def test_long_names(tmp_path):
+    path = tmp_path / ("x" * 250 + ".json")
+    write_text_atomic(path, "a")
+    assert path.read_text() == "a"
+
+
+def test_failure_leaves_the_old_file_and_no_litter(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with contextlib.suppress(RuntimeError), temporary_beside(path) as staged:
+        staged.write_text("half")
+        raise RuntimeError
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+@pytest.mark.parametrize("side", ["before", "after"])
+def test_kill_around_the_rename(tmp_path, side):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    code = (
+        "import sys; from pathlib import Path; from usdbrdf.files.atomic import write_text_atomic;"
+        "write_text_atomic(Path(sys.argv[1]), 'new')"
+    )
+    assert run_python(code, path, fault=f"kill@publish:{side}_replace").returncode == -9
+    assert path.read_text() == ("old" if side == "before" else "new")
+
+
+def test_fault_at_the_kth_pass(monkeypatch):
+    monkeypatch.setenv("USDBRDF_FAULT", "enospc@test:kth:3")
+    for _ in range(2):
+        fault_point("test:kth")
+    with pytest.raises(OSError, match="No space left"):
+        fault_point("test:kth")
+    fault_point("test:kth")
+    fault_point("test:other")
+
+
+def test_really_full_disk(tmp_path):
+    """A limit on the file size fails in write() as a full disk does, at half the content."""
+    code = """
+import resource, sys
+from pathlib import Path
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.atomic import environment_failures, write_text_atomic
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+try:
+    with environment_failures("stamp"):
+        write_text_atomic(Path(sys.argv[1]), "x" * 10000)
+except EnvironmentFailure as error:
+    print(error)
+"""
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    said = run_python(code, path).stdout
+    assert said.startswith("stamp: ")
+    assert said.endswith("[environment.io]\n")
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+def test_errors_of_the_machine_are_translated():
+    with pytest.raises(EnvironmentFailure, match="out of memory"), environment_failures("x"):
+        raise MemoryError
+    with pytest.raises(EnvironmentFailure, match="Permission"), environment_failures("x"):
+        raise PermissionError(13, "Permission denied", "/a")
+    with pytest.raises(BrokenPipeError), environment_failures("x"):
+        raise BrokenPipeError
+    with pytest.raises(ValueError, match="ours"), environment_failures("x"):
+        raise ValueError("ours")

@@ -1,0 +1,79 @@
+"""Colour conversions against the published formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files import colour
+from usdbrdf.files.colour import known_encodings, to_display_srgb8, to_working_space
+
+
+def srgb_from_linear(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+@pytest.fixture
+def ramp():
+    return np.linspace(0, 1, 3 * 4096, dtype=np.float32).reshape(64, 64, 3)
+
+
+def test_working_space_is_copied_unchanged(ramp):
+    ramp[0, 0] = (-1, 1e5, np.nan)
+    ramp.setflags(write=False)
+    copy = to_working_space(ramp, "lin_rec709_scene")
+    assert np.array_equal(copy, ramp, equal_nan=True)
+    assert not np.shares_memory(copy, ramp)
+
+
+def test_srgb_is_decoded(ramp):
+    encoded = srgb_from_linear(ramp.astype(np.float64)).astype(np.float32)
+    assert np.allclose(to_working_space(encoded, "srgb_rec709_scene"), ramp, atol=2e-6)
+
+
+def test_acescg_white_and_red():
+    white_and_red = np.array([[[1, 1, 1], [0.61309741, 0.07019372, 0.02061559]]], np.float32)
+    expected = [[[1, 1, 1], [1, 0, 0]]]
+    assert np.allclose(to_working_space(white_and_red, "lin_ap1_scene"), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("encoding", known_encodings())
+def test_white_stays_white(encoding):
+    white = np.ones((2, 2, 3), np.float32)
+    assert np.allclose(to_working_space(white, encoding), 1, atol=1e-4)
+
+
+def test_non_contiguous_pixels(ramp):
+    assert np.array_equal(
+        to_working_space(ramp[::2, ::-1], "lin_ap1_scene"),
+        to_working_space(ramp, "lin_ap1_scene")[::2, ::-1],
+    )
+
+
+def test_unknown_encoding_names_the_known():
+    with pytest.raises(InputRefused, match=r"'AdobeRGB'.+lin_rec709_scene.+\[colour\.encoding\]$"):
+        to_working_space(np.zeros((1, 1, 3), np.float32), "AdobeRGB")
+
+
+def test_wrong_shape():
+    with pytest.raises(UsdBrdfError, match=r"pixels\.shape=\(4, 3\)"):
+        to_working_space(np.zeros((4, 3), np.float32), "lin_ap1_scene")
+
+
+def test_display_bytes(ramp):
+    exact = 255 * srgb_from_linear(np.clip(ramp.astype(np.float64) * 2, 0, 1))
+    assert np.abs(to_display_srgb8(ramp, exposure_scale=2) - exact).max() < 0.51
+
+
+def test_display_of_what_is_no_number(ramp):
+    ramp[0, 0] = (0.5, np.nan, 0.5)
+    ramp[0, 1] = (np.inf, -np.inf, -3)
+    shown = to_display_srgb8(ramp, exposure_scale=1)
+    assert shown[0, :2].tolist() == [[255, 0, 255], [255, 0, 0]]
+
+
+def test_older_opencolorio_has_the_newest_config_of_its_own():
+    names = ["cg-config-v2.1.0_aces-v1.3_ocio-v2.3", "cg-config-v10.0.0_x", "studio-config-v11"]
+    assert colour._pick_config(names) == "cg-config-v10.0.0_x"
+    assert colour._pick_config([*names, colour._CONFIG]) == colour._CONFIG

@@ -1,0 +1,101 @@
+"""Strict JSON: what is refused, where, and that our own documents pass."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.documents import read_json, write_json
+
+
+@pytest.fixture
+def read(tmp_path):
+    def run(text, **limits):
+        path = tmp_path / "doc.json"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_json(path, **limits)
+
+    return run
+
+
+def test_plain_documents(read):
+    text = '\ufeff{"a": [1, -2.5e3, true, null, "x\\"[", "NaN"], "b": {"a": 9223372036854775807}}'
+    assert read(text) == {
+        "a": [1, -2500.0, True, None, 'x"[', "NaN"],
+        "b": {"a": 9223372036854775807},
+    }
+
+
+@pytest.mark.parametrize(
+    "number",
+    ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "9223372036854775808", "1" * 5000],
+)
+def test_numbers_that_are_not_finite(read, number):
+    text = f'{{"a": "NaN 1e999",\n\n "b": [1.0, {number}]}}'
+    with pytest.raises(InputRefused, match=r"doc\.json:3: the number .+\[document\.nonfinite\]$"):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['{"a": 1,\n"b": {"a": 2},\n"a": 3}', '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]'],
+)
+def test_key_twice(read, text):
+    with pytest.raises(InputRefused, match=r"doc\.json:3: the key 'a' .+\[document\.duplicate\]$"):
+        read(text)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"a": 1,}', "[1, 2", "nan", "{'a': 1}", '{"a": 1} x'])
+def test_malformed(read, text):
+    with pytest.raises(InputRefused, match=r"doc\.json:1: not valid JSON.+\[document\.json\]$"):
+        read(text)
+
+
+def test_line_of_malformed(read):
+    with pytest.raises(InputRefused, match=r"doc\.json:3: "):
+        read('{"a": 1,\n"b": 2\n"c": 3}')
+
+
+def test_not_utf8(read):
+    with pytest.raises(InputRefused, match=r"byte 2 is not UTF-8.+\[document\.json\]$"):
+        read(b'["\xff"]')
+
+
+def test_depth(read):
+    assert read("[" * 64 + "]" * 64)
+    for depth in (65, 200_000):
+        with pytest.raises(InputRefused, match=r"deeper than 64 levels.+\[document\.depth\]$"):
+            read("[" * depth + "]" * depth)
+    with pytest.raises(InputRefused, match="deeper than 1 "):
+        read('{"a": {}}', max_depth=1)
+
+
+def test_size(read):
+    with pytest.raises(InputRefused, match=r"11 bytes.+limit of 10.+\[document\.size\]$"):
+        read('["1234567"]', max_bytes=10)
+
+
+def test_not_a_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path, tmp_path / "fifo", tmp_path / "none", tmp_path / ("x" * 300)):
+        with pytest.raises(InputRefused, match=r"\[document\.missing\]$"):
+            read_json(path)
+
+
+def test_written_documents_read_back_and_do_not_depend_on_order(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    write_json(one, {"b": np.float64(0.1), "a": ("椅子", np.int32(3), True)})
+    write_json(two, {"a": ["椅子", 3, np.bool_(True)], "b": 0.1})
+    assert one.read_bytes() == two.read_bytes()
+    assert one.read_bytes().endswith(b"}\n")
+    assert read_json(one) == {"a": ["椅子", 3, True], "b": 0.1}
+
+
+@pytest.mark.parametrize("value", [float("nan"), object(), np.zeros(3)])
+def test_what_is_not_json_is_our_bug(tmp_path, value):
+    with pytest.raises(UsdBrdfError, match=r"\[document\.write\]$"):
+        write_json(tmp_path / "x", {"a": value})
+    assert list(tmp_path.iterdir()) == []

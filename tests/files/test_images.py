@@ -1,0 +1,354 @@
+"""Images arrive whole or not at all, and leave with the same bytes every time."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
+from usdbrdf.files import images
+from usdbrdf.files.images import (
+    image_size,
+    read_exr,
+    read_radiance,
+    write_exr,
+    write_preview_png,
+)
+
+
+@pytest.fixture
+def radiance():
+    return np.random.default_rng(1).random((24, 40, 3)).astype(np.float32) * 100
+
+
+def write_with_oiio(path, pixels, names, form="float", window=None, compression="zip"):
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), form)
+    spec.channelnames = names
+    spec.attribute("compression", compression)
+    if window is not None:
+        spec.x, spec.y, spec.full_width, spec.full_height = window
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(pixels)
+    output.close()
+
+
+# ---- writing ----
+
+
+@pytest.mark.parametrize(("channels", "names"), [(1, "Y"), (3, "RGB"), (4, "RGBA")])
+@pytest.mark.parametrize("half", [True, False])
+def test_exr_round_trip(tmp_path, channels, names, half):
+    pixels = np.random.default_rng(2).normal(0, 50, (5, 7, channels)).astype(np.float32)
+    path = tmp_path / "é [1].exr"
+    assert write_exr(path, pixels, half=half) == 0
+    expected = pixels.astype(np.float16).astype(np.float32) if half else pixels
+    assert np.array_equal(read_exr(path), expected)
+    assert image_size(path) == (7, 5, tuple(names))
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_single_channel_without_channel_axis(tmp_path):
+    write_exr(tmp_path / "a.exr", np.ones((2, 3), np.float32))
+    assert read_exr(tmp_path / "a.exr").shape == (2, 3, 1)
+
+
+def test_equal_pixels_give_equal_bytes(tmp_path, radiance):
+    for name in ("a.exr", "b.exr"):
+        write_exr(tmp_path / name, radiance)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+    assert b"2000:01:01" in (tmp_path / "a.exr").read_bytes()
+    assert b"lin_rec709_scene" in (tmp_path / "a.exr").read_bytes()
+
+
+def test_half_floats_are_clamped_and_counted(tmp_path):
+    pixels = np.array([[[65504, 65505, -1e30], [0, 1, 2]]], np.float32)
+    assert write_exr(tmp_path / "a.exr", pixels) == 2
+    assert read_exr(tmp_path / "a.exr")[0, 0].tolist() == [65504, 65504, -65504]
+    assert write_exr(tmp_path / "b.exr", pixels, half=False) == 0
+    assert np.array_equal(read_exr(tmp_path / "b.exr"), pixels)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_output_is_our_bug(tmp_path, value):
+    pixels = np.zeros((4, 4, 3), np.float32)
+    pixels[1, 2, 0] = value
+    with pytest.raises(UsdBrdfError, match=r"1 values .+not finite") as caught:
+        write_exr(tmp_path / "a.exr", pixels)
+    assert type(caught.value) is UsdBrdfError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 4, 2), (0, 4, 3), (2, 4, 4, 3)])
+def test_wrong_shape_is_our_bug(tmp_path, shape):
+    with pytest.raises(UsdBrdfError, match=r"is not \(H, W"):
+        write_exr(tmp_path / "a.exr", np.zeros(shape, np.float32))
+
+
+def test_full_disk_keeps_the_old_file(tmp_path, monkeypatch, radiance):
+    path = tmp_path / "a.exr"
+    write_exr(path, radiance)
+    before = path.read_bytes()
+
+    create = oiio.ImageOutput.create
+
+    class FullDisk:
+        """Fails as OpenImageIO does: write_image says False, close says True."""
+
+        def __init__(self, name):
+            self.output = create(name)
+
+        def open(self, name, spec):
+            return self.output.open(name, spec)
+
+        def write_image(self, pixels):
+            return False
+
+        def close(self):
+            return self.output.close() or True
+
+        def geterror(self):
+            return "Failed pwrite\nof header"
+
+    class ImageOutput:
+        create = FullDisk
+
+    monkeypatch.setattr(images.oiio, "ImageOutput", ImageOutput)
+    expected = r"cannot be written \(Failed pwrite of header\).+\[image\.write\]$"
+    with pytest.raises(EnvironmentFailure, match=expected):
+        write_exr(path, radiance + 1)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_really_full_disk_keeps_the_old_file(tmp_path, radiance):
+    """A limit on the file size fails in write() as a full disk does."""
+    code = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.images import write_exr
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+try:
+    write_exr(Path(sys.argv[1]), np.random.default_rng(0).random((64, 64, 3)).astype(np.float32))
+except EnvironmentFailure as error:
+    print(error)
+"""
+    path = tmp_path / "a.exr"
+    write_exr(path, radiance)
+    before = path.read_bytes()
+    search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    said = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        env={**os.environ, "PYTHONPATH": search},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert said.stdout.endswith("[image.write]\n"), said.stderr
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_exr_whose_header_lies_about_its_size(tmp_path, radiance):
+    path = tmp_path / "a.exr"
+    write_exr(path, radiance)
+    window = struct.pack("<iiii", 0, 0, 39, 23)
+    for side in (14_000, 60_000, 1 << 30):
+        huge = struct.pack("<iiii", 0, 0, side - 1, side - 1)
+        (tmp_path / "b.exr").write_bytes(path.read_bytes().replace(window, huge))
+        with pytest.raises(ImageRefused):
+            read_radiance(tmp_path / "b.exr")
+
+
+def test_folder_that_is_not_there(tmp_path, radiance):
+    with pytest.raises(EnvironmentFailure, match=r"cannot be written.+\[image\.write\]$"):
+        write_exr(tmp_path / "none/a.exr", radiance)
+
+
+def test_preview(tmp_path, radiance):
+    rgb8 = np.arange(5 * 6 * 3, dtype=np.uint8).reshape(5, 6, 3)
+    for name in ("a.png", "b.png"):
+        write_preview_png(tmp_path / name, rgb8)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert np.array_equal(np.rint(read_radiance(tmp_path / "a.png") * 255), rgb8)
+    with pytest.raises(UsdBrdfError, match="uint8"):
+        write_preview_png(tmp_path / "c.png", radiance)
+
+
+# ---- reading ----
+
+
+def test_nan_and_infinity_come_as_they_are(tmp_path, radiance):
+    radiance[0, 0] = (np.nan, np.inf, -np.inf)
+    write_with_oiio(tmp_path / "a.exr", radiance, ("R", "G", "B"))
+    assert np.array_equal(read_radiance(tmp_path / "a.exr"), radiance, equal_nan=True)
+
+
+def test_channels_are_chosen_by_name(tmp_path):
+    names = ("Z", "albedo.R", "B", "A", "G", "R")
+    pixels = np.tile(np.arange(6, dtype=np.float32), (3, 4, 1))
+    write_with_oiio(tmp_path / "a.exr", pixels, names)
+    assert read_radiance(tmp_path / "a.exr")[0, 0].tolist() == [5, 4, 2]
+    assert read_radiance(tmp_path / "a.exr").flags["C_CONTIGUOUS"]
+
+
+@pytest.mark.parametrize("names", [("Y",), ("U", "V"), ("R", "G"), ("a.R", "a.G", "a.B", "a.A")])
+def test_wrong_channels_are_listed(tmp_path, names):
+    write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, len(names)), np.float32), names)
+    with pytest.raises(ImageRefused, match=r"no channels R, G and B among .+\[image\.channels\]$"):
+        read_radiance(tmp_path / "a.exr")
+
+
+def test_data_window_is_placed_in_the_display_window(tmp_path):
+    pixels = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+    write_with_oiio(tmp_path / "a.exr", pixels, ("R", "G", "B"), window=(6, -1, 8, 4))
+    image = read_radiance(tmp_path / "a.exr")
+    expected = np.full((4, 8, 3), np.nan, np.float32)
+    expected[0, 6:] = pixels[1, :2]
+    assert np.array_equal(image, expected, equal_nan=True)
+    assert image_size(tmp_path / "a.exr")[:2] == (8, 4)
+
+
+def test_data_window_larger_than_the_display_window(tmp_path):
+    pixels = np.arange(6 * 7 * 3, dtype=np.float32).reshape(6, 7, 3)
+    write_with_oiio(tmp_path / "a.exr", pixels, ("R", "G", "B"), window=(-2, -1, 4, 3))
+    assert np.array_equal(read_radiance(tmp_path / "a.exr"), pixels[1:4, 2:6])
+
+
+def test_data_window_beside_the_display_window(tmp_path):
+    pixels = np.ones((2, 2, 3), np.float32)
+    for window in ((-9, 0, 4, 3), (0, 50, 4, 3)):
+        write_with_oiio(tmp_path / "a.exr", pixels, ("R", "G", "B"), window=window)
+        assert np.isnan(read_radiance(tmp_path / "a.exr")).all()
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".tif", ".png", ".jpg"])
+@pytest.mark.parametrize("fraction", [0.0, 0.02, 0.3, 0.5, 0.9, 0.99])
+def test_truncated_file_is_refused(tmp_path, radiance, suffix, fraction, capfd):
+    form = "float" if suffix in (".exr", ".hdr", ".tif") else "uint8"
+    whole, cut = tmp_path / f"whole{suffix}", tmp_path / f"cut{suffix}"
+    write_with_oiio(whole, radiance / 100, ("R", "G", "B"), form)
+    read_radiance(whole)
+    cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * fraction)])
+    with pytest.raises(ImageRefused, match=r"^.+ \[image\.(truncated|unreadable)\]$"):
+        read_radiance(cut)
+
+
+@pytest.mark.parametrize("length", [3, 100, -1])
+@pytest.mark.parametrize("compression", ["none", "zip", "piz", "dwaa"])
+def test_exr_truncated_anywhere(tmp_path, radiance, compression, length):
+    path = tmp_path / "a.exr"
+    write_with_oiio(path, radiance, ("R", "G", "B"), "half", compression=compression)
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(ImageRefused):
+        read_radiance(path)
+
+
+def test_jpeg_with_a_thumbnail_and_a_tail(tmp_path, radiance):
+    path = tmp_path / "a.jpg"
+    write_with_oiio(path, radiance / 100, ("R", "G", "B"), "uint8")
+    plain = path.read_bytes()
+    thumbnail = b"\xff\xe5" + struct.pack(">H", 2 + 6) + b"\xff\xd8\xff\xd9ab"
+    path.write_bytes(plain[:2] + thumbnail + plain[2:] + b"movie" * 2000)
+    read_radiance(path)
+    path.write_bytes((plain[:2] + thumbnail + plain[2:])[:-10])
+    with pytest.raises(ImageRefused, match=r"no end-of-image mark"):
+        read_radiance(path)
+
+
+def test_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance):
+    """A window of random bytes slides over the file; nothing else may ever come out."""
+    path = tmp_path / "a.exr"
+    write_exr(path, radiance)
+    whole = path.read_bytes()
+    generator = np.random.default_rng(3)
+    refused = 0
+    for _ in range(300):
+        content = bytearray(whole)
+        limit = len(whole) if generator.random() < 0.5 else 400
+        start, length = int(generator.integers(limit)), int(generator.integers(1, 40))
+        content[start : start + length] = generator.bytes(len(content[start : start + length]))
+        path.write_bytes(content)
+        try:
+            pixels = read_radiance(path)
+        except ImageRefused:
+            refused += 1
+        else:
+            assert pixels.dtype == np.float32
+            assert pixels.shape[2] == 3
+    assert refused > 100
+
+
+def test_what_is_not_a_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "fifo.exr")
+    (tmp_path / "folder.exr").mkdir()
+    (tmp_path / "text.exr").write_text("not an image")
+    (tmp_path / "dangling.exr").symlink_to("none")
+    names = ("fifo", "folder", "text", "dangling", "none", "x" * 300, "a\0b", "\udcff")
+    for name in names:
+        with pytest.raises(ImageRefused, match=r"\[image\.unreadable\]$"):
+            read_radiance(tmp_path / f"{name}.exr")
+
+
+@pytest.mark.parametrize("suffix", [".dng", ".CR2", ".nef"])
+def test_camera_raw_is_refused_by_name(tmp_path, radiance, suffix):
+    write_with_oiio(tmp_path / "a.tif", radiance, ("R", "G", "B"))
+    path = (tmp_path / "a.tif").rename(tmp_path / f"a{suffix}")
+    with pytest.raises(ImageRefused, match=r"camera raw.+\[image\.raw\]$"):
+        read_radiance(path)
+
+
+def test_other_formats_are_refused_by_content(tmp_path, radiance):
+    write_with_oiio(tmp_path / "a.bmp", radiance / 100, ("R", "G", "B"), "uint8")
+    path = (tmp_path / "a.bmp").rename(tmp_path / "a.exr")
+    with pytest.raises(ImageRefused, match=r"bmp images are not read.+\[image\.format\]$"):
+        read_radiance(path)
+
+
+def test_alpha_does_not_darken(tmp_path):
+    pixels = np.tile(np.array([1, 0.6, 0.2, 0.5], np.float32), (3, 4, 1))
+    path = tmp_path / "a.png"
+    spec = oiio.ImageSpec(4, 3, 4, "uint8")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(str(path))
+    output.open(str(path), spec)
+    output.write_image(pixels)
+    output.close()
+    assert np.allclose(read_radiance(path), pixels[..., :3], atol=1 / 255)
+
+
+def test_limits(tmp_path, radiance):
+    write_exr(tmp_path / "a.exr", radiance)
+    read_radiance(tmp_path / "a.exr", max_side=40)
+    with pytest.raises(ImageRefused, match=r"40 x 24 pixels.+\[image\.limits\]$"):
+        read_radiance(tmp_path / "a.exr", max_side=39)
+    names = tuple(f"c{i:02}" for i in range(65))
+    write_with_oiio(tmp_path / "b.exr", np.ones((2, 2, 65), np.float32), names)
+    with pytest.raises(ImageRefused, match="65 channels"):
+        read_exr(tmp_path / "b.exr")
+
+
+@pytest.mark.parametrize("side", [15_000, 60_000, 1_000_000])
+def test_decompression_bomb_is_refused_before_it_is_decoded(tmp_path, side):
+    def chunk(kind, content):
+        crc = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+    header = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    data = zlib.compress(bytes(10_000), 9)
+    content = chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + content)
+    for read in (read_radiance, image_size):
+        with pytest.raises(ImageRefused):
+            read(tmp_path / "a.png")

@@ -1,0 +1,92 @@
+"""Cleaning removes what carries no surface, counts it, and moves nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.mesh_clean import clean_mesh
+
+
+def _sphere(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return np.asarray(sphere.vertices, np.float32), np.asarray(sphere.faces, np.int32)
+
+
+def test_a_clean_mesh_comes_back_bit_for_bit():
+    points, triangles = _sphere()
+    labels = np.arange(len(triangles), dtype=np.int32) % 3
+    clean = clean_mesh(points, triangles, labels)
+    assert clean.points.tobytes() == points.tobytes()
+    assert clean.triangles.tobytes() == triangles.tobytes()
+    assert clean.face_object.tobytes() == labels.tobytes()
+    assert set(clean.counts.values()) == {0}
+
+
+def test_dead_weight_is_removed_and_counted():
+    points = np.array(
+        [[9, 9, 9], [0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [0, 0, 0]], np.float32
+    )
+    triangles = np.array(
+        [
+            [1, 2, 3],
+            [2, 3, 5],  # the same positions, begun elsewhere
+            [3, 2, 1],  # the other side stays
+            [1, 2, 4],  # three points in line
+            [1, 5, 2],  # two vertices at one position
+            [2, 2, 3],
+        ],
+        np.int32,
+    )
+    clean = clean_mesh(points, triangles, np.arange(6, dtype=np.int32))
+    assert clean.triangles.tolist() == [[0, 1, 2], [2, 1, 0]]
+    assert clean.points.tolist() == points[1:4].tolist()
+    assert clean.face_object.tolist() == [0, 2]
+    assert clean.counts == {
+        "degenerate_faces": 3,
+        "duplicate_faces": 1,
+        "nonmanifold_edges": 0,
+        "unreferenced_vertices": 3,
+    }
+
+
+def test_nonmanifold_edges_are_counted_and_kept():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+    triangles = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]], np.int32)
+    clean = clean_mesh(points, triangles, np.zeros(3, np.int32))
+    assert clean.counts["nonmanifold_edges"] == 1
+    assert len(clean.triangles) == 3
+
+
+def test_tiny_triangles_are_not_taken_for_degenerate_ones():
+    points, triangles = _sphere(1)
+    clean = clean_mesh(points * np.float32(1e-4), triangles, np.zeros(len(triangles), np.int32))
+    assert len(clean.triangles) == len(triangles)
+
+
+def test_a_mesh_without_any_area_is_refused():
+    triangles = np.array([[0, 1, 2]], np.int32)
+    with pytest.raises(InputRefused, match=r"^scan.ply: none of the 1 faces.*\[mesh.empty\]"):
+        clean_mesh(np.zeros((3, 3), np.float32), triangles, np.zeros(1, np.int32), label="scan.ply")
+
+
+def test_reduction_keeps_objects_in_proportion_and_the_small_ones_alive():
+    points, triangles = _sphere(4)
+    both = np.concatenate([points, points[:42] * 0 + _sphere(1)[0] + np.float32(3)])
+    small = _sphere(1)[1] + len(points)
+    faces = np.concatenate([triangles, small]).astype(np.int32)
+    labels = np.repeat([0, 1], [len(triangles), len(small)]).astype(np.int32)
+    clean = clean_mesh(both, faces, labels, decimate=1000)
+    sizes = np.bincount(clean.face_object)
+    assert len(clean.triangles) <= 1000 + len(small)
+    assert sizes[0] == pytest.approx(1000, rel=0.05)
+    assert 20 <= sizes[1] <= len(small)
+    radius = np.linalg.norm(
+        clean.points[np.unique(clean.triangles[clean.face_object == 0])], axis=1
+    )
+    np.testing.assert_allclose(radius, 1, atol=0.01)
+    again = clean_mesh(both, faces, labels, decimate=1000)
+    assert again.points.tobytes() == clean.points.tobytes()
+    assert again.triangles.tobytes() == clean.triangles.tobytes()

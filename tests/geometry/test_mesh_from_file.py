@@ -1,0 +1,111 @@
+"""Meshes are taken vertex by vertex, and broken ones refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.scenes import room_mesh, write_ply
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.mesh_from_file import mesh_from_file
+
+_SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def test_ply_comes_back_bit_for_bit_with_its_labels(tmp_path):
+    points, triangles, face_object, _ = room_mesh()
+    write_ply(tmp_path / "mesh.ply", points, triangles, face_object)
+    mesh = mesh_from_file(tmp_path / "mesh.ply")
+    assert mesh.points.tobytes() == points.tobytes()
+    assert mesh.triangles.tobytes() == triangles.tobytes()
+    assert mesh.face_label is not None
+    np.testing.assert_array_equal(mesh.face_label, face_object)
+    assert mesh.kept is None
+
+
+def test_quads_become_two_triangles_in_place_and_keep_their_label(tmp_path):
+    path = tmp_path / "quads.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "property int object_id\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3 6\n4 3 2 1 0 7\n"
+    )
+    mesh = mesh_from_file(path)
+    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0]]
+    assert mesh.face_label is not None
+    assert mesh.face_label.tolist() == [6, 6, 7, 7]
+
+
+def test_obj_keeps_vertices_and_its_objects_become_labels(tmp_path):
+    path = tmp_path / "two.obj"
+    path.write_text(_SQUARE + "o seat\nf 1 2 3\no back\nf 1 3 4\n")
+    mesh = mesh_from_file(path)
+    assert len(mesh.triangles) == 2
+    assert mesh.face_label is not None
+    assert {mesh.label_names[i] for i in mesh.face_label.tolist()} == {"seat", "back"}
+
+
+def test_glb_nodes_become_labels_in_world_positions(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box(), node_name="box")
+    moved = trimesh.transformations.translation_matrix([3, 0, 0])
+    scene.add_geometry(trimesh.creation.icosphere(), node_name="ball", transform=moved)
+    scene.export(tmp_path / "scene.glb")
+    mesh = mesh_from_file(tmp_path / "scene.glb")
+    assert sorted(mesh.label_names.values()) == ["ball", "box"]
+    np.testing.assert_allclose(mesh.points.max(axis=0), [4, 1, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("broken", ["nan", "index"])
+def test_a_few_broken_faces_are_left_out(tmp_path, broken):
+    points, triangles, face_object, _ = room_mesh(subdivisions=8)
+    if broken == "nan":
+        points[triangles[5, 0]] = np.nan
+        expected = ~(triangles == triangles[5, 0]).any(axis=1)
+    else:
+        triangles[5, 0] = -1
+        expected = np.arange(len(triangles)) != 5
+    write_ply(tmp_path / "mesh.ply", points, triangles, face_object)
+    mesh = mesh_from_file(tmp_path / "mesh.ply")
+    np.testing.assert_array_equal(mesh.kept, expected)
+    assert np.isfinite(mesh.points).all()
+    assert len(mesh.triangles) == len(mesh.face_label) == expected.sum()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "rule"),
+    [
+        ("empty.ply", b"", "mesh.read"),
+        ("garbage.ply", b"\x00\x01garbage", "mesh.read"),
+        ("garbage.glb", b"glTF\x02\x00\x00\x00\x10", "mesh.read"),
+        ("nothing.obj", b"", "mesh.empty"),
+        ("points.obj", _SQUARE.encode(), "mesh.empty"),
+        ("index.obj", (_SQUARE + "f 1 2 9\n").encode(), "mesh.read"),
+        ("far.obj", b"v 0 0 0\nv 1e9 0 0\nv 0 1 0\nf 1 2 3\n", "mesh.far"),
+        ("tiny.obj", b"v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\n", "mesh.tiny"),
+        ("mesh.stl", b"solid", "mesh.format"),
+    ],
+)
+def test_unusable_files_are_refused_in_one_sentence(tmp_path, name, content, rule):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputRefused, match=rf"{name}: .*\[{rule}\]$") as refused:
+        mesh_from_file(tmp_path / name)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_truncated_files_are_refused(tmp_path, share):
+    points, triangles, face_object, _ = room_mesh()
+    path = tmp_path / "mesh.ply"
+    write_ply(path, points, triangles, face_object)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(InputRefused, match=r"\[mesh\.(read|empty)\]"):
+        mesh_from_file(path)
+
+
+def test_a_folder_in_place_of_the_mesh_is_refused(tmp_path):
+    (tmp_path / "mesh.ply").mkdir()
+    with pytest.raises(InputRefused, match=r"not a regular file.*\[mesh.missing\]"):
+        mesh_from_file(tmp_path / "mesh.ply")

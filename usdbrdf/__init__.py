@@ -1,0 +1,18 @@
+"""usdbrdf: measured materials for captured rooms and objects, as non-destructive USD layers."""
+
+from usdbrdf.stage.schema import register as _register
+
+_register()
+
+from usdbrdf.pipeline import ConvertOptions as ConvertOptions  # noqa: E402
+from usdbrdf.pipeline import convert as convert  # noqa: E402
+from usdbrdf.pipeline import working_on as working_on  # noqa: E402
+from usdbrdf.scan.ingest_options import IngestOptions as IngestOptions  # noqa: E402
+from usdbrdf.shading.irradiance import Sampling as Sampling  # noqa: E402
+from usdbrdf.steps.fit import FitOptions as FitOptions  # noqa: E402
+from usdbrdf.steps.fit import fit as fit  # noqa: E402
+from usdbrdf.steps.ingest import ingest as ingest  # noqa: E402
+from usdbrdf.steps.shade import ShadeOptions as ShadeOptions  # noqa: E402
+from usdbrdf.steps.shade import shade as shade  # noqa: E402
+from usdbrdf.steps.texture import TextureOptions as TextureOptions  # noqa: E402
+from usdbrdf.steps.texture import texture as texture  # noqa: E402

@@ -1,0 +1,46 @@
+"""The errors a user can meet, each with the exit code that the command line returns for it.
+
+Every message is one sentence or two: what was looked at, what was found, what to do.
+"""
+
+from __future__ import annotations
+
+
+class UsdBrdfError(Exception):
+    """Root of everything that is raised on purpose; ``exit_code`` is the command line's status."""
+
+    exit_code = 1
+
+
+class UsageError(UsdBrdfError):
+    """The options contradict each other or name something that does not exist."""
+
+    exit_code = 2
+
+
+class InputRefused(UsdBrdfError):
+    """The capture, mesh, image or stage cannot be used; trying again is useless."""
+
+    exit_code = 3
+
+
+class ImageRefused(InputRefused):
+    """One image cannot be used; a capture with enough others goes on without it."""
+
+
+class EnvironmentFailure(UsdBrdfError):
+    """Disk, memory, permission, a missing optional package, time: trying again may help."""
+
+    exit_code = 4
+
+
+class FolderBusy(UsdBrdfError):
+    """Another run works in the same output folder."""
+
+    exit_code = 5
+
+
+class OwnershipConflict(UsdBrdfError):
+    """The output folder holds files that are not ours, or ours were edited by hand."""
+
+    exit_code = 6

@@ -1,0 +1,118 @@
+"""Files appear whole or not at all: write beside, flush, rename, and only then believe it.
+
+A killed process leaves at most a file whose name starts with ``TEMPORARY_PREFIX``; a full disk
+leaves the previous file as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import secrets
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from usdbrdf.errors import EnvironmentFailure
+
+TEMPORARY_PREFIX = ".tmp-"
+_BLOCK = 1 << 20  # bytes hashed at a time
+_passes: Counter[str] = Counter()  # how often each fault point was passed in this process
+
+
+def publish(staged: Path, final: Path) -> None:
+    """Move a finished file to its final name, durably; both must be in one file system.
+
+    The staged bytes reach the disk before the name does, so that a power cut cannot leave the
+    final name on an empty file. Readers that hold the previous file keep it.
+    """
+    with staged.open("rb") as file:
+        os.fsync(file.fileno())
+    fault_point("publish:before_replace")
+    os.replace(staged, final)
+    fault_point("publish:after_replace")
+    _flush_folder(final.parent)
+
+
+def sha256_of(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write UTF-8 text; ``path`` holds either its previous content or all of the new one."""
+    with temporary_beside(path) as staged:
+        staged.write_bytes(text.encode("utf-8"))
+        publish(staged, path)
+
+
+@contextmanager
+def temporary_beside(path: Path) -> Iterator[Path]:
+    """A fresh name in the folder of ``path``, with its suffix; gone at the end unless published."""
+    name = f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}"
+    staged = path.with_name(name)
+    try:
+        yield staged
+    finally:
+        with suppress(OSError):
+            staged.unlink()
+
+
+def fault_point(name: str) -> None:
+    """A place where the tests may kill this process or fill its disk; free otherwise.
+
+    Environment variable ``USDBRDF_FAULT``: ``kill@NAME`` (SIGKILL to ourselves) or
+    ``enospc@NAME`` (OSError ENOSPC); a ``:K`` after NAME means the K-th pass, counted from 1.
+    """
+    wanted = os.environ.get("USDBRDF_FAULT")
+    if not wanted:
+        return
+    _passes[name] += 1
+    action, _, where = wanted.partition("@")
+    if where not in (f"{name}:{_passes[name]}", name):
+        return
+    if action == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if action == "enospc":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextmanager
+def environment_failures(subject: str) -> Iterator[None]:
+    """Translate what the machine lacks (disk, memory, permission) into EnvironmentFailure.
+
+    Every OSError counts, whatever its errno: numpy raises one without when a disk is full.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise  # whoever read our output has gone: no fault of this machine
+    except MemoryError as error:
+        raise EnvironmentFailure(
+            f"{subject}: out of memory. Free some or use a larger machine, then run the same "
+            "command again; finished work is kept. [environment.memory]"
+        ) from error
+    except OSError as error:
+        where = f" ({error.filename!r})" if error.filename else ""
+        raise EnvironmentFailure(
+            f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
+            "permission, then run the same command again; finished work is kept. [environment.io]"
+        ) from error
+
+
+def _flush_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:  # network file systems that cannot flush a folder say EINVAL
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)

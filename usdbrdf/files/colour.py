@@ -1,0 +1,101 @@
+"""Colour spaces by their OpenColorIO names; the only importer of PyOpenColorIO."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import PyOpenColorIO as ocio
+
+from usdbrdf.errors import InputRefused, UsdBrdfError
+
+Float = npt.NDArray[np.float32]
+
+WORKING_SPACE = "lin_rec709_scene"
+DISPLAY_SPACE = "srgb_rec709_scene"
+_CONFIG = "cg-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
+# Our names, and what configs older than the pinned one call the same space.
+_NAMES = {
+    "lin_ap0_scene": ("lin_ap0_scene", "lin_ap0"),
+    "lin_ap1_scene": ("lin_ap1_scene", "lin_ap1"),
+    "lin_p3d65_scene": ("lin_p3d65_scene", "lin_p3d65"),
+    "lin_rec2020_scene": ("lin_rec2020_scene", "lin_rec2020"),
+    "lin_rec709_scene": ("lin_rec709_scene", "lin_rec709_srgb", "lin_rec709"),
+    "srgb_rec709_scene": ("srgb_rec709_scene", "srgb_tx"),
+}
+_UNKNOWN_SHOWN_AS = (255, 0, 255)
+
+
+def known_encodings() -> tuple[str, ...]:
+    """The names that ``to_working_space`` understands."""
+    return tuple(sorted(_NAMES))
+
+
+def to_working_space(pixels: Float, encoding: str) -> Float:
+    """A copy of (H, W, 3) float32 pixels as linear Rec.709; negative and large values pass."""
+    if encoding not in _NAMES:
+        raise InputRefused(
+            f"colour space {encoding!r} is not known. Use one of {', '.join(known_encodings())}. "
+            "[colour.encoding]"
+        )
+    return _converted(pixels, encoding, WORKING_SPACE)
+
+
+def to_display_srgb8(pixels: Float, *, exposure_scale: float) -> npt.NDArray[np.uint8]:
+    """sRGB bytes, (H, W, 3) uint8, of linear Rec.709 radiance times ``exposure_scale``.
+
+    A pixel with NaN is unknown and comes out magenta, for black would be a claim.
+    """
+    unknown = np.any(np.isnan(pixels), axis=2, keepdims=True)
+    known = np.where(unknown, np.float32(0), pixels)
+    scaled = np.clip(known * np.float32(exposure_scale), 0, 1).astype(np.float32)
+    encoded = _converted(scaled, WORKING_SPACE, DISPLAY_SPACE)
+    bytes_ = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return np.where(unknown, np.array(_UNKNOWN_SHOWN_AS, dtype=np.uint8), bytes_)
+
+
+def _converted(pixels: Float, source: str, target: str) -> Float:
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise UsdBrdfError(f"{pixels.shape=} but expected (H, W, 3). [colour.shape]")
+    image = np.array(pixels, dtype=np.float32, order="C")
+    if source != target and image.size:
+        _processor(source, target).applyRGB(image)
+    return image
+
+
+@cache
+def _processor(source: str, target: str) -> Any:
+    config = _config()
+    processor = config.getProcessor(_name_in(config, source), _name_in(config, target))
+    # Lossless, because the default replaces the power function by a fast approximation.
+    return processor.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
+
+
+@cache
+def _config() -> Any:
+    return ocio.Config.CreateFromBuiltinConfig(_pick_config(_builtin_configs()))
+
+
+def _builtin_configs() -> list[str]:
+    return [entry[0] for entry in ocio.BuiltinConfigRegistry().getBuiltinConfigs()]
+
+
+def _pick_config(available: list[str]) -> str:
+    """The pinned configuration, or in an older OpenColorIO the newest one of its kind."""
+    if _CONFIG in available:
+        return _CONFIG
+    kind = [name for name in available if name.startswith("cg-config-v")]
+    return max(kind, key=lambda name: [int(number) for number in re.findall(r"\d+", name)])
+
+
+def _name_in(config: Any, encoding: str) -> str:
+    for name in _NAMES[encoding]:
+        if config.getColorSpace(name) is not None:
+            return name
+    raise InputRefused(
+        f"colour space {encoding!r} is not in this OpenColorIO ({ocio.__version__}). Install 2.5 "
+        "or newer. [colour.encoding]"
+    )

@@ -1,0 +1,194 @@
+"""JSON without its traps: finite numbers, no key twice, bounded size and depth."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import write_text_atomic
+
+MAX_BYTES = 256 << 20
+MAX_DEPTH = 64
+_INTEGER_LIMIT = 1 << 63
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
+
+
+class _BadNumber(ValueError):
+    """A number that is not finite or does not fit 64 bits."""
+
+
+class _KeyTwice(ValueError):
+    """An object names one key two times."""
+
+
+def read_json(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
+    """Parse a JSON document strictly; InputRefused names the file and, where known, the line.
+
+    ``json`` alone would take NaN, turn 1e999 into infinity and keep the last of two equal keys.
+    """
+    text = _read_text(path, max_bytes)
+    try:
+        document = json.loads(
+            text,
+            object_pairs_hook=_object_without_key_twice,
+            parse_constant=_finite,
+            parse_float=_finite,
+            parse_int=_integer,
+        )
+    except _BadNumber as error:
+        line = next(line for line, token in _tokens(text) if _is_bad_number(token))
+        raise InputRefused(
+            f"{path}:{line}: the number {_short(error)} is not a finite 64-bit number. Remove or "
+            "correct it. [document.nonfinite]"
+        ) from error
+    except _KeyTwice as error:
+        raise InputRefused(
+            f"{path}:{_line_of_key_twice(text)}: the key {_short(error)} occurs twice in one "
+            "object. Keep one of the two. [document.duplicate]"
+        ) from error
+    except json.JSONDecodeError as error:
+        raise InputRefused(
+            f"{path}:{error.lineno}: not valid JSON ({error.msg}, column {error.colno}). Export "
+            "it again or correct it. [document.json]"
+        ) from error
+    except RecursionError as error:
+        raise _too_deep(path, max_depth) from error
+    if _deeper_than(document, max_depth):
+        raise _too_deep(path, max_depth)
+    return document
+
+
+def write_json(path: Path, obj: Any) -> None:
+    """Write JSON atomically; the same object gives the same bytes (sorted keys)."""
+    write_text_atomic(path, json_text(obj))
+
+
+def json_text(obj: Any) -> str:
+    """The document that ``write_json`` writes; numpy numbers count as numbers."""
+    try:
+        return json.dumps(obj, allow_nan=False, indent=2, sort_keys=True, default=_plain) + "\n"
+    except (TypeError, ValueError) as error:
+        raise UsdBrdfError(
+            f"a record cannot be stored as JSON: {error}. [document.write]"
+        ) from error
+
+
+def _read_text(path: Path, max_bytes: int) -> str:
+    try:
+        if not path.is_file():  # a FIFO or device would block or never end
+            raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise InputRefused(
+                f"{path}: {size} bytes, more than the limit of {max_bytes}. Split the capture. "
+                "[document.size]"
+            )
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputRefused(
+            f"{path}: cannot be read ({error.strerror}). Check its permissions. [document.missing]"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputRefused(
+            f"{path}: byte {error.start} is not UTF-8. Save the document as UTF-8. [document.json]"
+        ) from error
+
+
+def _object_without_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in result:
+            raise _KeyTwice(key)
+        result[key] = value
+    return result
+
+
+def _finite(token: str) -> float:
+    value = float(token)
+    if not math.isfinite(value):
+        raise _BadNumber(token)
+    return value
+
+
+def _integer(token: str) -> int:
+    # 19 digits and a sign always fit int(); longer ones may exceed Python's own digit limit.
+    if len(token) > 20 or not -_INTEGER_LIMIT <= int(token) < _INTEGER_LIMIT:
+        raise _BadNumber(token)
+    return int(token)
+
+
+def _is_bad_number(token: str) -> bool:
+    if token in ("NaN", "Infinity", "-Infinity"):
+        return True
+    if token[0] not in "-0123456789":
+        return False
+    try:
+        (_integer if token.lstrip("-").isdigit() else _finite)(token)
+    except ValueError:
+        return True
+    return False
+
+
+def _tokens(text: str) -> Iterator[tuple[int, str]]:
+    line, position = 1, 0
+    for match in _TOKEN.finditer(text):
+        line += text.count("\n", position, match.start())
+        position = match.start()
+        yield line, match.group()
+
+
+def _line_of_key_twice(text: str) -> int:
+    keys: list[set[str]] = []
+    previous = ""
+    for line, token in _tokens(text):
+        if token in "{[":
+            keys.append(set())
+        elif token in "}]":
+            keys.pop()
+        elif token == ":":
+            key = json.loads(previous, strict=False)
+            if key in keys[-1]:
+                return line
+            keys[-1].add(key)
+        previous = token
+    return 1
+
+
+def _deeper_than(document: Any, limit: int) -> bool:
+    level = [document]
+    for _ in range(limit):
+        level = [
+            child
+            for node in level
+            if isinstance(node, dict | list)
+            for child in (node.values() if isinstance(node, dict) else node)
+            if isinstance(child, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _too_deep(path: Path, limit: int) -> InputRefused:
+    return InputRefused(
+        f"{path}: nested deeper than {limit} levels. This is not a document of ours; check what "
+        "wrote it. [document.depth]"
+    )
+
+
+def _short(error: ValueError) -> str:
+    text = str(error)
+    return repr(text if len(text) <= 40 else text[:40] + "...")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is not a JSON type")

@@ -1,0 +1,259 @@
+"""Images in and out; the only importer of OpenImageIO.
+
+Reading gives every pixel or refuses: a truncated file never becomes zeros. Writing clamps to what
+half floats hold, pins the date so that equal pixels give equal bytes, and reads the file back.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio
+
+from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
+from usdbrdf.files.atomic import fault_point, publish, temporary_beside
+
+Float = npt.NDArray[np.float32]
+Byte = npt.NDArray[np.uint8]
+
+MAX_SIDE = 65_536  # pixels
+MAX_PIXELS = 1 << 28
+MAX_CHANNELS = 64
+MAX_DECLARED_BYTES = 4 << 30
+MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
+HALF_MAX = 65_504.0
+_PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
+_FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
+# fmt: off
+_RAW_SUFFIXES = frozenset((
+    ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
+    ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
+))
+# fmt: on
+_CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+
+# Process-wide guards of the decoders themselves, before anything is allocated.
+oiio.attribute("limits:channels", MAX_CHANNELS)
+oiio.attribute("limits:resolution", MAX_SIDE)
+oiio.attribute("limits:imagesize_MB", MAX_DECLARED_BYTES >> 20)
+
+
+def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
+    """The R, G and B of an image as stored, (H, W, 3) float32, no colour conversion.
+
+    H, W are the display window's; its pixels that the file does not hold are NaN (unknown, not
+    black). NaN and infinity in the file are returned as they are. Integer images give [0, 1].
+    """
+    source = _open(path, max_side)
+    names = source.spec().channelnames
+    channels = _rgb_channels(names)
+    if len(channels) != 3:
+        raise ImageRefused(
+            f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
+            "beauty pass as R, G, B. [image.channels]"
+        )
+    pixels = _pixels(path, source)[..., channels]
+    return _in_display_window(source.spec(), np.ascontiguousarray(pixels))
+
+
+def read_exr(path: Path) -> Float:
+    """All channels of an image in file order, (H, W, C) float32, NaN outside the data window."""
+    source = _open(path, MAX_SIDE)
+    return _in_display_window(source.spec(), _pixels(path, source))
+
+
+def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
+    """Width and height of the display window and the channel names, from the header alone."""
+    spec = _open(path, MAX_SIDE).spec()
+    return spec.full_width, spec.full_height, tuple(spec.channelnames)
+
+
+def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
+    """Write finite pixels, (H, W) or (H, W, 1 | 3 | 4), as ZIP-compressed scene-linear Rec.709.
+
+    Channels are named Y, RGB or RGBA. Values beyond +-65504 are clamped if ``half`` (as half floats
+    they would be infinite); returns how many. The file appears whole or not at all.
+    """
+    image = np.atleast_3d(np.asarray(pixels, dtype=np.float32))
+    names = _CHANNEL_NAMES.get(image.shape[2])
+    if names is None or np.ndim(pixels) not in (2, 3) or not image.size:
+        raise UsdBrdfError(f"{path}: {np.shape(pixels)=} is not (H, W[, 1|3|4]). [image.write]")
+    bad = int(np.count_nonzero(~np.isfinite(image)))
+    if bad:
+        raise UsdBrdfError(f"{path}: {bad} values to be written are not finite. [image.write]")
+    clamped = 0
+    if half:
+        clamped = int(np.count_nonzero(np.abs(image) > HALF_MAX))
+        stored: Any = np.clip(image, -HALF_MAX, HALF_MAX).astype(np.float16)
+    else:
+        stored = image
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], len(names), "half" if half else "float")
+    spec.channelnames = names
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", _PINNED_DATE)
+    spec.set_colorspace("lin_rec709_scene")
+    if len(names) == 4:
+        spec.alpha_channel = 3
+    with temporary_beside(path) as staged:
+        _write(path, staged, spec, stored)
+        if not np.array_equal(read_exr(staged), stored.astype(np.float32)):
+            raise EnvironmentFailure(
+                f"{path}: the file does not read back as it was written. Check the disk. "
+                "[image.write]"
+            )
+        publish(staged, path)
+    return clamped
+
+
+def write_preview_png(path: Path, rgb8: Byte) -> None:
+    """Write an 8-bit sRGB picture, (H, W, 3) uint8, for people to look at."""
+    if rgb8.dtype != np.uint8 or rgb8.ndim != 3 or rgb8.shape[2] != 3 or not rgb8.size:
+        raise UsdBrdfError(
+            f"{path}: {rgb8.dtype} {rgb8.shape=} is not (H, W, 3) uint8. [image.write]"
+        )
+    spec = oiio.ImageSpec(rgb8.shape[1], rgb8.shape[0], 3, "uint8")
+    spec.attribute("DateTime", _PINNED_DATE)
+    spec.set_colorspace("srgb_rec709_scene")
+    with temporary_beside(path) as staged:
+        _write(path, staged, spec, np.ascontiguousarray(rgb8))
+        publish(staged, path)
+
+
+def _open(path: Path, max_side: int) -> Any:
+    """An OpenImageIO reader on the first image of a regular file whose header is within limits."""
+    if path.suffix.lower() in _RAW_SUFFIXES:
+        raise ImageRefused(
+            f"{path}: camera raw files are not read (only their preview would be). Develop it "
+            "to a scene-linear EXR. [image.raw]"
+        )
+    size = _size_of_regular_file(path)
+    try:
+        # Without the hint, PNG's colours would come multiplied by their alpha.
+        hint = oiio.ImageSpec()
+        hint.attribute("oiio:UnassociatedAlpha", 1)
+        source = oiio.ImageInput.open(str(path), hint)
+    except UnicodeError:
+        source = None
+    if source is None:
+        raise ImageRefused(
+            f"{path}: not a readable image ({_message(oiio)}). Copy or export it again. "
+            "[image.unreadable]"
+        )
+    spec = source.spec()
+    if source.format_name() not in _FORMATS or spec.deep or spec.full_depth > 1 or spec.depth > 1:
+        raise ImageRefused(
+            f"{path}: {source.format_name()} {'deep or volume ' if spec.deep else ''}images are "
+            f"not read. Export a flat image ({', '.join(_FORMATS)}). [image.format]"
+        )
+    _check_limits(path, spec, size, max_side)
+    return source
+
+
+def _size_of_regular_file(path: Path) -> int:
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ImageRefused(
+            f"{path}: cannot be read ({reason}). Check name and permission. [image.unreadable]"
+        ) from error
+    if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
+        raise ImageRefused(f"{path}: not a regular file. Name an image file. [image.unreadable]")
+    if not os.access(path, os.R_OK):
+        raise ImageRefused(f"{path}: permission denied. Make it readable. [image.unreadable]")
+    if status.st_size == 0:
+        raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
+    return status.st_size
+
+
+def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
+    for width, height in ((spec.width, spec.height), (spec.full_width, spec.full_height)):
+        if max(width, height) > max_side or width * height > MAX_PIXELS or min(width, height) < 1:
+            raise ImageRefused(
+                f"{path}: {width} x {height} pixels, the limits are {max_side} a side and "
+                f"{MAX_PIXELS} in all. Scale it down. [image.limits]"
+            )
+    declared = 4 * spec.width * spec.height * spec.nchannels  # as the floats we would make of it
+    inflation = declared / size
+    if declared > MAX_DECLARED_BYTES or (declared > 1 << 30 and inflation > MAX_INFLATION):
+        raise ImageRefused(
+            f"{path}: {size} bytes claim to hold {declared} ({inflation:.0f} times as many), the "
+            f"limits are {MAX_DECLARED_BYTES} and {MAX_INFLATION} times. Export it again. "
+            "[image.limits]"
+        )
+
+
+def _pixels(path: Path, source: Any) -> Float:
+    """The data window, (H, W, C) float32, complete."""
+    if source.format_name() == "jpeg":
+        _refuse_cut_jpeg(path)
+    spec = source.spec()
+    try:
+        pixels = source.read_image(0, 0, 0, spec.nchannels, "float")
+        complete = pixels is not None and not source.has_error
+    except (UnicodeError, MemoryError):
+        complete = False
+    if not complete or pixels.shape != (spec.height, spec.width, spec.nchannels):
+        raise ImageRefused(
+            f"{path}: truncated or damaged ({_message(source)}). Copy or export it again. "
+            "[image.truncated]"
+        )
+    return np.asarray(pixels, dtype=np.float32)
+
+
+def _refuse_cut_jpeg(path: Path) -> None:
+    """The JPEG decoder paints what is missing grey and only warns; look for the end mark.
+
+    The mark is searched after the first scan starts: a thumbnail in the header has one of its own.
+    """
+    content = path.read_bytes()
+    position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
+    while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
+        position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+    if content.find(b"\xff\xd9", position) < 0:
+        raise ImageRefused(
+            f"{path}: truncated (no end-of-image mark). Copy or export it again. [image.truncated]"
+        )
+
+
+def _in_display_window(spec: Any, data: Float) -> Float:
+    left, top = spec.x - spec.full_x, spec.y - spec.full_y
+    if (left, top, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
+        return data
+    image = np.full((spec.full_height, spec.full_width, data.shape[2]), np.nan, dtype=np.float32)
+    right, bottom = left + spec.width, top + spec.height
+    part = data[max(0, -top) : spec.full_height - top, max(0, -left) : spec.full_width - left]
+    image[max(0, top) : max(0, bottom), max(0, left) : max(0, right)] = part
+    return image
+
+
+def _rgb_channels(names: Sequence[str]) -> list[int]:
+    lower = [name.lower() for name in names]
+    return [lower.index(letter) for letter in "rgb" if letter in lower]
+
+
+def _write(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
+    fault_point("image:before_write")
+    output = oiio.ImageOutput.create(str(staged))
+    done = output is not None and output.open(str(staged), spec) and output.write_image(pixels)
+    message = "" if done else _message(output or oiio)
+    # close() says True after a failed write, so it can only add a failure, never take one back.
+    if not (output is not None and output.close() and done):
+        raise EnvironmentFailure(
+            f"{path}: cannot be written ({message or 'closing failed'}). Free disk space or "
+            "correct the permission, then run the same command again. [image.write]"
+        )
+
+
+def _message(speaker: Any) -> str:
+    """OpenImageIO's own words, in one line; damaged files can make them invalid UTF-8."""
+    try:
+        return " ".join(str(speaker.geterror()).split())[:300] or "no reason given"
+    except UnicodeError:
+        return "no readable reason given"

@@ -1,0 +1,41 @@
+"""Paths that a document names may not lead out of the folder that the document governs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from usdbrdf.errors import InputRefused
+
+_URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
+_ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
+
+
+def contained(root: Path, candidate: str) -> Path:
+    """The absolute path of ``candidate`` below ``root``; symbolic links are judged by their target.
+
+    Nothing is opened, and the file need not exist. Absolute paths are refused even if they lie
+    inside: they would break as soon as the capture is moved.
+    """
+    if not candidate or "\0" in candidate:
+        raise _refused(root, candidate, "is not a file name")
+    if _URI.match(candidate):
+        raise _refused(root, candidate, "is a URI, only relative paths are followed")
+    if _ABSOLUTE.match(candidate):
+        raise _refused(root, candidate, "is an absolute path, only relative paths are followed")
+    try:
+        home = root.resolve()
+        path = (home / candidate).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # too long a name, a loop of links
+        raise _refused(root, candidate, f"cannot be resolved ({error})") from error
+    if not path.is_relative_to(home):
+        raise _refused(root, candidate, "leads outside that folder")
+    return path
+
+
+def _refused(root: Path, candidate: str, reason: str) -> InputRefused:
+    shown = repr(candidate if len(candidate) <= 200 else candidate[:200] + "...")
+    return InputRefused(
+        f"{str(root)!r}: the path {shown} {reason}. Put the file inside the folder and name it "
+        "relative to it. [paths.outside]"
+    )

@@ -1,0 +1,102 @@
+"""Shading normals of a triangle soup: smooth on smooth surfaces, sharp at creases."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.weld import welded_ids
+from usdbrdf.kernel import parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+
+# The pairs of corners around one vertex grow with the square of their number. Beyond this a vertex
+# is the hub of a fan that no smoothing can help; its corners keep their faces' normals.
+_MAX_CORNERS = 4096
+
+
+def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Float:
+    """Unit normal of every triangle corner, (F, 3, 3) float32.
+
+    n(corner) ~ sum of angle(c) n(face of c) over the corners c that share the corner's position and
+    whose faces lean less than ``crease_angle_deg`` from the corner's own face. Positions count, not
+    vertex numbers, so seams in the file leave no seams in the shading. The result depends on
+    nothing but the arguments. A corner of a triangle without area gets (0, 0, 1).
+
+    points     (V, 3) float32, finite
+    triangles  (F, 3) int32
+    """
+    if len(triangles) == 0:
+        return np.zeros((0, 3, 3), np.float32)
+    faces, angles = _face_normals_and_angles(points, triangles)
+    vertex_of_corner = welded_ids(points)[triangles].reshape(-1)
+    corners = np.argsort(vertex_of_corner, kind="stable")
+    starts = np.searchsorted(
+        vertex_of_corner[corners], np.arange(int(vertex_of_corner.max()) + 2)
+    ).astype(np.int64)
+    # The small margin keeps a crease of exactly the limit smooth whatever the rounding.
+    min_cosine = math.cos(math.radians(crease_angle_deg)) - 1e-6
+    normals = np.zeros((3 * len(triangles), 3), np.float32)
+    _sum_over_neighbours(corners, starts, faces, angles.reshape(-1), min_cosine, normals)
+    return normals.reshape(-1, 3, 3)
+
+
+def face_normals(points: Float, triangles: Int) -> Double:
+    """(F, 3) float64 unit normals, counter-clockwise; zero where a triangle has no area."""
+    return _face_normals_and_angles(points, triangles)[0]
+
+
+def _face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:
+    """Unit face normals (F, 3) and corner angles (F, 3) in radians; zeros without area."""
+    corner = points.astype(np.float64)[triangles]
+    edge = np.roll(corner, -1, axis=1) - corner  # from each corner to the next
+    length = np.linalg.norm(edge, axis=2, keepdims=True)
+    # Unit edges first: the product of two tiny edges would underflow, that of unit ones cannot.
+    edge = np.divide(edge, length, out=np.zeros_like(edge), where=length > 0)
+    across = np.cross(edge, -np.roll(edge, 1, axis=1))
+    sine = np.linalg.norm(across, axis=2)
+    cosine = -(edge * np.roll(edge, 1, axis=1)).sum(axis=2)
+    best = np.take_along_axis(across, sine.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    size = np.linalg.norm(best, axis=1, keepdims=True)
+    has_area = size > 1e-12
+    normal = np.divide(best, size, out=np.zeros_like(best), where=has_area)
+    return normal, np.where(has_area, np.arctan2(sine, cosine), 0.0)
+
+
+@parallel_kernel  # type: ignore[untyped-decorator]
+def _sum_over_neighbours(
+    corners: npt.NDArray[np.int64],
+    starts: npt.NDArray[np.int64],
+    faces: Double,
+    angles: Double,
+    min_cosine: float,
+    normals: Float,
+) -> None:
+    """Each corner is written by one vertex alone and summed in file order: threads do not show."""
+    for vertex in prange(len(starts) - 1):
+        first, last = starts[vertex], starts[vertex + 1]
+        alone = last - first > _MAX_CORNERS
+        for i in range(first, last):
+            own = faces[corners[i] // 3]
+            x, y, z = own[0], own[1], own[2]
+            if not alone:
+                x = y = z = 0.0
+                for j in range(first, last):
+                    other = faces[corners[j] // 3]
+                    cosine = own[0] * other[0] + own[1] * other[1] + own[2] * other[2]
+                    if cosine >= min_cosine:
+                        x += angles[corners[j]] * other[0]
+                        y += angles[corners[j]] * other[1]
+                        z += angles[corners[j]] * other[2]
+            size = math.sqrt(x * x + y * y + z * z)
+            if size > 0.0:
+                normals[corners[i], 0] = x / size
+                normals[corners[i], 1] = y / size
+                normals[corners[i], 2] = z / size
+            else:
+                normals[corners[i], 2] = 1.0

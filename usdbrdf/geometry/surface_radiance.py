@@ -1,0 +1,96 @@
+"""Radiance as a texture on the whole scene's surface, looked up where a ray hits it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.kernel import kernel, parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceTexture:
+    """All atlases in one flat array.
+
+    pixels        (P, 3) float32, gutters dilated
+    corner_pixel  (F, 3, 2) float32, the faces' corners in pixels of their own atlas
+    first_pixel   (F,) int64, where the face's atlas starts in ``pixels``
+    size          (F, 2) int32, width and height of the face's atlas
+    """
+
+    pixels: Float
+    corner_pixel: Float
+    first_pixel: npt.NDArray[np.int64]
+    size: Int
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What the kernels take, in the order of ``texture_at``."""
+        return self.pixels, self.corner_pixel, self.first_pixel, self.size
+
+    def at(self, face: Int, u: Float, v: Float) -> Float:
+        """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""
+        return _lookup(*self.arrays, face, u, v)
+
+
+def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceTexture:
+    """Per-texel values (T, 3) as a texture that can be looked up anywhere on the surface."""
+    texel = texels.nearest_texel
+    pixels = np.where(texel[:, None] >= 0, values[np.maximum(texel, 0)], 0).astype(np.float32)
+    return SurfaceTexture(
+        pixels=pixels,
+        corner_pixel=texels.corner_pixel,
+        first_pixel=texels.first_pixel[face_object],
+        size=texels.resolution[face_object],
+    )
+
+
+@kernel
+def texture_at(pixels, corner_pixel, first_pixel, size, face, u, v, channel):  # type: ignore[no-untyped-def]
+    """One channel at barycentric (u, v) of a face, bilinear; for use inside kernels."""
+    corners = corner_pixel[face]
+    width = size[face, 0]
+    height = size[face, 1]
+    w = 1.0 - u - v
+    x = w * corners[0, 0] + u * corners[1, 0] + v * corners[2, 0] - 0.5
+    y = w * corners[0, 1] + u * corners[1, 1] + v * corners[2, 1] - 0.5
+    x = min(max(x, 0.0), width - 1.0)
+    y = min(max(y, 0.0), height - 1.0)
+    i = min(int(x), max(width - 2, 0))
+    j = min(int(y), max(height - 2, 0))
+    fx = x - i
+    fy = y - j
+    right = 1 if width > 1 else 0
+    down = width if height > 1 else 0
+    k = first_pixel[face] + j * width + i
+    top = pixels[k, channel] * (1 - fx) + pixels[k + right, channel] * fx
+    low = pixels[k + down, channel] * (1 - fx) + pixels[k + down + right, channel] * fx
+    return top * (1 - fy) + low * fy
+
+
+@parallel_kernel
+def _lookup(
+    pixels: Float,
+    corner_pixel: Float,
+    first_pixel: npt.NDArray[np.int64],
+    size: Int,
+    face: Int,
+    u: Float,
+    v: Float,
+) -> Float:
+    out = np.zeros((len(face), 3), np.float32)
+    for r in prange(len(face)):
+        if face[r] >= 0:
+            for c in range(3):
+                out[r, c] = texture_at(
+                    pixels, corner_pixel, first_pixel, size, face[r], u[r], v[r], c
+                )
+    return out

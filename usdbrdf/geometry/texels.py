@@ -1,0 +1,233 @@
+"""The texel table: where on the surface each texel of each object's atlas lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.kernel import kernel
+
+Float = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+# A texel whose centre lies outside every triangle, but no further than this from one (in texels),
+# still belongs to the chart: bilinear lookup at the chart's border reads it.
+_BORDER = 0.75
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texels:
+    """T texels of all objects; texels of one object are consecutive, in row order.
+
+    pixel           (T,) int64, index into the flat pixels of all atlases
+    face            (T,) int32; barycentric (T, 3) float32: the surface point
+    position        (T, 3) float32, metres, world; normal (T, 3) shading normal,
+    geometric_normal (T, 3) the triangle's; both unit
+    step_x, step_y  (T, 3) float32, metres: the surface spanned by one texel right and one down
+    area            (T,) float32, m^2
+    interior        (T,) bool: the centre lies inside a triangle (False: chart border)
+    resolution      (num_objects, 2) int32, width and height of each atlas
+    first_pixel     (num_objects + 1,) int64: flat pixels of object i are first_pixel[i:i+1]
+    first_texel     (num_objects + 1,) int64
+    nearest_texel   (P,) int32: for every flat pixel the texel that it shows; its own, or (gutter)
+                    the nearest one of the same atlas; -1 only in an atlas without texels
+    corner_pixel    (F, 3, 2) float32: x right, y down, in pixels of the face's atlas
+    """
+
+    pixel: npt.NDArray[np.int64]
+    face: Int
+    barycentric: Float
+    position: Float
+    normal: Float
+    geometric_normal: Float
+    step_x: Float
+    step_y: Float
+    area: Float
+    interior: Bool
+    resolution: Int
+    first_pixel: npt.NDArray[np.int64]
+    first_texel: npt.NDArray[np.int64]
+    nearest_texel: Int
+    corner_pixel: Float
+
+    def __len__(self) -> int:
+        return len(self.face)
+
+    def of_object(self, index: int) -> slice:
+        """The texels of one object."""
+        return slice(int(self.first_texel[index]), int(self.first_texel[index + 1]))
+
+    def image(self, index: int, values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+        """(H, W, ...) picture of per-texel values (T, ...) of one object, gutters dilated."""
+        width, height = self.resolution[index]
+        texel = self.nearest_texel[self.first_pixel[index] : self.first_pixel[index + 1]]
+        if not len(texel) or texel[0] < 0:
+            return np.zeros((height, width, *values.shape[1:]), values.dtype)
+        return values[texel].reshape(height, width, *values.shape[1:])
+
+    def from_image(self, index: int, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+        """The texels' values (T_i, ...) out of one object's picture (H, W, ...)."""
+        own = self.pixel[self.of_object(index)] - self.first_pixel[index]
+        return image.reshape(-1, *image.shape[2:])[own]
+
+    def object_index(self) -> Int:
+        """(T,) int32, the object of each texel."""
+        return np.repeat(np.arange(len(self.resolution), dtype=np.int32), np.diff(self.first_texel))
+
+
+def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
+    """Rasterise every object's charts into its atlas of ``resolution`` (num_objects, 2)."""
+    if scene.corner_uv is None:
+        raise ValueError("the scene has no texture coordinates yet")
+    size = resolution[scene.face_object].astype(np.float32)
+    corner_pixel = scene.corner_uv * size[:, None]
+    corner_pixel[..., 1] = size[:, None, 1] - corner_pixel[..., 1]
+    pixels = resolution.astype(np.int64).prod(axis=1)
+    first_pixel = np.concatenate([[0], np.cumsum(pixels)])
+
+    owner = np.full(first_pixel[-1], -1, np.int32)
+    distance = np.full(first_pixel[-1], np.inf, np.float32)
+    _rasterise(corner_pixel, scene.face_object, first_pixel, resolution, owner, distance)
+    pixel = np.flatnonzero(owner >= 0)
+    face = owner[pixel]
+    interior = distance[pixel] <= 0
+    first_texel = np.searchsorted(pixel, first_pixel)
+
+    width = resolution[scene.face_object[face], 0]
+    local = pixel - first_pixel[scene.face_object[face]]
+    centre = np.stack([local % width, local // width], axis=-1) + np.float32(0.5)
+    barycentric = _barycentric(corner_pixel[face], centre, interior)
+    corners = scene.points[scene.triangles[face]]
+    geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = np.einsum("tc,tcd->td", barycentric, scene.corner_normals[face])
+    step_x, step_y = _surface_steps(corners, corner_pixel[face])
+    return Texels(
+        pixel=pixel,
+        face=face,
+        barycentric=barycentric,
+        position=np.einsum("tc,tcd->td", barycentric, corners).astype(np.float32),
+        normal=_unit(normal, otherwise=geometric),
+        geometric_normal=_unit(geometric, otherwise=normal),
+        step_x=step_x,
+        step_y=step_y,
+        area=np.linalg.norm(np.cross(step_x, step_y), axis=-1).astype(np.float32),
+        interior=interior,
+        resolution=resolution,
+        first_pixel=first_pixel,
+        first_texel=first_texel,
+        nearest_texel=_nearest_texel(owner, pixel, resolution, first_pixel),
+        corner_pixel=corner_pixel,
+    )
+
+
+@kernel
+def _rasterise(
+    corner_pixel: Float,
+    face_object: Int,
+    first_pixel: npt.NDArray[np.int64],
+    resolution: Int,
+    owner: Int,
+    distance: Float,
+) -> None:
+    """Give each pixel the face nearest to its centre, at most _BORDER away (0 = inside)."""
+    for f in range(len(face_object)):
+        width, height = resolution[face_object[f], 0], resolution[face_object[f], 1]
+        base = first_pixel[face_object[f]]
+        x = corner_pixel[f, :, 0]
+        y = corner_pixel[f, :, 1]
+        x0 = max(0, int(np.floor(x.min() - _BORDER)))
+        x1 = min(width, int(np.ceil(x.max() + _BORDER)) + 1)
+        y0 = max(0, int(np.floor(y.min() - _BORDER)))
+        y1 = min(height, int(np.ceil(y.max() + _BORDER)) + 1)
+        for j in range(y0, y1):
+            for i in range(x0, x1):
+                away = _distance_to_triangle(x, y, i + 0.5, j + 0.5)
+                k = base + j * width + i
+                if away <= _BORDER and away < distance[k]:
+                    distance[k] = away
+                    owner[k] = f
+
+
+@kernel
+def _distance_to_triangle(x: Float, y: Float, px: float, py: float) -> float:
+    """Distance of a point from a triangle in the plane; 0 inside, whatever its winding."""
+    nearest = np.inf
+    positive = 0
+    negative = 0
+    for a in range(3):
+        b = (a + 1) % 3
+        ex = x[b] - x[a]
+        ey = y[b] - y[a]
+        dx = px - x[a]
+        dy = py - y[a]
+        side = ex * dy - ey * dx
+        positive += side >= 0
+        negative += side <= 0
+        t = min(1.0, max(0.0, (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-20)))
+        nearest = min(nearest, (dx - t * ex) ** 2 + (dy - t * ey) ** 2)
+    if (positive == 3) != (negative == 3):
+        return 0.0
+    return float(np.sqrt(nearest))
+
+
+def _barycentric(corners: Float, points: npt.NDArray[np.floating], interior: Bool) -> Float:
+    """Barycentric coordinates (T, 3) of points (T, 2) in triangles (T, 3, 2).
+
+    Border texels are moved onto the triangle, a little inside its edge: exactly on it, a ray would
+    start on whatever touches the object there.
+    """
+    a = (corners[:, 1] - corners[:, 0]).astype(np.float64)
+    b = (corners[:, 2] - corners[:, 0]).astype(np.float64)
+    p = points.astype(np.float64) - corners[:, 0]
+    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    det = np.where(np.abs(det) < 1e-12, 1e-12, det)
+    u = (p[:, 0] * b[:, 1] - p[:, 1] * b[:, 0]) / det
+    v = (a[:, 0] * p[:, 1] - a[:, 1] * p[:, 0]) / det
+    weights = np.stack([1 - u - v, u, v], axis=-1)
+    clamped = np.clip(weights, 0.02, None)
+    clamped /= clamped.sum(axis=-1, keepdims=True)
+    return np.where(interior[:, None], weights, clamped).astype(np.float32)
+
+
+def _surface_steps(corners: Float, corner_pixel: Float) -> tuple[Float, Float]:
+    """How the surface point moves by one texel right and one texel down: (T, 3) metres each."""
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    a, b = (corner_pixel[:, k] - corner_pixel[:, 0] for k in (1, 2))
+    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    det = np.where(np.abs(det) < 1e-9, np.inf, det)[:, None]
+    step_x = (e1 * b[:, 1:2] - e2 * a[:, 1:2]) / det
+    step_y = (e2 * a[:, 0:1] - e1 * b[:, 0:1]) / det
+    return step_x.astype(np.float32), step_y.astype(np.float32)
+
+
+def _unit(vectors: npt.NDArray[np.floating], otherwise: npt.NDArray[np.floating]) -> Float:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    other = np.linalg.norm(otherwise, axis=-1, keepdims=True)
+    fallback = np.where(other > 0, otherwise / np.maximum(other, 1e-30), (0, 0, 1))
+    return np.where(length > 1e-12, vectors / np.maximum(length, 1e-30), fallback).astype(
+        np.float32
+    )
+
+
+def _nearest_texel(
+    owner: Int,
+    pixel: npt.NDArray[np.int64],
+    resolution: Int,
+    first_pixel: npt.NDArray[np.int64],
+) -> Int:
+    index = np.full(len(owner), -1, np.int32)
+    index[pixel] = np.arange(len(pixel), dtype=np.int32)
+    for i, (width, height) in enumerate(resolution):
+        flat = slice(first_pixel[i], first_pixel[i + 1])
+        picture = index[flat].reshape(height, width)
+        if (picture >= 0).any():
+            rows, columns = ndimage.distance_transform_edt(
+                picture < 0, return_distances=False, return_indices=True
+            )
+            index[flat] = picture[rows, columns].ravel()
+    return index

@@ -1,0 +1,26 @@
+"""Compiled functions: numba's decorators with the project's settings and with types kept.
+
+Never ``fastmath``: under it ``np.isnan`` is False, and sums depend on the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """Compile for one thread; may be called from other kernels."""
+    compiled: F = numba.njit(cache=True)(function)
+    return compiled
+
+
+def parallel_kernel(function: F) -> F:
+    """Compile with ``prange`` over all cores. Every iteration writes to places of its own, so that
+    the result does not depend on the number of threads."""
+    compiled: F = numba.njit(cache=True, parallel=True)(function)
+    return compiled

@@ -1,0 +1,146 @@
+"""The one frame per object that its material is read from (paper, section 3.4.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.geometry.rays import RayScene, lift_from_surface
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.geometry.surface_radiance import SurfaceTexture
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePoints:
+    """What R camera rays see: face (R,) int32 (-1: nothing), position, shading normal turned to
+    the camera, and direction to the camera, each (R, 3) float32, the latter two unit."""
+
+    face: Int
+    u: Float
+    v: Float
+    position: Float
+    normal: Float
+    to_camera: Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCounts:
+    """Per object: pixels whose mirror ray hits an emitter and that are valid (A1 and A2), and valid
+    pixels (A2); (num_objects,) int64 each."""
+
+    mirrored: npt.NDArray[np.int64]
+    valid: npt.NDArray[np.int64]
+
+
+def visible_points(
+    rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
+) -> SurfacePoints:
+    """The surface under pixel coordinates (R, 2)."""
+    origins, directions = camera_rays(world_from_camera, intrinsics, pixels)
+    hits = rays.closest(origins, directions)
+    face = np.maximum(hits.face, 0)
+    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+    normal = np.einsum("rc,rcd->rd", weights, scene.corner_normals[face])
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    towards = np.einsum("rd,rd->r", normal, directions) > 0
+    position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
+    return SurfacePoints(
+        face=hits.face,
+        u=hits.u,
+        v=hits.v,
+        position=position.astype(np.float32),
+        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
+        to_camera=-directions,
+    )
+
+
+def mirror_hits_emitter(
+    rays: RayScene, points: SurfacePoints, emission: SurfaceTexture, scene_size: float
+) -> Bool:
+    """A1 (R,): would a perfect mirror at the point show an emitter to the camera?
+
+    emission: a mask in [0, 1] on the surface.
+    """
+    along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
+    reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
+    origin = lift_from_surface(points.position, points.normal, scene_size)
+    hits = rays.closest(origin, reflected)
+    shines = emission.at(hits.face, hits.u, hits.v)[:, 0] > 0.5
+    return np.asarray(shines & (hits.face >= 0) & (points.face >= 0), np.bool_)
+
+
+def count_frame(
+    rays: RayScene,
+    scene: Scene,
+    emission: SurfaceTexture,
+    valid: Bool,
+    world_from_camera: Double,
+    intrinsics: Double,
+    scene_size: float,
+    stride: int,
+) -> FrameCounts:
+    """A1 and A2 counted per object over every ``stride``-th pixel of a frame, valid (H, W)."""
+    height, width = valid.shape
+    pixels = pixel_centres(width, height, stride)
+    points = visible_points(rays, scene, world_from_camera, intrinsics, pixels)
+    owner = np.where(points.face >= 0, scene.face_object[points.face], -1)
+    good = valid[::stride, ::stride].ravel() & (owner >= 0)
+    mirrored = good & mirror_hits_emitter(rays, points, emission, scene_size)
+    number = len(scene.objects)
+    return FrameCounts(
+        mirrored=np.bincount(owner[mirrored], minlength=number),
+        valid=np.bincount(owner[good], minlength=number),
+    )
+
+
+def choose_target_frames(counts: Iterable[FrameCounts]) -> tuple[Int, Int]:
+    """Per object: the frame with most pixels in A1 and A2, and how many those are.
+
+    An object that mirrors an emitter in no frame takes the frame with most valid pixels (count 0);
+    an object without any valid pixel gets frame -1.
+    """
+    frames = list(counts)
+    mirrored = np.stack([frame.mirrored for frame in frames])
+    valid = np.stack([frame.valid for frame in frames])
+    target = np.where(mirrored.max(axis=0) > 0, mirrored.argmax(axis=0), valid.argmax(axis=0))
+    target = np.where(valid.max(axis=0) > 0, target, -1)
+    return target.astype(np.int32), mirrored.max(axis=0).astype(np.int32)
+
+
+def object_pixels(
+    owner: Int,
+    valid: Bool,
+    highlight: Bool,
+    index: int,
+    limit: int,
+    pick: Callable[[int], npt.NDArray[np.int64]],
+) -> npt.NDArray[np.int64]:
+    """Flat indices of the pixels of object ``index`` to fit, at most ``limit``.
+
+    owner (H, W): object per pixel; valid (H, W); highlight (H, W): A1. Pixels next to another
+    object are left out (they mix both). Where there are more than ``limit``, ``pick(n)`` orders
+    them at random and half of the pixels are taken within 30 pixels of a mirrored emitter, where
+    the lobe shows.
+    """
+    own = owner == index
+    inner = ndimage.binary_erosion(own, np.ones((3, 3)))
+    candidates = np.flatnonzero(inner & valid)
+    if len(candidates) <= limit:
+        return candidates
+    candidates = candidates[pick(len(candidates))]
+    if not (highlight & own).any():
+        return np.sort(candidates[:limit])
+    distance = ndimage.distance_transform_edt(~(highlight & own)).ravel()[candidates]
+    near, far = candidates[distance <= 30], candidates[distance > 30]
+    take = min(len(near), max(limit // 2, limit - len(far)))
+    return np.sort(np.concatenate([near[:take], far[: limit - take]]))

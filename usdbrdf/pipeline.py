@@ -1,0 +1,92 @@
+"""The method on one page.
+
+A capture becomes a USD asset in four steps. Each opens the stage composed from the layers weaker
+than its own (never the artist's), and writes one layer and its textures; so anyone can stop after a
+step, look, override in edits.usda, and go on.
+
+    ingest   files        -> scan.usdc       geometry, one prim per object, cameras as captured
+    texture  frames       -> texturing.usda  L_d, the lit diffuse radiance: median of what was seen
+    shade    L_d          -> shading.usda    irradiance S by ray tracing, albedo = pi L_d / S
+    fit      target frame -> material.usda   roughness and specular of each object
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from usdbrdf.errors import OwnershipConflict
+from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import edited_files, prepare_asset_folder
+from usdbrdf.job.stage import StageResult
+from usdbrdf.scan.ingest_options import IngestOptions
+from usdbrdf.stage.adopt import adopt
+from usdbrdf.stage.asset import Asset
+from usdbrdf.steps.fit import FitOptions, fit
+from usdbrdf.steps.ingest import ingest
+from usdbrdf.steps.shade import ShadeOptions, shade
+from usdbrdf.steps.texture import TextureOptions, texture
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions:
+    """The options of all four steps."""
+
+    ingest: IngestOptions = field(default_factory=IngestOptions)
+    texture: TextureOptions = field(default_factory=TextureOptions)
+    shade: ShadeOptions = field(default_factory=ShadeOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+
+
+def convert(
+    capture: str | Path,
+    output: str | Path,
+    options: ConvertOptions | None = None,
+    *,
+    adapter: str | None = None,
+) -> dict[str, StageResult]:
+    """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
+
+    capture   folder or file that one of the adapters reads
+    output    asset folder, made if absent; its root layer is OUTPUT/<name>.usda
+    returns   what each step found, by name
+
+    Raises UsdBrdfError (see ``usdbrdf.errors``); an interrupted or failed call leaves what was
+    valid before, and the same call again goes on where it stopped.
+    """
+    chosen = options or ConvertOptions()
+    with working_on(output) as asset:
+        return {
+            "ingest": ingest(Path(capture), asset, chosen.ingest, adapter),
+            "texture": texture(asset, chosen.texture),
+            "shade": shade(asset, chosen.shade),
+            # Joint refinement of L_d and the lobes over all views belongs here: it would hand the
+            # debiased L_d back to ``shade`` and its lobes to ``fit``.
+            "fit": fit(asset, chosen.fit),
+        }
+
+
+@contextmanager
+def working_on(
+    folder: str | Path, *, hand_edits: str = "refuse", wait_s: float = 0.0
+) -> Iterator[Asset]:
+    """Prepare and lock an asset folder for one or more steps.
+
+    hand_edits  what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
+                "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
+    """
+    state = prepare_asset_folder(Path(folder))
+    with folder_lock(state, wait_s):
+        asset = Asset.at(Path(folder))
+        edited = edited_files(asset.folder)
+        if edited and hand_edits == "refuse":
+            raise OwnershipConflict(
+                f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run again "
+                "with --adopt to keep the changes beside edits.usda, or --discard to drop them. "
+                "[ownership.edited]"
+            )
+        if edited and hand_edits == "adopt":
+            adopt(asset, [asset.folder / file for file in edited])
+        yield asset

@@ -1,0 +1,89 @@
+"""The bright part of the surface, as triangles that rays can be sent to on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.geometry.texels import Texels
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+
+# Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
+# cosine-distributed ones find everything dimmer well enough.
+_BRIGHT = 6.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lights:
+    """K triangles and a density over their surface.
+
+    face         (K,) int32, indices into the scene's triangles
+    cumulative   (K,) float64, ascending to 1: probability of picking one of the first k
+    density      (F,) float32, probability per m^2 of a point on any triangle of the scene (0 on
+                 those that are no light)
+    corners      (F, 3, 3) float32, metres; normals (F, 3) float32, unit
+    """
+
+    face: Int
+    cumulative: Double
+    density: Float
+    corners: Float
+    normals: Float
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        return self.face, self.cumulative, self.density, self.corners, self.normals
+
+
+def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Lights:
+    """Triangles whose mean L_d is bright, picked in proportion to area times radiance.
+
+    radiance (T, 3): L_d per texel. Triangles smaller than a texel take the texel under their
+    centre through their neighbours' mean, so that no lit triangle is left out.
+    """
+    brightness = radiance.max(axis=1)
+    weight = np.where(texels.interior, texels.area, 0)
+    power = np.bincount(texels.face, brightness * weight, len(scene.triangles))
+    covered = np.bincount(texels.face, weight, len(scene.triangles))
+    mean = _mean_per_face(scene, texels, brightness, power, covered)
+
+    corners = scene.points[scene.triangles].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(normal, axis=-1)
+    area = doubled / 2
+    scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
+    bright = (mean > _BRIGHT * scene_mean) & (area > 0)
+    share = np.where(bright, mean * area, 0)
+    total = share.sum()
+    face = np.flatnonzero(bright).astype(np.int32)
+    density = np.zeros(len(area), np.float32)
+    density[face] = share[face] / total / area[face]
+    return Lights(
+        face=face,
+        cumulative=np.cumsum(share[face]) / total if len(face) else np.zeros(0),
+        density=density,
+        corners=corners.astype(np.float32),
+        normals=(normal / np.maximum(doubled, 1e-30)[:, None]).astype(np.float32),
+    )
+
+
+def _mean_per_face(
+    scene: Scene, texels: Texels, brightness: Float, power: Double, covered: Double
+) -> Double:
+    """Mean brightness of each face; faces without a texel centre read the texel at their centroid."""
+    mean = power / np.maximum(covered, 1e-30)
+    bare = np.flatnonzero(covered <= 0)
+    if len(bare):
+        centre = np.floor(texels.corner_pixel[bare].mean(axis=1)).astype(np.int64)
+        size = texels.resolution[scene.face_object[bare]]
+        centre = np.clip(centre, 0, size - 1)
+        pixel = texels.first_pixel[scene.face_object[bare]] + centre[:, 1] * size[:, 0]
+        mean[bare] = brightness[texels.nearest_texel[pixel + centre[:, 0]]]
+    return mean

@@ -1,0 +1,64 @@
+"""Opening the stage as a given step of the pipeline may see it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.header import Provenance, new_layer, read_header
+from usdbrdf.stage.usd_errors import in_one_line
+
+
+def open_weaker(asset: Asset, role: str) -> Usd.Stage:
+    """The stage that the stage ``role`` builds upon: only the layers weaker than its own.
+
+    Never edits.usda: what an artist overrides must not flow back into the measurement.
+    """
+    return _sublayered(asset, ROLES[: ROLES.index(role)])
+
+
+def open_measured(asset: Asset) -> Usd.Stage:
+    """All layers that the tool wrote, without the artist's."""
+    return _sublayered(asset, ROLES)
+
+
+def open_edited(asset: Asset) -> Usd.Stage:
+    """The asset as everybody else opens it: the root layer, with the artist's opinions."""
+    return open_stage(asset.root_layer)
+
+
+def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
+    """A stage that composes without errors, from the files as they are now."""
+    subject = layer if isinstance(layer, Path) else layer.subLayerPaths[0]
+    try:
+        stage = Usd.Stage.Open(str(layer) if isinstance(layer, Path) else layer)
+        for used in stage.GetUsedLayers():
+            # Another stage of this process may hold a layer from before it was written anew.
+            if not used.anonymous:
+                used.Reload()
+        problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
+    except Tf.ErrorException as error:
+        raise InputRefused(
+            f"{subject}: USD cannot open it: {in_one_line(error)}. [stage.open]"
+        ) from error
+    if problems:
+        raise InputRefused(f"{subject}: the stage does not compose: {problems[0]}. [stage.open]")
+    return stage
+
+
+def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
+    layers = [asset.layer(role) for role in roles]
+    for layer in layers:
+        if not layer.is_file():
+            raise InputRefused(
+                f"{layer}: the layer is missing. Run the stage that writes it first. "
+                "[stage.missing]"
+            )
+    header = read_header(layers[0])
+    root = new_layer(header, Provenance(role="view", version="1"))
+    root.subLayerPaths = [str(layer) for layer in reversed(layers)]
+    return open_stage(root)

@@ -1,0 +1,79 @@
+"""What the fitting stage adds: the specular lobe of every material, and how sure we are of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from pxr import Sdf
+
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.author import apply_schema, attribute, over
+from usdbrdf.stage.export import export
+from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.looks import SHADED, Shown, author_look_materials, author_looks
+from usdbrdf.stage.preview_surface import SURFACE, lobe, preview_surface_from_fit
+from usdbrdf.stage.records import FittedObject
+from usdbrdf.stage.schema import verify
+from usdbrdf.stage.scopes import Scopes
+
+__all__ = ["FittedObject", "write_material_layer"]
+
+Types = Sdf.ValueTypeNames
+
+
+def write_material_layer(
+    path: Path,
+    asset: Asset,
+    header: StageHeader,
+    provenance: Provenance,
+    objects: Sequence[FittedObject],
+) -> None:
+    """Write material.usda to ``path``."""
+    verify()
+    scopes = Scopes.of(asset)
+    layer = new_layer(header, provenance)
+    over(layer, scopes.root)
+    for item in objects:
+        _author_facts(over(layer, item.prim_path), item)
+        if _known(item):
+            _author_lobe(layer, scopes.path("materials", item.identifier), item)
+    looks = {
+        "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
+        "specular": author_look_materials(layer, scopes, "specular", _greys(objects, "psi")),
+    }
+    author_looks(layer, scopes, looks, selected=SHADED)
+    export(layer, path, folder=asset.layer("material").parent)
+
+
+def _author_lobe(layer: Sdf.Layer, material: str, item: FittedObject) -> None:
+    lobe(layer, material, *preview_surface_from_fit(item.phi, item.psi))
+    shader = over(layer, f"{material}/{SURFACE}")
+    attribute(shader, "inputs:metallic", Types.Float, 0.0)
+    attribute(shader, "inputs:useSpecularWorkflow", Types.Int, 0)
+
+
+def _author_facts(prim: Sdf.PrimSpec, item: FittedObject) -> None:
+    apply_schema(prim, "UsdBrdfMaterialFitAPI")
+    prefix = "usdBrdf:fit"
+    numbers = {"phi": item.phi, "psi": item.psi, "cost": item.cost, "evidence": item.evidence}
+    for name, value in numbers.items():
+        if math.isfinite(value):
+            attribute(prim, f"{prefix}:{name}", Types.Float, float(value), uniform=True)
+    attribute(prim, f"{prefix}:status", Types.Token, item.status, uniform=True)
+    attribute(prim, f"{prefix}:targetFrame", Types.Int, int(item.target_frame), uniform=True)
+    attribute(prim, f"{prefix}:numPixels", Types.Int, int(item.num_pixels), uniform=True)
+    attribute(prim, f"{prefix}:method", Types.Token, item.method, uniform=True)
+
+
+def _known(item: FittedObject) -> bool:
+    return math.isfinite(item.phi) and math.isfinite(item.psi)
+
+
+def _greys(objects: Sequence[FittedObject], parameter: str) -> list[tuple[str, str, Shown]]:
+    """Each object's parameter as a grey; None where it is not known."""
+    return [
+        (item.prim_path, item.identifier, (getattr(item, parameter),) * 3 if _known(item) else None)
+        for item in objects
+    ]

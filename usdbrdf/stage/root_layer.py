@@ -1,0 +1,44 @@
+"""The layers that hold no measurement: root, the artist's edits, and layers still to come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.author import over
+from usdbrdf.stage.export import export
+from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.scopes import Scopes
+
+_VERSION = "1"  # of the folder's layout; these layers outlive the version of the tool
+
+
+def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
+    """NAME.usda: the sublayers, strongest first, and metadata. Written once, never again."""
+    layer = new_layer(header, Provenance(role="root", version=_VERSION))
+    layer.documentation = (
+        "Captured scene with measured materials. Put your own opinions into edits.usda, the "
+        "strongest layer: no tool writes it again. The files in layers/ are regenerated."
+    )
+    layer.subLayerPaths = [
+        f"./{asset.edits_layer.name}",
+        *(f"./layers/{asset.layer(role).name}" for role in reversed(ROLES)),
+    ]
+    # This one can be said in a root layer only.
+    layer.pseudoRoot.SetInfo("renderSettingsPrimPath", Scopes.of(asset).path("render", "capture"))
+    export(layer, path, folder=asset.folder)
+
+
+def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:
+    """edits.usda: empty, for the artist. Written once, never again."""
+    layer = new_layer(header, Provenance(role="edits", version=_VERSION))
+    layer.documentation = "Yours: stronger than everything that was measured, never overwritten."
+    over(layer, f"/{header.name}")
+    export(layer, path, folder=asset.folder)
+
+
+def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
+    """A layer without opinions, so that the root composes before the stage ``role`` has run."""
+    layer = new_layer(header, Provenance(role=role, version=_VERSION), state="pending")
+    over(layer, f"/{header.name}")
+    export(layer, path, folder=path.parent)

@@ -1,0 +1,83 @@
+"""Step 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.progress import say
+from usdbrdf.job.stage import StageResult, StageRun
+from usdbrdf.scan.adapters import read_scan
+from usdbrdf.scan.ingest_options import IngestOptions
+from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.header import StageHeader
+from usdbrdf.stage.root_layer import write_edits, write_pending_layer, write_root
+from usdbrdf.stage.scan_layer import write_scan_layer
+from usdbrdf.steps.step import Step, hash_of_files
+
+
+def ingest(
+    capture: Path,
+    asset: Asset,
+    options: IngestOptions,
+    adapter: str | None = None,
+    *,
+    plugins: bool = True,
+) -> StageResult:
+    """Read and check a capture and write it as the weakest layer of ``asset``.
+
+    Raises InputRefused for a capture that cannot be used; nothing is published then.
+    """
+    parameters: dict[str, Any] = {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in asdict(options).items()
+        if key not in ("mesh", "objects", "allow_outside")
+    }
+    step = Step(
+        asset=asset,
+        name="ingest",
+        role="scan",
+        parameters={"adapter": adapter or "recognised", **parameters},
+        inputs=_inputs(capture, options),
+    )
+
+    def work(run: StageRun) -> dict[str, Any]:
+        scan = read_scan(capture, options, adapter, plugins=plugins)
+        for warning in scan.warnings:
+            say(f"warning: {warning}")
+        header = StageHeader.of_scan(asset.name, scan)
+        write_scan_layer(
+            run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, step.provenance
+        )
+        write_root(run.output_once(asset.root_layer.name), asset, header)
+        write_edits(run.output_once(asset.edits_layer.name), asset, header)
+        for role in ROLES[1:]:
+            name = f"layers/{asset.layer(role).name}"
+            write_pending_layer(run.output_once(name), role, header)
+        return {
+            "adapter": scan.adapter,
+            "frames": len(scan.frames),
+            "objects": len(scan.objects),
+            "triangles": len(scan.mesh.triangles),
+            "radiometric": scan.frames.radiometric,
+            "counts": scan.counts,
+            "warnings": list(scan.warnings),
+        }
+
+    return step.run(work)
+
+
+def _inputs(capture: Path, options: IngestOptions) -> dict[str, str]:
+    """Hashes of all that ingest may read: the capture's folder, and files named by options."""
+    folder = capture if capture.is_dir() else capture.parent
+    if not capture.exists():
+        raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    inputs = {"capture": hash_of_files(files, folder)}
+    for name in ("mesh", "objects"):
+        path = getattr(options, name)
+        if path is not None and path.is_file():
+            inputs[name] = hash_of_files([path])
+    return inputs

@@ -1,0 +1,169 @@
+"""Step 2: frames become the lit diffuse texture L_d and its companions, one atlas per object."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.errors import UsageError
+from usdbrdf.files.images import write_exr
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.geometry.texels import Texels, texels_from_atlas
+from usdbrdf.geometry.unwrap import unwrap
+from usdbrdf.job.progress import progress, say
+from usdbrdf.job.stage import StageResult, StageRun
+from usdbrdf.scan.scan import Frames
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.read import frames_from_stage, open_weaker, scene_from_stage
+from usdbrdf.stage.records import Aov, TexturedObject
+from usdbrdf.stage.texturing_layer import write_texturing_layer
+from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
+from usdbrdf.texturing import psquare
+from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
+from usdbrdf.texturing.texel_size import texel_size_from_frames
+
+Float = npt.NDArray[np.float32]
+
+# In the coverage map.
+MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureOptions:
+    """texel_size in metres (None: the frames' own median pixel footprint); quantile of the
+    observations that becomes L_d; max_texels: a chosen texel size is coarsened to stay below."""
+
+    texel_size: float | None = None
+    quantile: float = 0.5
+    max_texels: int = 4_000_000
+
+    def __post_init__(self) -> None:
+        if self.texel_size is not None and not self.texel_size > 0:
+            raise UsageError(
+                f"--texel-size {self.texel_size}: not a positive length. [usage.option]"
+            )
+        if not 0 < self.quantile < 1:
+            raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
+
+
+def texture(asset: Asset, options: TextureOptions) -> StageResult:
+    """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
+    layers = weaker_layers(asset, "texturing")
+    stage = open_weaker(asset, "texturing")
+    frames = frames_from_stage(stage)
+    step = Step(
+        asset=asset,
+        name="texture",
+        role="texturing",
+        parameters=asdict(options),
+        inputs={**layers, "frames": hash_of_files(frames.image_paths)},
+    )
+
+    def work(run: StageRun) -> dict[str, Any]:
+        scene = scene_from_stage(stage)
+        rays = RayScene(scene.points, scene.triangles)
+        size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)
+        charts = run.checkpoint("charts", lambda: _charts(scene, size))
+        scene = replace(scene, corner_uv=charts["corner_uv"])
+        texels = texels_from_atlas(scene, charts["resolution"])
+        say(f"texture: {len(texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames")
+        observed = _observe(run, texels, scene, rays, frames, options.quantile)
+        return _write(run, step, scene, texels, observed, size, options.quantile)
+
+    return step.run(work)
+
+
+def _charts(scene: Scene, texel_size: float) -> dict[str, npt.NDArray[Any]]:
+    corner_uv, resolution = unwrap(scene, texel_size)
+    return {"corner_uv": corner_uv, "resolution": resolution}
+
+
+def _observe(
+    run: StageRun,
+    texels: Texels,
+    scene: Scene,
+    rays: RayScene,
+    frames: Frames,
+    quantile: float,
+) -> Observation:
+    """All frames, going on from the last saved state of an interrupted run."""
+    saved = run.latest("frames")
+    start, observed = 0, Observation.empty(len(texels))
+    if saved is not None:
+        start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
+    steps = radiance_from_frames(texels, scene, rays, frames, observed, quantile, start)
+    for done in progress(steps, total=len(frames) - start, label="texture", unit="frames"):
+        if done % 16 == 15:
+            run.save_latest("frames", done, observed.arrays())
+    return observed
+
+
+def _write(
+    run: StageRun,
+    step: Step,
+    scene: Scene,
+    texels: Texels,
+    observed: Observation,
+    texel_size: float,
+    quantile: float,
+) -> dict[str, Any]:
+    measured = observed.quantiles.count > 0
+    clipped = ~measured & (observed.clipped > 0)
+    lit = np.where(
+        measured[:, None],
+        psquare.quantile(observed.quantiles, quantile),
+        observed.lower_bound[:, None],
+    )
+    coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
+    spread = np.nan_to_num(psquare.spread(observed.quantiles, quantile))
+    maps: dict[str, tuple[npt.NDArray[Any], float, str]] = {
+        "lit": (inpaint(texels, lit, measured | clipped), 1.0, "W/(m^2 sr)"),
+        "mean": (inpaint(texels, observed.quantiles.mean, measured), 1.0, "W/(m^2 sr)"),
+        "spread": (spread, 1.0, "W/(m^2 sr)"),
+        "samples": (observed.quantiles.count.astype(np.float32), 1 / 32, "1"),
+        "coverage": (coverage, 1.0, "1"),
+    }
+    objects = []
+    for i, obj in enumerate(
+        progress(scene.objects, total=len(scene.objects), label="texture: writing", unit="objects")
+    ):
+        aovs = []
+        for name, (values, scale, unit) in maps.items():
+            file = step.asset.texture(obj.identifier, name)
+            write_exr(run.output(file), texels.image(i, values))
+            aovs.append(Aov(name=name, file=file, scale=scale, unit=unit))
+        own = texels.of_object(i)
+        objects.append(
+            TexturedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                corner_uv=scene.corner_uv[obj.faces],  # type: ignore[index]
+                aovs=tuple(aovs),
+                texel_size=texel_size,
+                seen_fraction=float(measured[own].mean()),
+                clipped_fraction=float(clipped[own].mean()),
+                resolution=(int(texels.resolution[i, 0]), int(texels.resolution[i, 1])),
+                seen=bool((measured | clipped)[own].any()),
+                quantile=quantile,
+            )
+        )
+    write_texturing_layer(
+        run.output(f"layers/{step.asset.layer('texturing').name}"),
+        run.output(f"layers/{step.asset.uv_layer.name}"),
+        step.asset,
+        step.header,
+        step.provenance,
+        objects,
+    )
+    return {
+        "texel_size": texel_size,
+        "texels": len(texels),
+        "measured_fraction": float(measured.mean()),
+        "clipped_fraction": float(clipped.mean()),
+        "unseen_objects": [item.identifier for item in objects if not item.seen],
+    }

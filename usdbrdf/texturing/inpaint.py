@@ -1,0 +1,66 @@
+"""Values for texels that nobody saw, from the nearest seen ones of the same object."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from usdbrdf.geometry.texels import Texels
+
+Float = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+
+_NEIGHBOURS = 8
+# A normal that differs by 90 degrees counts as this share of the object's size in distance: the
+# unseen back of a box is filled from its own sides before the far end of its front.
+_NORMAL_WEIGHT = 0.25
+
+
+def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
+    """Fill ``values`` (T, 3) where ``known`` (T,) is False; known ones are returned unchanged.
+
+    Geometric mean of the 8 nearest known texels of the same object in position and normal. An
+    object of which nothing is known takes the nearest known texels of the scene; a scene of which
+    nothing is known becomes zero.
+    """
+    filled = np.where(known[:, None], values, 0).astype(np.float32)
+    if not known.any():
+        return filled
+    orphans = []
+    for i in range(len(texels.resolution)):
+        own = np.arange(*texels.of_object(i).indices(len(texels)))
+        missing, source = own[~known[own]], own[known[own]]
+        if not len(missing):
+            continue
+        if not len(source):
+            orphans.append(missing)
+            continue
+        position = texels.position[own]
+        weight = _NORMAL_WEIGHT * float(np.linalg.norm(np.ptp(position, axis=0)))
+        filled[missing] = _nearest_mean(texels, values, source, missing, weight)
+    if orphans:
+        filled[np.concatenate(orphans)] = _nearest_mean(
+            texels, values, np.flatnonzero(known), np.concatenate(orphans), 0.0
+        )
+    return filled
+
+
+def _nearest_mean(
+    texels: Texels,
+    values: Float,
+    source: npt.NDArray[np.int64],
+    missing: npt.NDArray[np.int64],
+    normal_weight: float,
+) -> Float:
+    def feature(index: npt.NDArray[np.int64]) -> Float:
+        return np.concatenate(
+            [texels.position[index], normal_weight * texels.normal[index]], axis=-1
+        )
+
+    tree = cKDTree(feature(source))
+    k = min(_NEIGHBOURS, len(source))
+    _, nearest = tree.query(feature(missing), k=k, workers=-1)
+    neighbours = values[source][nearest.reshape(len(missing), k)]
+    logarithm = np.log(np.maximum(neighbours, 1e-6))
+    return np.asarray(np.exp(logarithm.mean(axis=1)), np.float32)

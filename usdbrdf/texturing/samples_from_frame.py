@@ -1,0 +1,221 @@
+"""What one frame says about each texel: visible, valid, and which radiance.
+
+The loop is over texels, not pixels. A texel takes a sample where it faces the camera, where the
+3 x 3 pixels around its projection all show its own object near its own tangent plane (so it is
+unoccluded, and away from depth edges and the image border), and where every pixel of its footprint
+lies between noise floor and saturation in every channel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.kernel import kernel, parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+# Seen flatter than this a texel's footprint is smeared over its neighbours.
+_MIN_COSINE = 0.1
+# Sub-samples of a texel's footprint per side, at most.
+_MAX_TAPS = 4
+
+NOTHING, SAMPLE, CLIPPED = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstSurfaces:
+    """What each pixel of one frame sees: object (H, W) int32 (-1: nothing) and the point
+    (H, W, 3) float32 in the world."""
+
+    object: Int
+    point: Float
+
+
+def first_surfaces(
+    rays: RayScene,
+    face_object: Int,
+    world_from_camera: Double,
+    intrinsics: Double,
+    resolution: Int,
+) -> FirstSurfaces:
+    """Trace one ray through every pixel's centre."""
+    width, height = int(resolution[0]), int(resolution[1])
+    origins, directions = camera_rays(world_from_camera, intrinsics, pixel_centres(width, height))
+    hits = rays.closest(origins, directions)
+    seen = np.where(hits.face >= 0, face_object[hits.face], -1).astype(np.int32)
+    point = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
+    return FirstSurfaces(
+        object=seen.reshape(height, width),
+        point=point.reshape(height, width, 3).astype(np.float32),
+    )
+
+
+def samples_from_frame(
+    texels: Texels,
+    texel_object: Int,
+    surfaces: FirstSurfaces,
+    radiance: Float,
+    valid: Bool,
+    clipped: Bool,
+    world_from_camera: Double,
+    intrinsics: Double,
+) -> tuple[npt.NDArray[np.int8], Float]:
+    """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, but a pixel of its footprint is saturated),
+    (T,) int8, and the radiance of the samples, (T, 3) float32.
+
+    radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
+    intrinsics fx, fy, cx, cy.
+    """
+    camera_from_world = np.linalg.inv(world_from_camera)
+    kind = np.zeros(len(texels), np.int8)
+    values = np.zeros((len(texels), 3), np.float32)
+    _sample(
+        texels.position,
+        texels.geometric_normal,
+        texels.step_x,
+        texels.step_y,
+        texel_object,
+        surfaces.object,
+        surfaces.point,
+        radiance,
+        valid,
+        clipped,
+        camera_from_world,
+        world_from_camera[:3, 3].copy(),
+        np.asarray(intrinsics, np.float64),
+        kind,
+        values,
+    )
+    return kind, values
+
+
+@kernel
+def _project(p, sx, sy, dx, dy, k, m):  # type: ignore[no-untyped-def]
+    """Pixel of the point p + dx sx + dy sy and its depth in front of the camera."""
+    x = p[0] + dx * sx[0] + dy * sy[0]
+    y = p[1] + dx * sx[1] + dy * sy[1]
+    z = p[2] + dx * sx[2] + dy * sy[2]
+    depth = -(m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3])
+    if depth <= 1e-6:
+        return 0.0, 0.0, -1.0
+    u = k[2] + k[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+    v = k[3] - k[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+    return u, v, depth
+
+
+@parallel_kernel
+def _sample(
+    position: Float,
+    normal: Float,
+    step_x: Float,
+    step_y: Float,
+    texel_object: Int,
+    seen_object: Int,
+    seen_point: Float,
+    radiance: Float,
+    valid: Bool,
+    clipped: Bool,
+    camera_from_world: Double,
+    eye: Double,
+    intrinsics: Double,
+    kind: npt.NDArray[np.int8],
+    values: Float,
+) -> None:
+    height, width = valid.shape
+    for t in prange(len(position)):
+        p = position[t]
+        n = normal[t]
+        wx = eye[0] - p[0]
+        wy = eye[1] - p[1]
+        wz = eye[2] - p[2]
+        distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+        if n[0] * wx + n[1] * wy + n[2] * wz < _MIN_COSINE * distance:
+            continue
+        sx = step_x[t]
+        sy = step_y[t]
+        u, v, depth = _project(p, sx, sy, 0.0, 0.0, intrinsics, camera_from_world)
+        column = int(np.floor(u))
+        row = int(np.floor(v))
+        if depth < 0 or column < 1 or row < 1 or column > width - 2 or row > height - 2:
+            continue
+        pixel_size = depth / intrinsics[0]
+        if not _shows_surface(
+            row, column, p, n, texel_object[t], pixel_size, seen_object, seen_point
+        ):
+            continue
+        ux, vx, _ = _project(p, sx, sy, 1.0, 0.0, intrinsics, camera_from_world)
+        uy, vy, _ = _project(p, sx, sy, 0.0, 1.0, intrinsics, camera_from_world)
+        span_x = np.sqrt((ux - u) ** 2 + (vx - v) ** 2)
+        span_y = np.sqrt((uy - u) ** 2 + (vy - v) ** 2)
+        taps_x = min(_MAX_TAPS, max(1, int(np.ceil(span_x))))
+        taps_y = min(_MAX_TAPS, max(1, int(np.ceil(span_y))))
+        kind[t] = SAMPLE
+        total = np.zeros(3)
+        for a in range(taps_x):
+            for b in range(taps_y):
+                dx = (a + 0.5) / taps_x - 0.5
+                dy = (b + 0.5) / taps_y - 0.5
+                su, sv, _ = _project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
+                found = _bilinear(su, sv, radiance, valid, clipped, total)
+                if found != SAMPLE and kind[t] != CLIPPED:
+                    kind[t] = found
+        for c in range(3):
+            values[t, c] = total[c] / (taps_x * taps_y)
+
+
+@kernel
+def _shows_surface(
+    row: int,
+    column: int,
+    p: Float,
+    n: Float,
+    own: int,
+    pixel_size: float,
+    seen_object: Int,
+    seen_point: Float,
+) -> bool:
+    """Do the 3 x 3 pixels around show object ``own``, within a pixel's size of the tangent plane?"""
+    for j in range(row - 1, row + 2):
+        for i in range(column - 1, column + 2):
+            if seen_object[j, i] != own:
+                return False
+            s = seen_point[j, i]
+            off = (s[0] - p[0]) * n[0] + (s[1] - p[1]) * n[1] + (s[2] - p[2]) * n[2]
+            if abs(off) > pixel_size:
+                return False
+    return True
+
+
+@kernel
+def _bilinear(
+    u: float, v: float, radiance: Float, valid: Bool, clipped: Bool, total: Double
+) -> int:
+    """Add the image's value at pixel coordinates (u, v) to ``total`` if all four pixels are valid."""
+    height, width = valid.shape
+    x = min(max(u - 0.5, 0.0), width - 1.001)
+    y = min(max(v - 0.5, 0.0), height - 1.001)
+    i = int(x)
+    j = int(y)
+    fx = x - i
+    fy = y - j
+    found = SAMPLE
+    for b in range(2):
+        for a in range(2):
+            w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
+            if clipped[j + b, i + a]:
+                found = CLIPPED
+            elif not valid[j + b, i + a] and found != CLIPPED:
+                found = NOTHING
+            for c in range(3):
+                total[c] += w * radiance[j + b, i + a, c]
+    return found

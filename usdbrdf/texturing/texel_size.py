@@ -1,0 +1,49 @@
+"""A texel size from the capture itself: what one pixel covers of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.scan.scan import Frames
+
+_RAYS_PER_FRAME = 600
+# An atlas is never full; this share of its area is charts.
+_PACKING = 0.7
+
+
+def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_texels: int) -> float:
+    """Median pixel footprint in metres, sqrt(area that one pixel covers), over all frames; larger
+    if the surface would otherwise need more than ``max_texels``. Two significant digits.
+
+    Raises InputRefused if no camera ray meets the mesh.
+    """
+    footprints = []
+    for i in range(len(frames)):
+        width, height = (int(n) for n in frames.resolution[i])
+        stride = max(1, int(np.sqrt(width * height / _RAYS_PER_FRAME)))
+        origins, directions = camera_rays(
+            frames.world_from_camera[i], frames.intrinsics[i], pixel_centres(width, height, stride)
+        )
+        hits = rays.closest(origins, directions)
+        met = hits.face >= 0
+        corners = scene.points[scene.triangles[hits.face[met]]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        cosine = np.abs(np.einsum("rd,rd->r", normal, directions[met]))
+        pixel = hits.distance[met] / np.sqrt(frames.intrinsics[i, 0] * frames.intrinsics[i, 1])
+        footprints.append(pixel / np.sqrt(np.maximum(cosine, 0.1)))
+    footprint = np.concatenate(footprints)
+    if not len(footprint):
+        raise InputRefused(
+            "no camera ray meets the mesh, so no texel size can be chosen. Check that poses and "
+            "mesh share one frame of reference and unit. [texturing.texel-size]"
+        )
+    corners = scene.points[scene.triangles].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1).sum() / 2
+    size = max(float(np.median(footprint)), float(np.sqrt(area / (_PACKING * max_texels))))
+    return float(f"{size:.2g}")
