@@ -10,7 +10,8 @@ BSDF in Python runs only in Mitsuba's vectorised variants. On Debian or Ubuntu:
     python samples/make_study.py                  # rewrites samples/study
     python samples/make_study.py --samples 16 --output /tmp/draft
 
-``study_scene`` holds the room, ``study_brdf`` the BRDF, ``study_camera`` the camera and its sensor.
+``study_scene`` holds the room, built of ``study_shapes``; ``study_brdf`` the BRDF;
+``study_camera`` the camera and its sensor.
 """
 
 from __future__ import annotations
@@ -37,10 +38,11 @@ from study_camera import (
     saturation_radiance,
     write_exr,
 )
-from study_scene import StudyObject, study_objects, vertex_normals
+from study_scene import StudyObject, study_objects
+from study_shapes import vertex_normals
 
 SEED = 20
-SAMPLES_PER_PASS = 64  # bounds the memory of the vectorised path tracer
+SAMPLES_PER_PASS = 256  # bounds the memory of the vectorised path tracer
 MAX_DEPTH = 14  # path vertices
 ROULETTE_DEPTH = 4
 

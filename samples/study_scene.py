@@ -1,7 +1,7 @@
 """The sample's room: geometry, albedo and materials, in NumPy alone.
 
 Units are metres, z is up, the room's corner is the origin. Every object is closed but for the sides
-on which it stands or hangs, because no camera could ever see those.
+on which it stands or hangs: no camera could ever see those.
 """
 
 from __future__ import annotations
@@ -10,11 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+from study_shapes import Array, Mesh, Triangles, box, disc, joined, rectangle, sphere, turned
 
-Array = npt.NDArray[np.float64]
-Triangles = npt.NDArray[np.int32]
-Mesh = tuple[Array, Triangles]
 Pattern = Callable[[Array], Array]
 
 ROOM = (3.8, 3.2, 2.4)
@@ -40,108 +37,6 @@ class StudyObject:
     phi: float
     psi: float
     emission: tuple[float, float, float] = BLACK
-
-
-# ---- shapes ------------------------------------------------------------------------------------
-
-
-def joined(parts: list[Mesh]) -> Mesh:
-    """Several meshes as one; vertices stay apart, so edges between the parts stay sharp."""
-    offsets = np.cumsum([0] + [len(points) for points, _ in parts[:-1]])
-    return (
-        np.concatenate([points for points, _ in parts]),
-        np.concatenate([f + o for (_, f), o in zip(parts, offsets, strict=True)]).astype(np.int32),
-    )
-
-
-def rectangle(corner: Array, side_u: Array, side_v: Array, edge: float) -> Mesh:
-    """A flat grid of triangles about ``edge`` long; its normal is ``side_u x side_v``."""
-    nu, nv = (max(1, round(float(np.linalg.norm(side)) / edge)) for side in (side_u, side_v))
-    u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
-    points = corner + u.reshape(-1, 1) * side_u + v.reshape(-1, 1) * side_v
-    return points, lattice_triangles(nv, nu, nu + 1)
-
-
-def lattice_triangles(rows: int, columns: int, row_stride: int, wrap: bool = False) -> Triangles:
-    """Two triangles per cell of a lattice; ``wrap`` closes the last column onto the first."""
-    r, c = (a.ravel() for a in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    right = (c + 1) % columns if wrap else c + 1
-    a, b = r * row_stride + c, r * row_stride + right
-    d, e = (r + 1) * row_stride + c, (r + 1) * row_stride + right
-    return np.concatenate([np.stack([a, b, e], 1), np.stack([a, e, d], 1)]).astype(np.int32)
-
-
-def box(low: tuple[float, ...], high: tuple[float, ...], edge: float, without: str = "") -> Mesh:
-    """An axis-aligned box seen from outside, without the named sides: of ``w e s n d u``."""
-    lo, hi = np.array(low), np.array(high)
-    x, y, z = np.diag(hi - lo)
-    sides = {
-        "w": (lo, z, y),
-        "e": (lo + x, y, z),
-        "s": (lo, x, z),
-        "n": (lo + y, z, x),
-        "d": (lo, y, x),
-        "u": (lo + z, x, y),
-    }
-    return joined([rectangle(*sides[s], edge) for s in sides if s not in without])
-
-
-def sphere(centre: tuple[float, ...], radius: float, subdivisions: int) -> Mesh:
-    """An icosahedron, each subdivision of which quarters the triangles."""
-    g = (1 + 5**0.5) / 2
-    signs = [(-1, g), (1, g), (-1, -g), (1, -g)]
-    points = [(a, b, 0.0) for a, b in signs] + [(0.0, a, b) for a, b in signs]
-    points += [(b, 0.0, a) for a, b in signs]
-    faces = "0 11 5 0 5 1 0 1 7 0 7 10 0 10 11 1 5 9 5 11 4 11 10 2 10 7 6 7 1 8"
-    faces += " 3 9 4 3 4 2 3 2 6 3 6 8 3 8 9 4 9 5 2 4 11 6 2 10 8 6 7 9 8 1"
-    unit = np.array(points) / np.hypot(1, g)
-    triangles = np.array(faces.split(), dtype=np.int32).reshape(-1, 3)
-    for _ in range(subdivisions):
-        unit, triangles = quartered(unit, triangles)
-    return np.array(centre) + radius * unit, triangles
-
-
-def quartered(unit: Array, triangles: Triangles) -> Mesh:
-    """Each triangle of a unit sphere split in four, new vertices shared and on the sphere."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    pairs, where = np.unique(edges, axis=0, return_inverse=True)
-    middle = unit[pairs].sum(1)
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    ab, bc, ca = (len(unit) + where.reshape(-1, 3)).T
-    a, b, c = triangles.T
-    split = [[a, ab, ca], [b, bc, ab], [c, ca, bc], [ab, bc, ca]]
-    four = np.concatenate([np.stack(corner, 1) for corner in split]).astype(np.int32)
-    return np.concatenate([unit, middle]), four
-
-
-def turned(centre: tuple[float, float], profile: Array, segments: int) -> Mesh:
-    """A surface of revolution about the vertical; ``profile`` (P, 2) is radius, z from below up."""
-    angle = np.arange(segments) * 2 * np.pi / segments
-    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
-    rings = [
-        np.column_stack([np.array(centre) + r * circle, np.full(segments, z)]) for r, z in profile
-    ]
-    return np.concatenate(rings), lattice_triangles(len(profile) - 1, segments, segments, wrap=True)
-
-
-def disc(centre: tuple[float, float], radius: float, z: float, segments: int, rings: int) -> Mesh:
-    """A horizontal disc seen from above; the middle is a tiny hole closed by a point."""
-    profile = np.array([(radius * k / rings, z) for k in range(rings, 0, -1)])
-    points, triangles = turned(centre, profile, segments)
-    first, last = len(points) - segments, np.arange(segments)
-    fan = np.stack([first + last, first + (last + 1) % segments, np.full(segments, len(points))], 1)
-    tip = np.array([[*centre, z]])
-    return np.concatenate([points, tip]), np.concatenate([triangles, fan]).astype(np.int32)
-
-
-def vertex_normals(points: Array, triangles: Triangles) -> Array:
-    """(V, 3) area-weighted normals: exact on flat sides, smooth on balls and turned shapes."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    area_normal = np.cross(b - a, c - a)
-    normals = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(normals, triangles[:, k], area_normal)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 # ---- albedo patterns: (V, 3) points to (V, 3) colours ------------------------------------------
@@ -239,7 +134,9 @@ def furniture() -> list[StudyObject]:
     drum = np.array([(0.27, z) for z in np.linspace(0, 0.42, 9)])
     pouf = joined([turned((0.58, 2.62), drum, 36), disc((0.58, 2.62), 0.27, 0.42, 36, 6)])
     return [
-        thing("rug", "rug", box((1.15, 1.15, 0), (2.65, 2.05, 0.012), 0.06, "d"), weave, 0.95, 0.02),
+        thing(
+            "rug", "rug", box((1.15, 1.15, 0), (2.65, 2.05, 0.012), 0.06, "d"), weave, 0.95, 0.02
+        ),
         thing(
             "table_top", "table", box((1.45, 1.3, 0.4), (2.35, 1.9, 0.44), 0.05), walnut, 0.08, 0.80
         ),
@@ -252,7 +149,7 @@ def furniture() -> list[StudyObject]:
             0.4,
         ),
         thing(
-            "bookcase", "cabinet", box((0, 0.2, 0), (0.42, 1.05, 1.2), 0.06, "wd"), cream, 0.2, 0.6
+            "bookcase", "cabinet", box((0, 0.9, 0), (0.38, 1.9, 1.1), 0.06, "wd"), cream, 0.2, 0.6
         ),
         thing(
             "sideboard",
@@ -268,9 +165,10 @@ def furniture() -> list[StudyObject]:
 
 def ornaments() -> list[StudyObject]:
     height = np.linspace(0, 1, 21)
-    radius = 0.075 + 0.085 * np.sin(np.pi * height**0.8) ** 2 + 0.02 * height**6
-    vase = turned((3.42, 1.35), np.stack([radius, 0.72 * height], 1), 36)
-    lid = disc((3.42, 1.35), float(radius[-1]), 0.72, 36, 3)
+    radius = 0.10 + 0.12 * np.sin(np.pi * height**0.8) ** 2 + 0.02 * height**6
+    vase = turned((3.48, 1.3), np.stack([radius, 0.95 * height], 1), 36)
+    lid = disc((3.48, 1.3), float(radius[-1]), 0.95, 36, 3)
+    rod = np.array([(0.025, z) for z in np.linspace(0, 1.45, 25)])
     frame = box((1.0, 3.175, 1.1), (2.0, 3.2, 1.8), 0.04, "n")
     return [
         thing("vase", "ornament", joined([vase, lid]), plain(0.05, 0.12, 0.36), 0.06, 0.90),
@@ -285,19 +183,22 @@ def ornaments() -> list[StudyObject]:
         thing(
             "ball_ochre",
             "ornament",
-            sphere((2.7, 2.98, 0.91), 0.16, 3),
+            sphere((2.75, 2.97, 0.95), 0.2, 3),
             plain(0.52, 0.34, 0.08),
             0.30,
             0.50,
         ),
         thing("picture", "picture", frame, painting, 0.04, 0.55),
+        thing(
+            "lamp_rod", "lamp_stand", turned((0.68, 0.62), rod, 10), plain(0.3, 0.3, 0.3), 0.3, 0.5
+        ),
     ]
 
 
 def lamps() -> list[StudyObject]:
     shade = plain(0.10, 0.10, 0.10)
-    globe = sphere((0.24, 0.62, 1.38), 0.18, 3)
-    panel = box((1.5, 0.3, 2.38), (2.7, 1.0, 2.4), 0.10, "u")
+    globe = sphere((0.68, 0.62, 1.6), 0.18, 3)
+    panel = box((1.6, 0.5, 2.38), (2.8, 1.2, 2.4), 0.10, "u")
     return [
         thing("globe_lamp", "lamp", globe, shade, 0.5, 0.5, (11.0, 8.6, 6.0)),
         thing("panel_lamp", "lamp", panel, shade, 0.5, 0.5, (7.2, 7.9, 8.8)),

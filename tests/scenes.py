@@ -184,11 +184,9 @@ def ring_of_poses(count: int, *, radius: float = 1.2, height: float = 1.4) -> Do
     for i in range(count):
         angle = 2 * np.pi * i / count + 0.1
         # Not quite a circle and not quite level: no two frames look alike.
-        centre = middle + [
-            radius * np.cos(angle),
-            0.9 * radius * np.sin(angle),
-            height - 0.4 + 0.2 * np.sin(3 * angle + 1),
-        ]
+        across, along = radius * np.cos(angle), 0.9 * radius * np.sin(angle)
+        up = height - middle[2] + 0.2 * np.sin(3 * angle + 1)
+        centre = middle + np.array([across, along, up])
         poses.append(look_at(centre, middle))
     return np.array(poses)
 

@@ -19,7 +19,13 @@ from pathlib import Path
 
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.lock import folder_lock
-from usdbrdf.job.ownership import edited_files, prepare_asset_folder
+from usdbrdf.job.ownership import (
+    edited_files,
+    make_parents,
+    prepare_asset_folder,
+    removed_if_unused,
+)
+from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.adopt import adopt
@@ -74,19 +80,27 @@ def working_on(
 ) -> Iterator[Asset]:
     """Prepare and lock an asset folder for one or more steps.
 
+    A folder that is made here, its parents too, is removed again if nothing gets written into it.
+
     hand_edits  what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
                 "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
     """
-    state = prepare_asset_folder(Path(folder))
-    with folder_lock(state, wait_s):
-        asset = Asset.at(Path(folder))
-        edited = edited_files(asset.folder)
-        if edited and hand_edits == "refuse":
-            raise OwnershipConflict(
-                f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run again "
-                "with --adopt to keep the changes beside edits.usda, or --discard to drop them. "
-                "[ownership.edited]"
-            )
-        if edited and hand_edits == "adopt":
-            adopt(asset, [asset.folder / file for file in edited])
+    place = Path(folder)
+    new = make_parents(place)
+    state = prepare_asset_folder(place)
+    with folder_lock(state, wait_s), removed_if_unused(new):
+        asset = Asset.at(place)
+        _settle(asset, edited_files(asset.folder), hand_edits)
         yield asset
+
+
+def _settle(asset: Asset, edited: list[str], hand_edits: str) -> None:
+    if edited and hand_edits == "refuse":
+        raise OwnershipConflict(
+            f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run again "
+            "with --adopt to keep the changes beside edits.usda, or --discard to drop them. "
+            "[ownership.edited]"
+        )
+    if edited and hand_edits == "adopt":
+        for copy in adopt(asset, [asset.folder / file for file in edited]):
+            say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.mesh_clean import clean_mesh
+from usdbrdf.geometry.mesh_clean import CleanMesh, clean_mesh
 
 
 def _sphere(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -52,12 +52,67 @@ def test_dead_weight_is_removed_and_counted():
     }
 
 
-def test_nonmanifold_edges_are_counted_and_kept():
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
-    triangles = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]], np.int32)
-    clean = clean_mesh(points, triangles, np.zeros(3, np.int32))
+def _edges(clean: CleanMesh, index: int) -> np.ndarray:
+    """How many triangles of an object share each of its edges, by vertex number."""
+    own = clean.triangles[clean.face_object == index]
+    edges = np.sort(own[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def test_surfaces_are_separated_where_more_than_two_faces_meet():
+    fan = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+    sphere, faces = _sphere(1)
+    points = np.concatenate([sphere + np.float32(5), fan])
+    triangles = np.concatenate([faces, np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]) + len(sphere)])
+    labels = np.repeat([3, 7], [len(faces), 3]).astype(np.int32)
+    clean = clean_mesh(points, triangles.astype(np.int32), labels)
     assert clean.counts["nonmanifold_edges"] == 1
-    assert len(clean.triangles) == 3
+    assert _edges(clean, 7).max() == 1
+    # Nothing has moved, no face is gone, and the sphere is as it was.
+    assert clean.points[clean.triangles].tobytes() == points[triangles].tobytes()
+    assert clean.face_object.tobytes() == labels.tobytes()
+    assert clean.triangles[:-3].tobytes() == faces.tobytes()
+    assert clean.points[: len(sphere)].tobytes() == points[: len(sphere)].tobytes()
+
+
+def test_objects_that_touch_and_leaves_with_two_sides_are_no_damage():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]])
+    triangles = np.array(
+        [
+            [0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0],  # a leaf: every edge of it four times
+            [0, 1, 4], [1, 0, 5],  # two other objects at its stem
+        ],
+        np.int32,
+    )  # fmt: skip
+    labels = np.array([0, 0, 0, 0, 1, 2], np.int32)
+    clean = clean_mesh(corners.astype(np.float32), triangles, labels)
+    assert set(clean.counts.values()) == {0}
+    assert clean.triangles.tolist() == triangles.tolist()
+
+
+def test_a_broken_soup_keeps_its_good_faces_and_their_labels():
+    rng = np.random.default_rng(3)
+    lattice = np.stack(np.meshgrid(*[np.arange(3)] * 3), -1).reshape(-1, 3)
+    points = np.concatenate([lattice, lattice]).astype(np.float32) * np.float32(0.1)
+    triangles = rng.integers(0, len(points), (4000, 3)).astype(np.int32)
+    labels = rng.integers(0, 4, 4000).astype(np.int32)
+    expected: dict[tuple, int] = {}
+    for corners, label in zip(points[triangles].tolist(), labels.tolist(), strict=True):
+        a, b, c = np.array(corners)
+        if np.linalg.norm(np.cross(b - a, c - a)) > 1e-6:
+            turn = min(range(3), key=lambda i: corners[i])
+            face = tuple(map(tuple, corners[turn:] + corners[:turn]))
+            expected.setdefault(face, label)
+    clean = clean_mesh(points, triangles, labels)
+    faces = []
+    for corners in clean.points[clean.triangles].tolist():
+        turn = min(range(3), key=lambda i: corners[i])
+        faces.append(tuple(map(tuple, corners[turn:] + corners[:turn])))
+    assert dict(zip(faces, clean.face_object.tolist(), strict=True)) == expected
+    assert len(faces) == len(expected)
+    removed = clean.counts["degenerate_faces"] + clean.counts["duplicate_faces"]
+    assert len(faces) + removed == len(triangles)
+    assert max(_edges(clean, index).max() for index in range(4)) <= 2
 
 
 def test_tiny_triangles_are_not_taken_for_degenerate_ones():

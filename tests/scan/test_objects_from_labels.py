@@ -19,7 +19,7 @@ def _squares(sides: list[float], **more) -> FileMesh:
     points = np.concatenate(
         [
             np.array([[0, 0, 0], [s, 0, 0], [s, s, 0], [0, 0, 0], [s, s, 0], [0, s, 0]])
-            + [10.0 * i, 0, 0]
+            + np.array([10.0 * i, 0, 0])
             for i, s in enumerate(sides)
         ]
     )

@@ -210,7 +210,7 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
     return built
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def synthetic():
     """The functions above, for tests that need other assets than ``built``."""
     return SimpleNamespace(make_scan=make_scan, build=build, box=box)

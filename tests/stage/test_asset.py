@@ -3,6 +3,7 @@
 import pytest
 from pxr import Sdf
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.stage.asset import Asset, path_in_asset, path_in_layer
 
 
@@ -21,6 +22,12 @@ def test_a_renamed_folder_keeps_the_names_of_its_files(built):
     moved = built.asset.folder.rename(built.asset.folder.with_name("lounge"))
     assert Asset.at(moved).name == "room"
     assert Asset.at(moved).root_layer.is_file()
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "tab\there", "back\\slash", "a:SDF_FORMAT_ARGS:b"])
+def test_a_folder_that_usd_cannot_name_is_refused(tmp_path, name):
+    with pytest.raises(InputRefused, match=r"Choose another folder.+\[stage\.asset_path\]"):
+        Asset.at(tmp_path / name)
 
 
 def test_a_damaged_scan_layer_does_not_hide_the_folder(tmp_path):

@@ -2,15 +2,17 @@
 
 import hashlib
 import resource
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 
-from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
-from usdbrdf.stage.asset import ROLES
+from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsdBrdfError
+from usdbrdf.stage.asset import ROLES, Asset
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer, read_header, read_provenance
+from usdbrdf.stage.root_layer import check_root
 
 
 def layer_files(asset):
@@ -84,6 +86,15 @@ def test_the_root_holds_sublayers_only_and_reads_in_order(built):
         "./layers/scan.usdc",
     ]
     assert not root.rootPrims
+
+
+def test_a_capture_in_other_units_needs_another_folder(built):
+    check_root(built.asset, built.header)
+    check_root(built.asset, replace(built.header, end=99.0))
+    check_root(Asset.at(built.asset.folder.with_name("new")), built.header)
+    for other in (replace(built.header, meters_per_unit=0.01), replace(built.header, up_axis="Y")):
+        with pytest.raises(OwnershipConflict, match=r"new folder.+\[ownership\.units\]"):
+            check_root(built.asset, other)
 
 
 @pytest.mark.parametrize("upto", ROLES)

@@ -1,8 +1,11 @@
 """Every look, composed: what each object is bound to, and what that material shows."""
 
+from dataclasses import replace
+
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
+from usdbrdf.errors import UsdBrdfError
 from usdbrdf.stage.asset import ROLES
 
 GREY = ("spread", "coverage", "samples", "stderr")
@@ -128,6 +131,23 @@ def test_the_shaded_material_of_an_emitter(built):
     assert emission.GetInput("file").Get().path == "../textures/lamp.emission.exr"
     assert shader.GetInput("roughness").GetAttr().HasAuthoredValue()
     assert shader.GetInput("ior").GetAttr().HasAuthoredValue()
+
+
+def test_an_object_that_glows_in_places_reflects_as_well(built):
+    wall, lamp = built.shaded[1], built.shaded[2]
+    both = replace(wall, aovs=(*wall.aovs, *(a for a in lamp.aovs if a.name == "emission")))
+    built.shaded = (built.shaded[0], both, lamp)
+    built.write_layer("shading")
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    shader = surface_of(bound(stage, wall.prim_path))
+    assert source_of(shader, "diffuseColor").GetPath().name == "AlbedoTexture"
+    assert source_of(shader, "emissiveColor").GetPath().name == "EmissionTexture"
+
+
+def test_a_map_that_is_missing_is_our_own_mistake(built):
+    built.shaded = (replace(built.shaded[0], aovs=()), *built.shaded[1:])
+    with pytest.raises(UsdBrdfError, match=r"no albedo map.+\[stage\.aov\]"):
+        built.write_layer("shading")
 
 
 def test_without_a_fit_there_is_no_lobe(built):

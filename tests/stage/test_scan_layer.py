@@ -38,6 +38,22 @@ def test_every_object_is_one_mesh_with_its_own_points(built):
     assert valid, reason
 
 
+def test_copies_of_a_point_are_merged_and_the_surface_stays(tmp_path, synthetic):
+    scan = synthetic.make_scan(tmp_path / "capture")
+    apart = replace(
+        scan.mesh,
+        points=scan.mesh.points[scan.mesh.triangles].reshape(-1, 3),
+        triangles=np.arange(3 * len(scan.mesh.triangles), dtype=np.int32).reshape(-1, 3),
+    )
+    built = synthetic.build(tmp_path / "room", replace(scan, mesh=apart), upto="scan")
+    scene = scene_from_stage(open_weaker(built.asset, "texturing"))
+    assert len(scene.points) == 3 * 8
+    order = np.argsort(scan.mesh.face_object, kind="stable")
+    np.testing.assert_array_equal(
+        scene.points[scene.triangles], scan.mesh.points[scan.mesh.triangles[order]]
+    )
+
+
 def test_names_classes_and_kinds(built):
     stage = stage_of(built)
     prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1")

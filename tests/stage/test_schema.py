@@ -31,6 +31,8 @@ def run_python(code, **environment):
 
 def test_generated_files_are_those_of_the_source(tmp_path):
     pytest.importorskip("jinja2", reason="usdGenSchema needs jinja2")
+    if Usd.GetVersion() < (0, 26, 8):
+        pytest.skip("usd-core brings what usdGenSchema needs from version 26.8 on")
     spec = importlib.util.spec_from_file_location("generate", SCHEMAS / "generate.py")
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)

@@ -1,13 +1,11 @@
-"""A scanned mesh without its dead weight: what was removed is counted, what stays is untouched.
+"""A scanned mesh without its dead weight: what was removed is counted, what stays is not moved.
 
-pymeshlab is licensed under the GPL; it is imported only in the child process that reduces meshes.
+NumPy finds what is wrong and with which objects; only these go through pymeshlab.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +17,6 @@ from usdbrdf.job.child import run_child
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
-
-# No object is reduced below this, or small ones would vanish beside a large one.
-_MIN_TRIANGLES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,40 +38,83 @@ def clean_mesh(
     decimate: int | None = None,
     label: str = "the mesh",
 ) -> CleanMesh:
-    """Drop triangles without area, repeated triangles and unused vertices; reduce if asked.
+    """Drop triangles without area, repeated triangles and unused vertices; separate the surface
+    of an object along edges where more than two of its triangles meet; reduce if asked.
 
-    Vertices that stay keep their bits and their order. A repeated triangle has the same three
-    positions and the same side as an earlier one, of whatever object.
+    Positions keep their bits, what stays its order, and objects without damage their vertices. A
+    repeated triangle has the same three positions and the same side as an earlier one, of whatever
+    object.
 
     decimate  number of triangles wanted in all; each object is reduced in proportion
     label     what the mesh is called in messages
     """
-    counts: dict[str, int] = {}
-    position = welded_ids(points)
-    corners = position[triangles]
-    keep = _has_area(points, triangles, corners)
-    counts["degenerate_faces"] = int((~keep).sum())
-    repeated = keep & _repeated(corners, keep)
-    counts["duplicate_faces"] = int(repeated.sum())
-    keep &= ~repeated
-    if not keep.any():
+    found = _damage(points, triangles, face_object)
+    if not found.keep.any():
         raise InputRefused(
             f"{label}: none of the {len(triangles)} faces has an area. Export it again. "
             "[mesh.empty]"
         )
-    counts["nonmanifold_edges"] = _nonmanifold_edges(corners[keep])
-    triangles, face_object = triangles[keep], face_object[keep]
+    counts = dict(found.counts)
+    num_given, num_before = len(points), int(found.keep.sum())
+    repaired = np.zeros(0, np.int32)
+    if len(found.damaged_sheets):
+        points, triangles, origin = _repaired(points, triangles, found, label)
+        face_object, repaired = face_object[origin], np.unique(found.damaged_sheets // 2)
     if decimate is not None and decimate < len(triangles):
-        before = len(triangles)
-        points, triangles, face_object = _decimated(points, triangles, face_object, decimate, label)
-        counts["decimated_faces"] = before - len(triangles)
+        points, triangles, face_object = _decimated(
+            points, triangles, face_object, repaired, decimate, label
+        )
+        num_given = len(points)
+        counts["decimated_faces"] = num_before - len(triangles)
     used, compact = np.unique(triangles, return_inverse=True)
-    counts["unreferenced_vertices"] = len(points) - len(used)
+    counts["unreferenced_vertices"] = num_given - int((used < num_given).sum())
     return CleanMesh(
         points=np.ascontiguousarray(points[used]),
         triangles=compact.reshape(-1, 3).astype(np.int32),
         face_object=face_object,
         counts=counts,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Damage:
+    """What is wrong with a mesh.
+
+    keep            (F,) bool: neither flat nor repeated
+    void            (F,) bool: flat, or repeated from another object
+    sheet           (F,) int32: 2 x object, + 1 for a face that lies on an earlier one of the same
+                    object with its back to it (the two sides of a leaf are two sheets)
+    damaged_sheets  numbers of the sheets with something to repair
+    """
+
+    keep: Bool
+    void: Bool
+    sheet: Int
+    damaged_sheets: Int
+    counts: dict[str, int]
+
+
+def _damage(points: Float, triangles: Int, face_object: Int) -> _Damage:
+    corners = welded_ids(points)[triangles]
+    flat = ~_has_area(points, triangles, corners)
+    turn = (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    first = _first_equal(np.take_along_axis(corners, turn, axis=1), ~flat)
+    repeated = first != np.arange(len(triangles))
+    keep = ~flat & ~repeated
+    same_place = np.column_stack([np.sort(corners, axis=1), face_object])
+    back = _first_equal(same_place, keep) != np.arange(len(triangles))
+    sheet = (2 * face_object + back[first]).astype(np.int32)
+    branching = _sheets_of_branching_edges(corners[keep], sheet[keep])
+    return _Damage(
+        keep=keep,
+        void=flat | (repeated & (face_object[first] != face_object)),
+        sheet=sheet,
+        damaged_sheets=np.unique(np.concatenate([sheet[~keep], branching])),
+        counts={
+            "degenerate_faces": int(flat.sum()),
+            "duplicate_faces": int(repeated.sum()),
+            "nonmanifold_edges": len(branching),
+        },
     )
 
 
@@ -91,80 +129,70 @@ def _has_area(points: Float, triangles: Int, corners: Int) -> Bool:
     return distinct & ~flat
 
 
-def _repeated(corners: Int, among: Bool) -> Bool:
-    """True for every triangle but the first of those with equal corners in equal cyclic order."""
-    first = corners.argmin(axis=1)
-    cyclic = np.take_along_axis(corners, (first[:, None] + np.arange(3)) % 3, axis=1)
-    rows = np.flatnonzero(among)
-    # lexsort is stable: within a group of equal triangles the file's order is kept.
-    order = rows[np.lexsort(cyclic[rows].T[::-1])]
-    again = (cyclic[order[1:]] == cyclic[order[:-1]]).all(axis=1)
-    repeated = np.zeros(len(corners), np.bool_)
-    repeated[order[1:]] = again
-    return repeated
+def _first_equal(rows: Int, among: Bool) -> npt.NDArray[np.int64]:
+    """(F,) for each row the index of the first equal one, of the rows ``among``; else its own."""
+    chosen = np.flatnonzero(among)
+    # lexsort is stable: within a group of equal rows the file's order is kept.
+    order = chosen[np.lexsort(rows[chosen].T[::-1])]
+    again = np.zeros(len(order), np.bool_)
+    again[1:] = (rows[order[1:]] == rows[order[:-1]]).all(axis=1)
+    group = np.maximum.accumulate(np.where(again, 0, np.arange(len(order))))
+    first = np.arange(len(rows))
+    first[order] = order[group]
+    return first
 
 
-def _nonmanifold_edges(corners: Int) -> int:
-    """Edges shared by more than two triangles."""
-    edges = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    _, uses = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)
-    return int((uses > 2).sum())
+def _sheets_of_branching_edges(corners: Int, sheet: Int) -> Int:
+    """For each edge that more than two triangles of one sheet share, that sheet."""
+    ends = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    edge, owner = ends[:, 0] << 32 | ends[:, 1], np.repeat(sheet, 3)
+    order = np.lexsort((edge, owner))
+    edge, owner = edge[order], owner[order]
+    begins = np.ones(len(edge), np.bool_)
+    begins[1:] = (edge[1:] != edge[:-1]) | (owner[1:] != owner[:-1])
+    first = np.flatnonzero(begins)
+    uses = np.diff(first, append=len(edge))
+    return np.asarray(owner[first[uses > 2]], np.int32)
+
+
+def _repaired(
+    points: Float, triangles: Int, found: _Damage, label: str
+) -> tuple[Float, Int, npt.NDArray[np.int64]]:
+    """Points, triangles and the input face of each. Copies of vertices are appended."""
+    damaged = np.isin(found.sheet, found.damaged_sheets)
+    given = triangles[damaged]
+    # pymeshlab only knows areas of exactly 0, in one mesh: whatever else is void is made a point.
+    given[found.void[damaged]] = given[found.void[damaged], :1]
+    result = run_child(
+        function="usdbrdf.geometry.mesh_filters:repair_sheets",
+        arrays={"points": points, "triangles": given, "sheet": found.sheet[damaged]},
+        parameters={},
+        timeout_s=60 + len(given) / 2000,
+        label=f"{label}: repair of {len(found.damaged_sheets)} damaged objects",
+    )
+    vertex = result["vertex"]
+    copied = np.ones(len(vertex), np.bool_)
+    copied[np.unique(vertex, return_index=True)[1]] = False
+    number = np.where(copied, len(points) + np.cumsum(copied) - 1, vertex).astype(np.int32)
+    origin = np.concatenate([np.flatnonzero(~damaged), np.flatnonzero(damaged)[result["face"]]])
+    order = np.argsort(origin)
+    both = np.concatenate([triangles[~damaged], number[result["triangles"]]])
+    return np.concatenate([points, points[vertex[copied]]]), both[order], origin[order]
 
 
 def _decimated(
-    points: Float, triangles: Int, face_object: Int, target: int, label: str
+    points: Float, triangles: Int, face_object: Int, repaired: Int, target: int, label: str
 ) -> tuple[Float, Int, Int]:
-    """Quadric edge collapse, object by object, in a child process: it may crash or hang."""
     reduced = run_child(
-        function="usdbrdf.geometry.mesh_clean:decimate_objects",
-        arrays={"points": points, "triangles": triangles, "face_object": face_object},
+        function="usdbrdf.geometry.mesh_filters:decimate_objects",
+        arrays={
+            "points": points,
+            "triangles": triangles,
+            "face_object": face_object,
+            "joined": repaired,
+        },
         parameters={"target": target},
         timeout_s=60 + len(triangles) / 2000,
         label=f"{label}: reduction to {target} triangles",
     )
     return reduced["points"], reduced["triangles"], reduced["face_object"]
-
-
-def decimate_objects(
-    arrays: Mapping[str, npt.NDArray[Any]], parameters: Mapping[str, Any]
-) -> dict[str, npt.NDArray[Any]]:
-    """The child's part. Borders are kept, so that objects do not come apart where they touch."""
-    import pymeshlab
-
-    points, triangles, face_object = (arrays[k] for k in ("points", "triangles", "face_object"))
-    share = parameters["target"] / len(triangles)
-    parts: list[tuple[npt.NDArray[Any], npt.NDArray[Any], int]] = []
-    for index in np.unique(face_object):
-        own = triangles[face_object == index]
-        target = max(_MIN_TRIANGLES, round(share * len(own)))
-        part = _welded_part(points, own)
-        if target < len(own):
-            meshes = pymeshlab.MeshSet()
-            meshes.add_mesh(pymeshlab.Mesh(part[0].astype(np.float64), part[1]))
-            meshes.meshing_decimation_quadric_edge_collapse(
-                targetfacenum=target, preserveboundary=True, boundaryweight=2.0,
-                preservenormal=True, planarquadric=True, autoclean=True,
-            )  # fmt: skip
-            mesh = meshes.current_mesh()
-            part = (mesh.vertex_matrix().astype(np.float32), mesh.face_matrix())
-        parts.append((*part, int(index)))
-    firsts = np.cumsum([0, *[len(p) for p, _, _ in parts]])
-    return {
-        "points": np.concatenate([p for p, _, _ in parts]),
-        "triangles": np.concatenate(
-            [f + firsts[i] for i, (_, f, _) in enumerate(parts)], dtype=np.int32
-        ),
-        "face_object": np.repeat(
-            np.array([index for _, _, index in parts], np.int32), [len(f) for _, f, _ in parts]
-        ),
-    }
-
-
-def _welded_part(
-    points: npt.NDArray[Any], triangles: npt.NDArray[Any]
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """One object's own vertices, joined by position: edges must be shared to be collapsed."""
-    used, corners = np.unique(triangles, return_inverse=True)
-    own = points[used]
-    _, first, joined = np.unique(welded_ids(own), return_index=True, return_inverse=True)
-    return own[first], joined[corners.reshape(-1, 3)].astype(np.int32)

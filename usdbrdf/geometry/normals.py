@@ -68,7 +68,7 @@ def _face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Dou
     return normal, np.where(has_area, np.arctan2(sine, cosine), 0.0)
 
 
-@parallel_kernel  # type: ignore[untyped-decorator]
+@parallel_kernel
 def _sum_over_neighbours(
     corners: npt.NDArray[np.int64],
     starts: npt.NDArray[np.int64],

@@ -13,7 +13,7 @@ Int = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, kw_only=True)
 class SceneObject:
-    """One object: its mesh prim, its USD identifier (names its textures), and its faces in the soup."""
+    """One object: its mesh prim, its USD identifier (names its textures), its faces in the soup."""
 
     prim_path: str
     identifier: str

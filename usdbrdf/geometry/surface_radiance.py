@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,10 @@ from usdbrdf.kernel import kernel, parallel_kernel
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+Long = npt.NDArray[np.int64]
+
+# What the kernels take of a SurfaceTexture, in this order: pixels, corner_pixel, first_pixel, size.
+TextureArrays: TypeAlias = tuple[Float, Float, Long, Int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,12 +32,11 @@ class SurfaceTexture:
 
     pixels: Float
     corner_pixel: Float
-    first_pixel: npt.NDArray[np.int64]
+    first_pixel: Long
     size: Int
 
     @property
-    def arrays(self) -> tuple[Any, ...]:
-        """What the kernels take, in the order of ``texture_at``."""
+    def arrays(self) -> TextureArrays:
         return self.pixels, self.corner_pixel, self.first_pixel, self.size
 
     def at(self, face: Int, u: Float, v: Float) -> Float:
@@ -54,7 +57,16 @@ def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceT
 
 
 @kernel
-def texture_at(pixels, corner_pixel, first_pixel, size, face, u, v, channel):  # type: ignore[no-untyped-def]
+def texture_at(
+    pixels: Float,
+    corner_pixel: Float,
+    first_pixel: Long,
+    size: Int,
+    face: int,
+    u: float,
+    v: float,
+    channel: int,
+) -> float:
     """One channel at barycentric (u, v) of a face, bilinear; for use inside kernels."""
     corners = corner_pixel[face]
     width = size[face, 0]
@@ -73,14 +85,15 @@ def texture_at(pixels, corner_pixel, first_pixel, size, face, u, v, channel):  #
     k = first_pixel[face] + j * width + i
     top = pixels[k, channel] * (1 - fx) + pixels[k + right, channel] * fx
     low = pixels[k + down, channel] * (1 - fx) + pixels[k + down + right, channel] * fx
-    return top * (1 - fy) + low * fy
+    value: float = top * (1 - fy) + low * fy
+    return value
 
 
 @parallel_kernel
 def _lookup(
     pixels: Float,
     corner_pixel: Float,
-    first_pixel: npt.NDArray[np.int64],
+    first_pixel: Long,
     size: Int,
     face: Int,
     u: Float,

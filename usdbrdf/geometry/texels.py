@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from usdbrdf.kernel import kernel
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
+Number = TypeVar("Number", bound=np.generic)
 
 # A texel whose centre lies outside every triangle, but no further than this from one (in texels),
 # still belongs to the chart: bilinear lookup at the chart's border reads it.
@@ -62,18 +64,20 @@ class Texels:
         """The texels of one object."""
         return slice(int(self.first_texel[index]), int(self.first_texel[index + 1]))
 
-    def image(self, index: int, values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    def image(self, index: int, values: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """(H, W, ...) picture of per-texel values (T, ...) of one object, gutters dilated."""
         width, height = self.resolution[index]
         texel = self.nearest_texel[self.first_pixel[index] : self.first_pixel[index + 1]]
         if not len(texel) or texel[0] < 0:
             return np.zeros((height, width, *values.shape[1:]), values.dtype)
-        return values[texel].reshape(height, width, *values.shape[1:])
+        shown: npt.NDArray[Number] = values[texel].reshape(height, width, *values.shape[1:])
+        return shown
 
-    def from_image(self, index: int, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    def from_image(self, index: int, image: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """The texels' values (T_i, ...) out of one object's picture (H, W, ...)."""
         own = self.pixel[self.of_object(index)] - self.first_pixel[index]
-        return image.reshape(-1, *image.shape[2:])[own]
+        values: npt.NDArray[Number] = image.reshape(-1, *image.shape[2:])[own]
+        return values
 
     def object_index(self) -> Int:
         """(T,) int32, the object of each texel."""

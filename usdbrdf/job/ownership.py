@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
@@ -35,6 +38,30 @@ def prepare_asset_folder(asset: Path) -> Path:
             folder.mkdir(exist_ok=True)
         _write_job_record(state / "job.json")
     return state
+
+
+def make_parents(asset: Path) -> list[Path]:
+    """Make the folders above the output folder; returns those that were not there, deepest first,
+    beginning with the output folder itself (empty if that exists)."""
+    new = list(takewhile(lambda folder: not os.path.lexists(folder), (asset, *asset.parents)))
+    with environment_failures(str(asset)):
+        asset.parent.mkdir(parents=True, exist_ok=True)
+    return new
+
+
+@contextmanager
+def removed_if_unused(new: Sequence[Path]) -> Iterator[None]:
+    """Around the work in an output folder: where it fails before anything is published, the
+    folders that ``make_parents`` found missing are removed again."""
+    try:
+        yield
+    except BaseException:
+        if new and [entry.name for entry in new[0].glob("*")] == [STATE_FOLDER]:
+            shutil.rmtree(new[0], ignore_errors=True)
+            for parent in new[1:]:
+                with suppress(OSError):  # somebody else's by now
+                    parent.rmdir()
+        raise
 
 
 def edited_files(asset: Path) -> list[str]:

@@ -24,7 +24,7 @@ def say(line: str) -> None:
     """One plain line to stderr, above a running bar; control characters are shown, not obeyed."""
     if _quiet or sys.stderr is None:
         return
-    tqdm.write(_printable(line), file=sys.stderr)
+    tqdm.write(printable(line), file=sys.stderr)
 
 
 def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Iterator[T]:
@@ -33,7 +33,7 @@ def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Ite
         yield from iterable
     elif sys.stderr.isatty():
         yield from tqdm(
-            iterable, total=total, desc=_printable(label), unit=f" {unit}", file=sys.stderr
+            iterable, total=total, desc=printable(label), unit=f" {unit}", file=sys.stderr
         )
     else:
         yield from _with_lines(iterable, total, label, unit)
@@ -48,7 +48,8 @@ def _with_lines(iterable: Iterable[T], total: int, label: str, unit: str) -> Ite
         yield item
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """The text with control characters escaped, but for newlines and tabs."""
     return "".join(
         char if char.isprintable() or char in "\n\t" else char.encode("unicode_escape").decode()
         for char in text

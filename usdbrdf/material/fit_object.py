@@ -65,7 +65,7 @@ def fit_object(
     Each pixel is the mean of 2 x 2 surface points with 52 rays each, traced once for all
     roughnesses.
     """
-    chosen, points = _points_of_object(lit, view, index, residual, max_pixels, seed)
+    chosen, stands_for, points = _points_of_object(lit, view, index, max_pixels, seed)
     if len(chosen) < MIN_PIXELS:
         return None, len(chosen)
     samples = trace_lobe_samples(
@@ -81,35 +81,38 @@ def fit_object(
 
     diffuse = per_pixel(lit.radiance.at(points.face, points.u, points.v))
     observed = view.radiance.reshape(-1, 3)[chosen]
-    weight = np.ones((len(chosen), 1), np.float32)
+    # The paper sums over all pixels alike; what was left out is stood for by what was taken.
+    weight = (stands_for / max(float(stands_for.mean()), 1e-12))[:, None]
     if residual == "scaled":
-        # Errors of L_d and of the frame grow with the radiance; the floor keeps noise small.
+        # Highlights count for more than their share of pixels. Errors of L_d and of the frame grow
+        # with the radiance; the floor keeps the noise of dark pixels small.
         level = diffuse.mean(axis=1, keepdims=True)
         weight = 1 / (level + np.float32(0.1) * np.median(level)) ** 2
     return fit_grid(observed, diffuse, weight, basis, residual), len(chosen)
 
 
 def _points_of_object(
-    lit: LitScene, view: View, index: int, residual: Residual, max_pixels: int, seed: int
-) -> tuple[npt.NDArray[np.int64], SurfacePoints]:
-    """The pixels to fit (flat indices) and the four surface points of each, in order."""
+    lit: LitScene, view: View, index: int, max_pixels: int, seed: int
+) -> tuple[npt.NDArray[np.int64], Float, SurfacePoints]:
+    """The pixels to fit (flat indices), how many pixels each stands for, and the four surface
+    points of each, in order."""
     height, width = view.valid.shape
     pixels = pixel_centres(width, height)
     pose, lens = view.world_from_camera, view.intrinsics
     seen = visible_points(lit.rays, lit.scene, pose, lens, pixels)
     owner = _owner(lit.scene, seen).reshape(height, width)
-    highlight = np.zeros_like(view.valid)
-    if residual == "scaled":
-        mirrored = mirror_hits_emitter(lit.rays, seen, lit.emission, lit.size)
-        highlight = mirrored.reshape(height, width) & view.valid
+    mirrored = mirror_hits_emitter(lit.rays, seen, lit.emission, lit.size)
+    highlight = mirrored.reshape(height, width) & view.valid
     random = np.random.default_rng([seed, index])
-    chosen = object_pixels(owner, view.valid, highlight, index, max_pixels, random.permutation)
+    chosen, stands_for = object_pixels(
+        owner, view.valid, highlight, index, max_pixels, random.permutation
+    )
     inside = (pixels[chosen][:, None] + _SUBPIXELS).reshape(-1, 2)
     points = visible_points(lit.rays, lit.scene, pose, lens, inside)
     whole = (_owner(lit.scene, points) == index).reshape(-1, len(_SUBPIXELS)).all(axis=1)
     keep = np.repeat(whole, len(_SUBPIXELS))
     kept = {name: values[keep] for name, values in vars(points).items()}
-    return chosen[whole], SurfacePoints(**kept)
+    return chosen[whole], stands_for[whole], SurfacePoints(**kept)
 
 
 def _owner(scene: Scene, points: SurfacePoints) -> npt.NDArray[np.int32]:

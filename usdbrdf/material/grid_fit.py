@@ -22,14 +22,19 @@ Residual = Literal["paper", "scaled"]
 Basis = Callable[[float], tuple[Float, Float]]
 
 GRID = 11
+# Costs this close, relatively, are not told apart by a frame of some thousand noisy pixels.
+_FLAT = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class GridFit:
-    """phi, psi in [0, 1]; cost at them; evidence = 1 - cost / cost without any specular light."""
+    """phi, psi in [0, 1]; the roughnesses phi_low..phi_high that fit as well within 1 %; cost at
+    phi, psi per residual; evidence = 1 - cost / cost without any specular light."""
 
     phi: float
     psi: float
+    phi_low: float
+    phi_high: float
     cost: float
     evidence: float
 
@@ -42,7 +47,9 @@ def fit_grid(
     observed, diffuse  (P, 3) float32, radiance of the target frame and of L_d seen from it
     weight             (P, 1) float32, of the squared residual
     basis              phi -> (base, slope), (P, 3) each
-    Two levels of K = 11: [0, 1], then between the neighbours of the first level's minimiser.
+    Two levels of K = 11: [0, 1], then between the neighbours of the first level's minimiser. Where
+    the cost is flat around its minimum (with psi at 0 hardly anything depends on phi), the minimiser
+    is noise; phi is then the middle of the flat interval.
     """
     root = np.sqrt(weight).astype(np.float64)
     target, known = observed * root, diffuse * root
@@ -58,12 +65,33 @@ def fit_grid(
         return float(grid[max(best - 1, 0)]), float(grid[min(best + 1, GRID - 1)])
 
     level(*level(0.0, 1.0))
-    phi = min(tried, key=lambda candidate: (tried[candidate][0], candidate))
+    low, phi, high = _flat_interval(tried)
     cost, psi = tried[phi]
-    nothing = np.zeros_like(target)
-    without = _cost(target, known, nothing, residual)
+    without = _cost(target, known, np.zeros_like(target), residual)
     evidence = 1.0 - cost / without if without > 0 else 0.0
-    return GridFit(phi=phi, psi=psi, cost=cost / max(target.size, 1), evidence=max(0.0, evidence))
+    return GridFit(
+        phi=phi,
+        psi=psi,
+        phi_low=low,
+        phi_high=high,
+        cost=cost / max(target.size, 1),
+        evidence=max(0.0, evidence),
+    )
+
+
+def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, float, float]:
+    """Lowest, middle and highest roughness tried of the flat stretch around the minimum."""
+    phis = sorted(tried)
+    costs = [tried[phi][0] for phi in phis]
+    best = min(range(len(phis)), key=costs.__getitem__)
+    first = last = best
+    while first > 0 and costs[first - 1] <= (1 + _FLAT) * costs[best]:
+        first -= 1
+    while last + 1 < len(phis) and costs[last + 1] <= (1 + _FLAT) * costs[best]:
+        last += 1
+    middle = (phis[first] + phis[last]) / 2
+    nearest = min(phis[first : last + 1], key=lambda phi: (abs(phi - middle), phi))
+    return phis[first], nearest, phis[last]
 
 
 def _best_psi(

@@ -124,23 +124,28 @@ def object_pixels(
     index: int,
     limit: int,
     pick: Callable[[int], npt.NDArray[np.int64]],
-) -> npt.NDArray[np.int64]:
-    """Flat indices of the pixels of object ``index`` to fit, at most ``limit``.
+) -> tuple[npt.NDArray[np.int64], Float]:
+    """Flat indices of the pixels of object ``index`` to fit, at most ``limit``, and how many pixels
+    each stands for, (P,) float32.
 
     owner (H, W): object per pixel; valid (H, W); highlight (H, W): A1. Pixels next to another
     object are left out (they mix both). Where there are more than ``limit``, ``pick(n)`` orders
-    them at random and half of the pixels are taken within 30 pixels of a mirrored emitter, where
-    the lobe shows.
+    them at random and half of them are taken within 30 pixels of a mirrored emitter, where the
+    lobe shows.
     """
     own = owner == index
     inner = ndimage.binary_erosion(own, np.ones((3, 3)))
     candidates = np.flatnonzero(inner & valid)
     if len(candidates) <= limit:
-        return candidates
+        return candidates, np.ones(len(candidates), np.float32)
     candidates = candidates[pick(len(candidates))]
-    if not (highlight & own).any():
-        return np.sort(candidates[:limit])
-    distance = ndimage.distance_transform_edt(~(highlight & own)).ravel()[candidates]
-    near, far = candidates[distance <= 30], candidates[distance > 30]
-    take = min(len(near), max(limit // 2, limit - len(far)))
-    return np.sort(np.concatenate([near[:take], far[: limit - take]]))
+    near = np.zeros(len(candidates), np.bool_)
+    if (highlight & own).any():
+        near = ndimage.distance_transform_edt(~(highlight & own)).ravel()[candidates] <= 30
+    close, far = candidates[near], candidates[~near]
+    take = min(len(close), max(limit // 2, limit - len(far)))
+    parts = (close[:take], close), (far[: limit - take], far)
+    chosen = np.concatenate([taken for taken, _ in parts])
+    stands_for = np.concatenate([np.full(len(t), len(of) / max(len(t), 1)) for t, of in parts])
+    order = np.argsort(chosen)
+    return chosen[order], stands_for[order].astype(np.float32)

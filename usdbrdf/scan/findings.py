@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.job.progress import say
 
 MIN_FRAMES = 8
 _MAX_DROPPED_SHARE = 0.2
@@ -30,9 +29,8 @@ class Findings:
         self.dropped: list[DroppedFrame] = []
 
     def warn(self, sentence: str) -> None:
-        """Print a sentence and keep it; it is published, so it names files without their folder."""
+        """Keep a sentence for the user. It is published, so it names files without their folder."""
         self.warnings.append(sentence)
-        say(f"warning: {sentence}")
 
     def count(self, name: str, number: int) -> None:
         """Add to a number that is worth recording; zeros are not."""

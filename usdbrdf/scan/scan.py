@@ -18,8 +18,10 @@ class Frames:
     """N photographs with pinhole cameras, all of scene-linear radiance once read.
 
     image_paths           N absolute paths
-    world_from_camera     (N, 4, 4) float64, rigid, scene units; OpenGL axes (x right, y up, looks down -z)
-    intrinsics            (N, 4) float64: fx, fy, cx, cy in pixels; the first pixel's centre is (0.5, 0.5)
+    world_from_camera     (N, 4, 4) float64, rigid, scene units; OpenGL axes (x right, y up, looks
+                          down -z)
+    intrinsics            (N, 4) float64: fx, fy, cx, cy in pixels; the first pixel's centre is
+                          (0.5, 0.5)
     resolution            (N, 2) int32: width, height
     exposure_time         (N,) float64, seconds (1 where unknown)
     saturation_radiance   (N,) float64: a channel >= 0.998 of it is clipped
@@ -74,7 +76,8 @@ class Scan:
 
     meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses.
     usd_geometry   the USD file that holds the meshes, if the geometry came as USD; then
-                   ``object_prims`` gives, per object, the mesh's path below that file's default prim.
+                   ``object_prims`` gives, per object, the mesh's path below that file's default
+                   prim
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """

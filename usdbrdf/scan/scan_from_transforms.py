@@ -247,8 +247,8 @@ def _warn_of_missing_exposure(
     unknown = sum(math.isinf(r.saturation_radiance) for r in records)
     if unknown:
         findings.warn(
-            f"{capture.source.name}: {unknown} of {len(records)} frames state no saturation_radiance, "
-            "so their clipped pixels pass for radiance. [capture.saturation]"
+            f"{capture.source.name}: {unknown} of {len(records)} frames state no "
+            "saturation_radiance, so clipped pixels pass for radiance. [capture.saturation]"
         )
     masks = sum("mask_path" in frame for frame in capture.document["frames"])
     if masks:

@@ -77,8 +77,8 @@ def rigid_records(
         kept.append(replace(record, world_from_camera=rigid))
     if worst > _ROUNDING:
         findings.warn(
-            f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been made "
-            "rigid. [capture.pose]"
+            f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
+            "made rigid. [capture.pose]"
         )
     return kept
 

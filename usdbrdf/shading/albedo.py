@@ -18,6 +18,6 @@ def albedo_from_irradiance(
     floor: S below it is unknown, not dark. Returns rho (T, 3) float32, not clipped and 0 where
     unknown, and known (T,) bool.
     """
-    known = (irradiance > floor).all(axis=1)
+    known: Bool = np.all(irradiance > floor, axis=1)
     rho = np.where(known[:, None], np.pi * diffuse_radiance / np.maximum(irradiance, floor), 0)
     return rho.astype(np.float32), known

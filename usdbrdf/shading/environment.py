@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,9 @@ import numpy.typing as npt
 from usdbrdf.kernel import kernel
 
 Float = npt.NDArray[np.float32]
+
+# What the kernels take of an Environment, in this order: image, z_up.
+EnvironmentArrays: TypeAlias = tuple[Float, bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +29,7 @@ class Environment:
     z_up: bool
 
     @property
-    def arrays(self) -> tuple[Any, ...]:
+    def arrays(self) -> EnvironmentArrays:
         return self.image, self.z_up
 
 
@@ -35,7 +38,7 @@ def black_environment() -> Environment:
 
 
 @kernel
-def environment_at(image, z_up, x, y, z, channel):  # type: ignore[no-untyped-def]
+def environment_at(image: Float, z_up: bool, x: float, y: float, z: float, channel: int) -> float:
     """Radiance from the unit direction (x, y, z); nearest pixel; for use inside kernels."""
     height = image.shape[0]
     width = image.shape[1]
@@ -43,4 +46,5 @@ def environment_at(image, z_up, x, y, z, channel):  # type: ignore[no-untyped-de
     ahead = -y if z_up else z
     row = int((0.5 - np.arcsin(min(1.0, max(-1.0, up))) / np.pi) * height)
     column = int((0.5 - np.arctan2(x, ahead) / (2 * np.pi)) * width)
-    return image[min(row, height - 1), min(max(column, 0), width - 1), channel]
+    value: float = image[min(row, height - 1), min(max(column, 0), width - 1), channel]
+    return value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,9 @@ from usdbrdf.geometry.texels import Texels
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
+
+# What the kernels take of Lights, in this order: face, cumulative, density, corners, normals.
+LightArrays: TypeAlias = tuple[Int, Double, Float, Float, Float]
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
@@ -38,7 +41,7 @@ class Lights:
     normals: Float
 
     @property
-    def arrays(self) -> tuple[Any, ...]:
+    def arrays(self) -> LightArrays:
         return self.face, self.cumulative, self.density, self.corners, self.normals
 
 
@@ -50,8 +53,9 @@ def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Light
     """
     brightness = radiance.max(axis=1)
     weight = np.where(texels.interior, texels.area, 0)
-    power = np.bincount(texels.face, brightness * weight, len(scene.triangles))
-    covered = np.bincount(texels.face, weight, len(scene.triangles))
+    num_faces = len(scene.triangles)
+    power = np.bincount(texels.face, brightness * weight, num_faces).astype(np.float64)
+    covered = np.bincount(texels.face, weight, num_faces).astype(np.float64)
     mean = _mean_per_face(scene, texels, brightness, power, covered)
 
     corners = scene.points[scene.triangles].astype(np.float64)
@@ -77,7 +81,7 @@ def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Light
 def _mean_per_face(
     scene: Scene, texels: Texels, brightness: Float, power: Double, covered: Double
 ) -> Double:
-    """Mean brightness of each face; faces without a texel centre read the texel at their centroid."""
+    """Mean brightness of each face; one without a texel centre reads the texel at its centroid."""
     mean = power / np.maximum(covered, 1e-30)
     bare = np.flatnonzero(covered <= 0)
     if len(bare):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.stage.naming import identifier_from
 
 # The layers that the stages write, weakest first; each sees only those before it.
@@ -28,6 +29,11 @@ class Asset:
         A folder that was renamed after its making keeps its files' names.
         """
         folder = Path(folder).absolute()
+        if not is_storable(folder) or "\\" in str(folder):
+            raise InputRefused(
+                f"{str(folder)!r}: the name of the folder, or of one above it, holds characters "
+                "that USD cannot store in a path. Choose another folder. [stage.asset_path]"
+            )
         made_with = _default_prim(folder / "layers" / "scan.usdc")
         return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
 
@@ -56,6 +62,15 @@ class Asset:
     def texture(self, identifier: str, aov: str) -> str:
         """Path of an object's map, relative to the asset folder."""
         return f"textures/{identifier}.{aov}.exr"
+
+
+def is_storable(path: Path) -> bool:
+    """False if USD cannot hold the path: control characters, undecodable bytes, its own marks."""
+    try:
+        Sdf.AssetPath(str(path))
+    except (Tf.ErrorException, UnicodeEncodeError):
+        return False
+    return ":SDF_FORMAT_ARGS:" not in str(path)
 
 
 def path_in_layer(asset_relative: str) -> str:

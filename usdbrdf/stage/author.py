@@ -18,10 +18,11 @@ def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
 
 
 def define(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
-    """A ``def`` of the given type; its ancestors stay what they are."""
+    """A ``def``, of a type unless that is ""; its ancestors stay what they are."""
     prim = over(layer, path)
     prim.specifier = Sdf.SpecifierDef
-    prim.typeName = type_name
+    if type_name:
+        prim.typeName = type_name
     return prim
 
 
@@ -58,12 +59,10 @@ def attribute(
 
 
 def relationship(prim: Sdf.PrimSpec, name: str, *targets: str) -> Sdf.RelationshipSpec:
-    """A relationship to exactly these targets; without any it blocks weaker layers' targets."""
-    spec = Sdf.RelationshipSpec(prim, name, custom=False)
+    """A relationship to these targets; without any it has no opinion about them."""
+    spec = prim.relationships.get(name) or Sdf.RelationshipSpec(prim, name, custom=False)
     if targets:
         spec.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
-    else:
-        spec.targetPathList.ClearEditsAndMakeExplicit()
     return spec
 
 

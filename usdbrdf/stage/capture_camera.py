@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf
+from pxr import Gf, Sdf
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.scan.scan import Double, Frames
+from usdbrdf.stage.asset import is_storable
 from usdbrdf.stage.author import apply_schema, attribute, define
 
 Types = Sdf.ValueTypeNames
@@ -56,13 +57,12 @@ def relative_path(target: Path, folder: Path) -> str:
 
 def asset_path(target: Path, folder: Path) -> Sdf.AssetPath:
     """The same as a USD value; refuses names that USD cannot hold."""
-    try:
-        return Sdf.AssetPath(relative_path(target, folder))
-    except (Tf.ErrorException, UnicodeEncodeError) as error:
+    if not is_storable(target):
         raise InputRefused(
             f"{str(target)!r}: the name holds characters that USD cannot store in a path. "
             "Rename the file. [stage.asset_path]"
-        ) from error
+        )
+    return Sdf.AssetPath(relative_path(target, folder))
 
 
 def lens_from_pinhole(

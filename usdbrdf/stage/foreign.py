@@ -165,7 +165,7 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
         )
     if cages:
         warnings.append(
-            f"{path.name}: {cages} meshes are subdivision cages (the scheme that USD assumes where none "
+            f"{path.name}: {cages} meshes are subdivision cages (what USD assumes where no scheme "
             "is set); the cage is taken as the surface. [stage.subdivision]"
         )
     if hidden:

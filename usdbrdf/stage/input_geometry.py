@@ -1,8 +1,8 @@
 """A scan whose geometry is a USD file: referenced, never copied, never changed.
 
 The file comes in by a reference on the default prim, which is weaker than the looks' variants. Only
-what would defeat the looks or the textures is overridden in our own layer: bindings that variants
-on the mesh cannot beat, instancing, and polygons (texture seams run between triangles).
+what would defeat the looks or the textures is overridden in our own layer: bindings that claim to
+be stronger, instancing, and polygons (texture seams run between triangles).
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.stage.author import attribute, over, relationship
+from usdbrdf.stage.author import attribute, over
 from usdbrdf.stage.capture_camera import relative_path
 from usdbrdf.stage.triangulate import Triangulation, triangulate
 from usdbrdf.stage.usd_errors import in_one_line
 
 Types = Sdf.ValueTypeNames
-_BINDING = "material:binding"
 
 
 def open_input(file: Path) -> Usd.Stage:
-    """The input file as a stage with a default prim. A prim does not keep its stage alive: hold it."""
+    """The input file as a stage with a default prim. Hold it: a prim does not keep it alive."""
     try:
         stage = Usd.Stage.Open(str(file))
     except Tf.ErrorException as error:
@@ -45,57 +44,27 @@ def author_reference(layer: Sdf.Layer, root: str, file: Path, folder: Path) -> N
     over(layer, root).referenceList.prependedItems = [reference]
 
 
-def author_overrides(layer: Sdf.Layer, root: str, source: Usd.Prim, below: str) -> None:
-    """What our layer must say about one mesh, ``below`` the input's default prim ``source``."""
-    path = source.GetPath().AppendPath(below) if below not in ("", ".") else source.GetPath()
+def input_mesh(source: Usd.Prim, below: str) -> Usd.Prim:
+    """The mesh ``below`` the input's default prim ``source``; "." is the default prim itself."""
+    path = source.GetPath() if below == "." else source.GetPath().AppendPath(below)
     prim = source.GetStage().GetPrimAtPath(path)
     if not prim or not prim.IsA(UsdGeom.Mesh):
         raise InputRefused(f"<{path}>: the input stage has no mesh there. [stage.input_mesh]")
-    for ancestor in path.GetPrefixes():
-        if ancestor.HasPrefix(source.GetPath()):
-            name = ancestor.ReplacePrefix(source.GetPath(), Sdf.Path(root))
-            found = source.GetStage().GetPrimAtPath(ancestor)
-            _open_instance(layer, str(name), found)
-            _yield_bindings(layer, str(name), found, is_object=ancestor == path)
-    target = str(path.ReplacePrefix(source.GetPath(), Sdf.Path(root)))
+    return prim
+
+
+def author_overrides(layer: Sdf.Layer, path: str, mesh: Usd.Prim) -> None:
+    """What our layer must say about one mesh of the input, which is at ``path`` in our stage."""
+    target, prim = Sdf.Path(path), mesh
+    while target != Sdf.Path.absoluteRootPath:
+        # Opinions inside an instance are ignored, so the instance must become a plain prim.
+        if prim.IsInstanceable():
+            over(layer, str(target)).SetInfo("instanceable", False)
+        target, prim = target.GetParentPath(), prim.GetParent()
     # The photographs show the surface as it is: the cage is taken as the surface everywhere.
-    attribute(
-        over(layer, target), "subdivisionScheme", Types.Token, UsdGeom.Tokens.none, uniform=True
-    )
-    _author_triangles(layer, target, UsdGeom.Mesh(prim))
-
-
-def _open_instance(layer: Sdf.Layer, path: str, prim: Usd.Prim) -> None:
-    """Opinions inside an instance are ignored, so the instance must become a plain prim."""
-    if prim.IsInstanceable():
-        over(layer, path).SetInfo("instanceable", False)
-
-
-def _yield_bindings(layer: Sdf.Layer, path: str, prim: Usd.Prim, *, is_object: bool) -> None:
-    """Make every binding that could win against one on the object give way."""
-    for binding in _bindings(prim):
-        name = binding.GetName()
-        for_all_purposes = name.split(":")[2:3] in ([], ["collection"]) and name.count(":") < 4
-        if not for_all_purposes or (is_object and name != _BINDING):
-            relationship(over(layer, path), name)
-        elif not is_object and _is_stronger(binding):
-            weaker = relationship(over(layer, path), name, *map(str, binding.GetTargets()))
-            weaker.SetInfo("bindMaterialAs", UsdShade.Tokens.weakerThanDescendants)
-    if is_object:
-        for child in prim.GetChildren():
-            for binding in _bindings(child):
-                relationship(over(layer, f"{path}/{child.GetName()}"), binding.GetName())
-
-
-def _bindings(prim: Usd.Prim) -> list[Usd.Relationship]:
-    properties = prim.GetAuthoredPropertiesInNamespace(_BINDING)
-    own = prim.GetRelationship(_BINDING)
-    found = [p for p in properties if isinstance(p, Usd.Relationship)]
-    return [own, *found] if own and own.HasAuthoredTargets() else found
-
-
-def _is_stronger(binding: Usd.Relationship) -> bool:
-    return bool(binding.GetMetadata("bindMaterialAs") == UsdShade.Tokens.strongerThanDescendants)
+    none = UsdGeom.Tokens.none
+    attribute(over(layer, path), "subdivisionScheme", Types.Token, none, uniform=True)
+    _author_triangles(layer, path, UsdGeom.Mesh(mesh))
 
 
 def _author_triangles(layer: Sdf.Layer, path: str, mesh: UsdGeom.Mesh) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from pxr import Sdf
 
 from usdbrdf.stage.author import apply_schema, define, over, relationship
+from usdbrdf.stage.input_bindings import BINDING, Competing
 from usdbrdf.stage.preview_surface import Colour, unlit_colour, unlit_texture
 from usdbrdf.stage.records import Aov
 from usdbrdf.stage.scopes import Scopes
@@ -28,18 +29,30 @@ Shown = Aov | Colour | None
 
 
 def author_looks(
-    layer: Sdf.Layer, scopes: Scopes, looks: Mapping[str, Bindings], *, selected: str
+    layer: Sdf.Layer,
+    scopes: Scopes,
+    looks: Mapping[str, Bindings],
+    *,
+    selected: str,
+    competing: Mapping[str, Competing],
 ) -> None:
-    """Add variants to the default prim and select one; weaker layers' variants remain."""
+    """Add variants to the default prim and select one; weaker layers' variants remain.
+
+    competing  per object, what an input file binds otherwise and must be bound too
+    """
     root = Sdf.Path(scopes.root)
     over(layer, scopes.root)
     for look, bindings in looks.items():
         variant = root.AppendVariantSelection(VARIANT_SET, look)
         over(layer, str(variant))
         for prim_path, material in bindings.items():
-            prim = over(layer, str(Sdf.Path(prim_path).ReplacePrefix(root, variant)))
-            apply_schema(prim, "MaterialBindingAPI")
-            relationship(prim, "material:binding", material)
+            also = competing.get(prim_path, {})
+            for binding, collection in {f"{prim_path}.{BINDING}": "", **also}.items():
+                path = Sdf.Path(binding).ReplacePrefix(root, variant)
+                prim = over(layer, str(path.GetParentPath()))
+                apply_schema(prim, "MaterialBindingAPI")
+                targets = [collection, material] if collection else [material]
+                relationship(prim, path.name, *targets)
     layer.GetPrimAtPath(root).variantSelections[VARIANT_SET] = selected
 
 

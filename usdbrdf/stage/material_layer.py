@@ -12,6 +12,7 @@ from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.author import apply_schema, attribute, over
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.input_bindings import recorded_bindings
 from usdbrdf.stage.looks import SHADED, Shown, author_look_materials, author_looks
 from usdbrdf.stage.preview_surface import SURFACE, lobe, preview_surface_from_fit
 from usdbrdf.stage.records import FittedObject
@@ -43,7 +44,8 @@ def write_material_layer(
         "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
         "specular": author_look_materials(layer, scopes, "specular", _greys(objects, "psi")),
     }
-    author_looks(layer, scopes, looks, selected=SHADED)
+    competing = recorded_bindings(asset)
+    author_looks(layer, scopes, looks, selected=SHADED, competing=competing)
     export(layer, path, folder=asset.layer("material").parent)
 
 

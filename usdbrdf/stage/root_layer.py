@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from usdbrdf.errors import OwnershipConflict
 from usdbrdf.stage.asset import ROLES, Asset
 from usdbrdf.stage.author import over
 from usdbrdf.stage.export import export
-from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.header import Provenance, StageHeader, new_layer, read_header
 from usdbrdf.stage.scopes import Scopes
 
 _VERSION = "1"  # of the folder's layout; these layers outlive the version of the tool
@@ -24,9 +25,29 @@ def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
         f"./{asset.edits_layer.name}",
         *(f"./layers/{asset.layer(role).name}" for role in reversed(ROLES)),
     ]
-    # This one can be said in a root layer only.
-    layer.pseudoRoot.SetInfo("renderSettingsPrimPath", Scopes.of(asset).path("render", "capture"))
+    # Only a root layer can say this. The scan layer may still be waiting beside it, unpublished.
+    staged = Asset(path.parent, asset.name)
+    scopes = Scopes.of(staged if staged.layer("scan").is_file() else asset)
+    layer.pseudoRoot.SetInfo("renderSettingsPrimPath", scopes.path("render", "capture"))
     export(layer, path, folder=asset.folder)
+
+
+def check_root(asset: Asset, header: StageHeader) -> None:
+    """Raise if the asset has a root layer that says otherwise about units or the up axis.
+
+    USD believes the root, which is never written again: a capture in other units would come out
+    in the wrong size, beneath edits that were made for the old one.
+    """
+    if not asset.root_layer.is_file():
+        return
+    root = read_header(asset.root_layer)
+    ours, theirs = ((h.meters_per_unit, h.up_axis) for h in (root, header))
+    if ours != theirs:
+        raise OwnershipConflict(
+            f"{asset.root_layer}: the asset was made with {ours[0]:g} metres per unit and "
+            f"{ours[1]} up, this capture has {theirs[0]:g} and {theirs[1]}. Convert it into a new "
+            "folder. [ownership.units]"
+        )
 
 
 def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:

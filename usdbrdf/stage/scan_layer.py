@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Gf, Sdf, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.scan.scan import ObjectLabel, Scan
+from usdbrdf.geometry.weld import welded_ids
+from usdbrdf.scan.scan import ObjectLabel, Scan, ScanMesh
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.author import apply_schema, attribute, define, over, relationship
 from usdbrdf.stage.capture_camera import author_capture_camera
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.input_bindings import competing_bindings, weaken_bindings
 from usdbrdf.stage.input_geometry import (
     author_overrides,
     author_reference,
     has_transform,
+    input_mesh,
     open_input,
 )
 from usdbrdf.stage.naming import readable_label
@@ -37,6 +41,7 @@ def write_scan_layer(
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
     scopes = Scopes.beside(f"/{header.name}", taken)
+    meshes = _input_meshes(source, scan, scopes.root) if source else {}
     layer = new_layer(
         header,
         provenance,
@@ -44,6 +49,10 @@ def write_scan_layer(
         radiometric=scan.frames.radiometric,
         counts=scan.counts,
         scopes=scopes.names(),
+        competing_bindings={
+            path: competing_bindings(mesh, source, scopes.root) for path, mesh in meshes.items()
+        }
+        or None,
     )
     # A typed root would hide the input's own type.
     typed = source is not None and source.GetTypeName() != ""
@@ -51,10 +60,10 @@ def write_scan_layer(
     _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
     if source and scan.usd_geometry:
         author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        for label, below in zip(scan.objects, scan.object_prims, strict=True):
-            author_overrides(layer, scopes.root, source, below.strip("/"))
-            inside = below.strip("/.")
-            author_label(over(layer, f"{scopes.root}/{inside}" if inside else scopes.root), label)
+        for label, (path_of_mesh, mesh) in zip(scan.objects, meshes.items(), strict=True):
+            weaken_bindings(layer, mesh, source, scopes.root)
+            author_overrides(layer, path_of_mesh, mesh)
+            author_label(over(layer, path_of_mesh), label)
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
@@ -92,26 +101,37 @@ def _author_root(root: Sdf.PrimSpec, asset: Asset, *, keep_kind: bool) -> None:
     attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
 
 
+def _input_meshes(source: Usd.Prim, scan: Scan, root: str) -> dict[str, Usd.Prim]:
+    """The input's meshes by their paths in our stage, in the order of the objects."""
+    meshes = [input_mesh(source, below) for below in scan.object_prims]
+    here = Sdf.Path(root)
+    return {str(mesh.GetPath().ReplacePrefix(source.GetPath(), here)): mesh for mesh in meshes}
+
+
 def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
     geometry = define(layer, scopes.path("geometry"), "Scope")
     geometry.SetInfo("kind", "group")
-    order = np.argsort(scan.mesh.face_object, kind="stable")
+    mesh = scan.mesh
+    # Files split vertices at seams; ours has its normals per corner and needs no copies.
+    _, first, number = np.unique(welded_ids(mesh.points), return_index=True, return_inverse=True)
+    mesh = replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
+    order = np.argsort(mesh.face_object, kind="stable")
     objects = np.arange(len(scan.objects) + 1)
-    bounds = np.searchsorted(scan.mesh.face_object[order], objects)
+    bounds = np.searchsorted(mesh.face_object[order], objects)
     for i, label in enumerate(scan.objects):
         faces = order[bounds[i] : bounds[i + 1]]
         if len(faces):
             prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
             prim.SetInfo("kind", "component")
-            _author_mesh(prim, scan, faces)
+            _author_mesh(prim, mesh, faces)
             author_label(prim, label)
 
 
-def _author_mesh(prim: Sdf.PrimSpec, scan: Scan, faces: npt.NDArray[np.intp]) -> None:
+def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:
     """The triangles ``faces`` with only the points that they use."""
-    used, corners = np.unique(scan.mesh.triangles[faces], return_inverse=True)
-    points = np.ascontiguousarray(scan.mesh.points[used], np.float32)
-    normals = np.ascontiguousarray(scan.mesh.corner_normals[faces], np.float32).reshape(-1, 3)
+    used, corners = np.unique(mesh.triangles[faces], return_inverse=True)
+    points = np.ascontiguousarray(mesh.points[used], np.float32)
+    normals = np.ascontiguousarray(mesh.corner_normals[faces], np.float32).reshape(-1, 3)
     extent = Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
     counts = Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32))
     indices = Vt.IntArray.FromNumpy(corners.reshape(-1).astype(np.int32))

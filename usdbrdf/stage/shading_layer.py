@@ -12,6 +12,7 @@ from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.author import apply_schema, attribute, define, over, relationship
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.input_bindings import recorded_bindings
 from usdbrdf.stage.looks import SHADED, author_looks
 from usdbrdf.stage.preview_surface import colour_from_texture, surface
 from usdbrdf.stage.records import Aov, ShadedObject
@@ -55,7 +56,8 @@ def write_shading_layer(
     # Emission is not a look: it is nothing on most objects, and the shaded look shows it.
     looks = aov_looks(layer, scopes, objects, hidden=frozenset([EMISSION]))
     looks[SHADED] = {item.prim_path: scopes.path("materials", item.identifier) for item in objects}
-    author_looks(layer, scopes, looks, selected=SHADED)
+    competing = recorded_bindings(asset)
+    author_looks(layer, scopes, looks, selected=SHADED, competing=competing)
     _author_render_outputs(layer, scopes)
     export(layer, path, folder=asset.layer("shading").parent)
 
@@ -71,16 +73,13 @@ def _author_material(layer: Sdf.Layer, scopes: Scopes, item: ShadedObject) -> No
             f"<{item.prim_path}>: the shading stage delivered no {wanted} map. This is a defect of "
             "usdbrdf; please report it. [stage.aov]"
         )
-    if item.emitter:
-        colour_from_texture(
-            layer, material, "emissiveColor", "EmissionTexture", files[EMISSION],
-            fallback=item.radiance,
-        )  # fmt: skip
-    else:
-        colour_from_texture(
-            layer, material, "diffuseColor", "AlbedoTexture", files[ALBEDO],
-            fallback=item.mean_albedo,
-        )  # fmt: skip
+    # An emitter reflects nothing that could be measured; other objects may glow in places.
+    inputs = [("emissiveColor", "EmissionTexture", EMISSION, item.radiance)]
+    if not item.emitter:
+        inputs.append(("diffuseColor", "AlbedoTexture", ALBEDO, item.mean_albedo))
+    for name, texture, aov, mean in inputs:
+        if aov in files:
+            colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
 
 
 def _author_facts(prim: Sdf.PrimSpec, item: ShadedObject) -> None:

@@ -12,6 +12,7 @@ from usdbrdf.stage.asset import Asset, path_in_layer
 from usdbrdf.stage.author import apply_schema, attribute, over
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
+from usdbrdf.stage.input_bindings import recorded_bindings
 from usdbrdf.stage.looks import LIT, author_look_materials, author_looks
 from usdbrdf.stage.records import Aov, Float, ShadedObject, TexturedObject
 from usdbrdf.stage.schema import verify
@@ -50,7 +51,8 @@ def write_texturing_layer(
         for item in objects:
             author_texture_coordinates(over(coordinates, item.prim_path), item.corner_uv)
             _author_facts(over(layer, item.prim_path), item)
-    author_looks(layer, scopes, aov_looks(layer, scopes, objects), selected=LIT)
+    looks = aov_looks(layer, scopes, objects)
+    author_looks(layer, scopes, looks, selected=LIT, competing=recorded_bindings(asset))
     export(coordinates, uv_path, folder=folder)
     export(layer, path, folder=folder)
 

@@ -27,10 +27,10 @@ class Atlas:
 
     def map(self, aov: str) -> Float:
         """Per-texel values (T, C) float32 of an AOV that every object has."""
-        return np.concatenate([
-            np.asarray(self.texels.from_image(i, self._picture(obj, aov)), np.float32)
-            for i, obj in enumerate(self.scene.objects)
-        ])  # fmt: skip
+        own = enumerate(self.scene.objects)
+        return np.concatenate(
+            [self.texels.from_image(i, self._picture(obj, aov)) for i, obj in own]
+        )
 
     def map_where_present(self, aov: str, channels: int) -> Float:
         """The same, with zeros on objects that do not have the AOV."""
@@ -40,8 +40,7 @@ class Atlas:
             if aov_path(self.stage, obj.prim_path, aov) is None:
                 parts.append(np.zeros((own.stop - own.start, channels), np.float32))
             else:
-                picture = self._picture(obj, aov)
-                parts.append(np.asarray(self.texels.from_image(i, picture), np.float32))
+                parts.append(self.texels.from_image(i, self._picture(obj, aov)))
         return np.concatenate(parts)
 
     def _picture(self, obj: SceneObject, aov: str) -> Float:

@@ -40,7 +40,7 @@ def ingest(
         name="ingest",
         role="scan",
         parameters={"adapter": adapter or "recognised", **parameters},
-        inputs=_inputs(capture, options),
+        inputs=_inputs(capture, options, asset.folder),
     )
 
     def work(run: StageRun) -> dict[str, Any]:
@@ -69,12 +69,14 @@ def ingest(
     return step.run(work)
 
 
-def _inputs(capture: Path, options: IngestOptions) -> dict[str, str]:
-    """Hashes of all that ingest may read: the capture's folder, and files named by options."""
-    folder = capture if capture.is_dir() else capture.parent
+def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str]:
+    """Hashes of all that ingest may read: the capture's folder, without the asset if that lies in
+    it, and files named by options."""
+    folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    own = asset.resolve()
+    files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
     inputs = {"capture": hash_of_files(files, folder)}
     for name in ("mesh", "objects"):
         path = getattr(options, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +40,8 @@ Bool = npt.NDArray[np.bool_]
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
 # bounds the memory of the ray buffers.
 _TILE = 1 << 15
+# More Sobol points than this fill the memory, and improve nothing.
+_MAX_RAYS = 1 << 20
 # Albedo of a surface that nobody saw.
 NEUTRAL = 0.5
 # S below this share of the scene's median is darkness in which an albedo means nothing.
@@ -57,17 +60,20 @@ class ShadeOptions:
     def __post_init__(self) -> None:
         if not self.sampling.standard_error >= 0:
             raise UsageError("--standard-error: must not be negative. [usage.option]")
-        if self.sampling.max_rays < 4:
-            raise UsageError("--rays: at least 4 are needed. [usage.option]")
+        if not 4 <= self.sampling.max_rays <= _MAX_RAYS:
+            raise UsageError(
+                f"--rays {self.sampling.max_rays}: not between 4 and {_MAX_RAYS}. [usage.option]"
+            )
 
 
 def shade(asset: Asset, options: ShadeOptions) -> StageResult:
     """Trace S, divide, find the emitters, write shading.usda and its EXR maps."""
     if options.denoise == "oidn":
         require_oidn()
+    layers = weaker_layers(asset, "shading")
     stage = open_weaker(asset, "shading")
     inputs = {
-        **weaker_layers(asset, "shading"),
+        **layers,
         **environment_hash(options.environment),
         "maps": hash_of_maps(asset, "lit", "coverage"),
     }
@@ -112,7 +118,7 @@ def _trace(
     for number, (first, last) in enumerate(
         progress(tiles, total=len(tiles), label="shade", unit="tiles")
     ):
-        done = run.checkpoint(f"tile-{number}", lambda a=first, b=last: tile(a, b))  # type: ignore[misc]
+        done = run.checkpoint(f"tile-{number}", partial(tile, first, last))
         for name, values in done.items():
             parts.setdefault(name, []).append(values)
     back = np.argsort(order)
@@ -131,13 +137,12 @@ def _tiles(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
 
 
 def _denoised(texels: Texels, irradiance: Float) -> Float:
-    return np.concatenate([
-        np.asarray(
-            texels.from_image(i, denoise_lightmap(np.asarray(texels.image(i, irradiance)))),
-            np.float32,
-        )
-        for i in range(len(texels.resolution))
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            texels.from_image(i, denoise_lightmap(texels.image(i, irradiance)))
+            for i in range(len(texels.resolution))
+        ]
+    )
 
 
 def _write(
@@ -175,7 +180,7 @@ def _write(
         aovs = []
         for name, (values, scale, unit) in chosen.items():
             file = step.asset.texture(obj.identifier, name)
-            write_exr(run.output(file), np.asarray(texels.image(i, values)))
+            write_exr(run.output(file), texels.image(i, values))
             aovs.append(Aov(name=name, file=file, scale=scale, unit=unit))
         area = np.maximum(texels.area[own], 1e-12)
         objects.append(

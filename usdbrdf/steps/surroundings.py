@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, to_working_space
 from usdbrdf.files.images import read_radiance
 from usdbrdf.shading.environment import Environment, black_environment
@@ -20,4 +21,8 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
 
 def environment_hash(picture: Path | None) -> dict[str, str]:
     """The picture's entry in a step's inputs."""
-    return {} if picture is None else {"environment": hash_of_files([picture])}
+    if picture is None:
+        return {}
+    if not picture.is_file():
+        raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
+    return {"environment": hash_of_files([picture])}

@@ -28,6 +28,7 @@ from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_fr
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
 Float = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
 
 # In the coverage map.
 MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
@@ -46,6 +47,10 @@ class TextureOptions:
         if self.texel_size is not None and not self.texel_size > 0:
             raise UsageError(
                 f"--texel-size {self.texel_size}: not a positive length. [usage.option]"
+            )
+        if self.max_texels < 1:
+            raise UsageError(
+                f"--max-texels {self.max_texels}: at least 1 is needed. [usage.option]"
             )
         if not 0 < self.quantile < 1:
             raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
@@ -112,17 +117,15 @@ def _write(
     texel_size: float,
     quantile: float,
 ) -> dict[str, Any]:
+    assert scene.corner_uv is not None
     measured = observed.quantiles.count > 0
     clipped = ~measured & (observed.clipped > 0)
-    lit = np.where(
-        measured[:, None],
-        psquare.quantile(observed.quantiles, quantile),
-        observed.lower_bound[:, None],
-    )
+    median = psquare.quantile(observed.quantiles, quantile)
+    lit = _with_lower_bounds(texels, median, measured, clipped, observed.lower_bound)
     coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
     spread = np.nan_to_num(psquare.spread(observed.quantiles, quantile))
-    maps: dict[str, tuple[npt.NDArray[Any], float, str]] = {
-        "lit": (inpaint(texels, lit, measured | clipped), 1.0, "W/(m^2 sr)"),
+    maps: dict[str, tuple[Float, float, str]] = {
+        "lit": (lit, 1.0, "W/(m^2 sr)"),
         "mean": (inpaint(texels, observed.quantiles.mean, measured), 1.0, "W/(m^2 sr)"),
         "spread": (spread, 1.0, "W/(m^2 sr)"),
         "samples": (observed.quantiles.count.astype(np.float32), 1 / 32, "1"),
@@ -142,7 +145,7 @@ def _write(
             TexturedObject(
                 prim_path=obj.prim_path,
                 identifier=obj.identifier,
-                corner_uv=scene.corner_uv[obj.faces],  # type: ignore[index]
+                corner_uv=scene.corner_uv[obj.faces],
                 aovs=tuple(aovs),
                 texel_size=texel_size,
                 seen_fraction=float(measured[own].mean()),
@@ -167,3 +170,17 @@ def _write(
         "clipped_fraction": float(clipped.mean()),
         "unseen_objects": [item.identifier for item in objects if not item.seen],
     }
+
+
+def _with_lower_bounds(
+    texels: Texels, median: Float, measured: Bool, clipped: Bool, lower_bound: Float
+) -> Float:
+    """L_d everywhere: measured, or inpainted from what was measured on the same object, but where
+    every frame clipped at least what saturates them. An object that only ever clipped is known by
+    those bounds alone."""
+    owner = texels.object_index()
+    has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0
+    bounded = clipped & ~has_measured[owner]
+    known = np.where(bounded[:, None], lower_bound[:, None], median)
+    lit = inpaint(texels, known, measured | bounded)
+    return np.where(clipped[:, None], np.maximum(lit, lower_bound[:, None]), lit)

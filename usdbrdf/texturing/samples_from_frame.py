@@ -70,13 +70,13 @@ def samples_from_frame(
     world_from_camera: Double,
     intrinsics: Double,
 ) -> tuple[npt.NDArray[np.int8], Float]:
-    """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, but a pixel of its footprint is saturated),
+    """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, and saturated all over its footprint),
     (T,) int8, and the radiance of the samples, (T, 3) float32.
 
     radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
     intrinsics fx, fy, cx, cy.
     """
-    camera_from_world = np.linalg.inv(world_from_camera)
+    camera_from_world = np.linalg.inv(world_from_camera).astype(np.float64, copy=False)
     kind = np.zeros(len(texels), np.int8)
     values = np.zeros((len(texels), 3), np.float32)
     _sample(
@@ -100,7 +100,9 @@ def samples_from_frame(
 
 
 @kernel
-def _project(p, sx, sy, dx, dy, k, m):  # type: ignore[no-untyped-def]
+def _project(
+    p: Float, sx: Float, sy: Float, dx: float, dy: float, k: Double, m: Double
+) -> tuple[float, float, float]:
     """Pixel of the point p + dx sx + dy sy and its depth in front of the camera."""
     x = p[0] + dx * sx[0] + dy * sy[0]
     y = p[1] + dx * sx[1] + dy * sy[1]
@@ -159,18 +161,24 @@ def _sample(
         span_y = np.sqrt((uy - u) ** 2 + (vy - v) ** 2)
         taps_x = min(_MAX_TAPS, max(1, int(np.ceil(span_x))))
         taps_y = min(_MAX_TAPS, max(1, int(np.ceil(span_y))))
-        kind[t] = SAMPLE
         total = np.zeros(3)
+        num_valid = 0
+        num_clipped = 0
         for a in range(taps_x):
             for b in range(taps_y):
                 dx = (a + 0.5) / taps_x - 0.5
                 dy = (b + 0.5) / taps_y - 0.5
                 su, sv, _ = _project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
-                found = _bilinear(su, sv, radiance, valid, clipped, total)
-                if found != SAMPLE and kind[t] != CLIPPED:
-                    kind[t] = found
-        for c in range(3):
-            values[t, c] = total[c] / (taps_x * taps_y)
+                good, saturated = _bilinear(su, sv, radiance, valid, clipped, total)
+                num_valid += good
+                num_clipped += saturated
+        # Partly saturated is no bound: a lamp's neighbour catches some of its light.
+        if num_valid == 4 * taps_x * taps_y:
+            kind[t] = SAMPLE
+            for c in range(3):
+                values[t, c] = total[c] / (taps_x * taps_y)
+        elif num_clipped == 4 * taps_x * taps_y:
+            kind[t] = CLIPPED
 
 
 @kernel
@@ -184,7 +192,7 @@ def _shows_surface(
     seen_object: Int,
     seen_point: Float,
 ) -> bool:
-    """Do the 3 x 3 pixels around show object ``own``, within a pixel's size of the tangent plane?"""
+    """Do the 3 x 3 pixels around show object ``own`` within a pixel's size of its tangent plane?"""
     for j in range(row - 1, row + 2):
         for i in range(column - 1, column + 2):
             if seen_object[j, i] != own:
@@ -199,8 +207,8 @@ def _shows_surface(
 @kernel
 def _bilinear(
     u: float, v: float, radiance: Float, valid: Bool, clipped: Bool, total: Double
-) -> int:
-    """Add the image's value at pixel coordinates (u, v) to ``total`` if all four pixels are valid."""
+) -> tuple[int, int]:
+    """Add the image at (u, v) to ``total``; how many of the four pixels are valid, and clipped."""
     height, width = valid.shape
     x = min(max(u - 0.5, 0.0), width - 1.001)
     y = min(max(v - 0.5, 0.0), height - 1.001)
@@ -208,14 +216,13 @@ def _bilinear(
     j = int(y)
     fx = x - i
     fy = y - j
-    found = SAMPLE
+    num_valid = 0
+    num_clipped = 0
     for b in range(2):
         for a in range(2):
             w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
-            if clipped[j + b, i + a]:
-                found = CLIPPED
-            elif not valid[j + b, i + a] and found != CLIPPED:
-                found = NOTHING
+            num_valid += valid[j + b, i + a]
+            num_clipped += clipped[j + b, i + a]
             for c in range(3):
                 total[c] += w * radiance[j + b, i + a, c]
-    return found
+    return num_valid, num_clipped

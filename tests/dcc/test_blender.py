@@ -1,0 +1,81 @@
+"""What Blender makes of an asset: textures, roughness and index of refraction on every object."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from pxr import Sdf
+
+BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
+SCRIPT = Path(__file__).with_name("blender_report.py")
+FOLDERS = ["room", "Zimmer é 椅子 (1)"]
+
+pytestmark = pytest.mark.skipif(
+    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
+)
+
+
+def blender_report(layer, tmp_path):
+    """Import a layer in Blender's own process, which must not see our build of USD."""
+    done = subprocess.run(
+        [BLENDER, str(SCRIPT), str(layer)],
+        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def report_of(built, tmp_path, look):
+    """The report with a look selected, as an artist would in a layer of his own."""
+    mine = Sdf.Layer.CreateNew(str(tmp_path / f"{look}.usda"))
+    mine.subLayerPaths = [str(built.asset.root_layer)]
+    mine.defaultPrim = built.asset.name
+    prim = Sdf.CreatePrimInLayer(mine, f"/{built.asset.name}")
+    prim.variantSelections["look"] = look
+    mine.Save()
+    meshes = blender_report(mine.realPath, tmp_path)["meshes"]
+    assert set(meshes) == {"Stuhl_No_1", "wall", "lamp"}
+    return {name: mesh["slots"][0] for name, mesh in meshes.items()}
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_the_shaded_look(tmp_path, synthetic, folder):
+    scan = synthetic.make_scan(tmp_path / "capture")
+    built = synthetic.build(tmp_path / folder, scan)
+    report = blender_report(built.asset.root_layer, tmp_path)
+    for mesh in report["meshes"].values():
+        assert mesh["uv_layers"] == ["st"]
+        assert len(mesh["slots"]) == 1
+    materials = {name: mesh["slots"][0] for name, mesh in report["meshes"].items()}
+    for name in ("Stuhl_No_1", "wall"):
+        image = materials[name]["base_image"]
+        assert image["file"] == f"{name}.albedo.exr"
+        # Not taken for sRGB, and in place: a missing image has no size.
+        assert image["colorspace"] == "Non-Color"
+        assert image["pixel"] == [0.25, 0.25, 0.25, 1.0]
+        assert (image["extension"], image["uv"]) == ("EXTEND", "st")
+    chair, wall, lamp = (materials[name] for name in ("Stuhl_No_1", "wall", "lamp"))
+    assert (chair["roughness"], chair["ior"]) == pytest.approx((0.5, 1.5))
+    assert (wall["roughness"], wall["ior"]) == (1.0, 1.0)
+    assert chair["tint"] == [1.0] * 4
+    assert chair["metallic"] == 0
+    assert lamp["emission_image"]["file"] == "lamp.emission.exr"
+    assert lamp["emission_strength"] == 1
+    assert lamp["base_color"][:3] == [0, 0, 0]
+    assert report["frames"] == [1, 3]
+
+
+@pytest.mark.parametrize("look", ["lit", "coverage", "albedo"])
+def test_a_look_shows_its_map_unlit(built, tmp_path, look):
+    chair = report_of(built, tmp_path, look)["Stuhl_No_1"]
+    assert chair["emission_image"]["file"] == f"Stuhl_No_1.{look}.exr"
+    # A map of one channel is grey, not red.
+    assert chair["emission_image"]["pixel"][:3] == [0.25] * 3
+    assert chair["base_color"][:3] == [0, 0, 0]
+    assert chair["ior"] == 1

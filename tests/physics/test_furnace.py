@@ -1,0 +1,97 @@
+"""The white furnace: in a closed box of albedo rho and uniform emission Le every radiance is the
+same, L = Le + rho L, so L = Le / (1 - rho), whatever the shape of the box."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.chi2 import assert_same_mean
+from tests.physics.surfaces import World, box, estimates, room, world_of
+from usdbrdf.shading.albedo import albedo_from_irradiance
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+
+RHO = np.array([0.2, 0.5, 0.8])
+EMITTED = np.array([1.0, 0.5, 0.25])
+L = EMITTED / (1 - RHO)
+
+
+@pytest.fixture(scope="module")
+def furnace() -> World:
+    """A room with a box floating in it: corners, edges and blockers, and no way out."""
+    return world_of(room((0, 0, 0), (4, 3, 2.5)) + box((1, 1, 0.5), (2, 2.2, 1.5)))
+
+
+def _lit(world: World) -> np.ndarray:
+    return np.tile(L.astype(np.float32), (len(world.texels), 1))
+
+
+def _somewhere_bright(world: World) -> np.ndarray:
+    """A radiance from which only lights are made: estimators must not care where they aim."""
+    return world.per_object([(1, 1, 1)] * 5 + [(100, 100, 100)] + [(1, 1, 1)] * 6)
+
+
+def _shade(world: World, lights: np.ndarray, estimator: str, rays: int) -> Irradiance:
+    order, patch = patches_of_texels(world.texels)
+    found = irradiance_at(
+        world.rays, world.texture(_lit(world)), world.lights(lights), black_environment(),
+        world.texels.position[order], world.texels.normal[order], patch,
+        Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=1), world.size,
+    )  # fmt: skip
+    back = np.argsort(order)
+    return Irradiance(**{name: values[back] for name, values in vars(found).items()})
+
+
+@pytest.mark.parametrize("estimator", ["cosine", "mis"])
+def test_cosine_rays_alone_give_pi_L_without_noise(furnace: World, estimator: str):
+    # L cos / (cos / pi) = pi L for every single ray. Uniform radiance makes no lights.
+    assert len(furnace.lights(_lit(furnace)).face) == 0
+    found = _shade(furnace, _lit(furnace), estimator, 256)
+    np.testing.assert_allclose(found.mean, np.tile(np.pi * L, (len(found.mean), 1)), rtol=1e-5)
+    assert found.standard_error.max() < 1e-5
+
+
+@pytest.mark.parametrize("estimator", ["cosine", "mis"])
+def test_no_ray_leaves_a_closed_box(furnace: World, estimator: str):
+    found = _shade(furnace, _somewhere_bright(furnace), estimator, 1024)
+    leaks = np.count_nonzero(found.escaped[furnace.texels.interior])
+    assert leaks == 0, f"rays escaped from {leaks} texels"
+
+
+def test_lights_in_the_list_do_not_change_the_answer(furnace: World):
+    # S = pi L still, now with noise: half of the rays go to one wall.
+    lights = furnace.lights(_somewhere_bright(furnace))
+    assert len(lights.face) == 2
+    pick = np.random.default_rng(12345).choice(len(furnace.texels), 40, replace=False)
+    replicates, _ = estimates(
+        furnace, _lit(furnace), lights,
+        furnace.texels.position[pick], furnace.texels.normal[pick],
+        estimator="mis", rays=128, repeat=64, seed=1,
+    )  # fmt: skip
+    assert_same_mean(replicates, np.pi * L)
+
+
+def test_the_furnace_is_a_fixed_point_of_emission_plus_reflection(furnace: World):
+    # L = Le + rho S / pi, with S out of the estimator and nothing else.
+    found = _shade(furnace, _somewhere_bright(furnace), "mis", 1024)
+    area = furnace.texels.area / furnace.texels.area.sum()
+    mean = area @ found.mean
+    np.testing.assert_allclose(EMITTED + RHO * mean / np.pi, L, rtol=2e-3)
+    # ... and the one that iterating reaches from darkness: L_k = L (1 - rho^k).
+    lit = np.zeros(3)
+    for _ in range(60):
+        lit = EMITTED + RHO * lit * (mean / (np.pi * L))
+    np.testing.assert_allclose(lit, L, rtol=1e-2)
+
+
+def test_the_albedo_of_the_reflected_part_comes_back(furnace: World):
+    # What leaves a texel without its own emission is L - Le = rho L, and S = pi L.
+    found = _shade(furnace, _lit(furnace), "mis", 64)
+    reflected = np.tile((L - EMITTED).astype(np.float32), (len(furnace.texels), 1))
+    rho, known = albedo_from_irradiance(reflected, found.mean, 1e-6)
+    assert known.all()
+    np.testing.assert_allclose(rho, np.tile(RHO, (len(rho), 1)), rtol=1e-5)
+    # With its emission it looks like rho = 1: that is why emitters are told apart.
+    emitting, _ = albedo_from_irradiance(_lit(furnace), found.mean, 1e-6)
+    np.testing.assert_allclose(emitting, 1, rtol=1e-5)

@@ -1,0 +1,174 @@
+"""The two irradiance estimators on a furnished room: same answer, honest error, repeatable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tests.physics.chi2 import sidak
+from tests.physics.surfaces import World, box, estimates, room, world_of
+from usdbrdf.shading.environment import Environment, black_environment
+from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.shading.lights import Lights
+
+# Quads of the room and its two boxes; those of the lamp follow.
+NUM_REFLECTORS = 18
+
+
+@pytest.fixture(scope="module")
+def furnished() -> tuple[World, np.ndarray, Lights]:
+    """A room with two boxes and a lamp; every texel has a radiance of its own."""
+    parts = (
+        room((0, 0, 0), (4, 3, 2.5))
+        + box((0.5, 0.6, 0.1), (1.2, 1.4, 0.9))
+        + box((2.4, 1.5, 0.2), (3.1, 2.2, 1.3))
+        + box((1.6, 1.1, 2.3), (2.4, 1.7, 2.45))
+    )
+    world = world_of(parts)
+    lit = np.random.default_rng(7).uniform(0.05, 0.6, (len(world.texels), 3)).astype(np.float32)
+    lit[world.texels.object_index() >= NUM_REFLECTORS] *= 60
+    lights = world.lights(lit)
+    assert len(lights.face) == 12
+    return world, lit, lights
+
+
+def _shade(furnished, index: np.ndarray, patch: np.ndarray, **sampling) -> Irradiance:
+    world, lit, lights = furnished
+    return irradiance_at(
+        world.rays, world.texture(lit), lights, black_environment(),
+        world.texels.position[index], world.texels.normal[index], patch,
+        Sampling(**sampling), world.size,
+    )  # fmt: skip
+
+
+def test_both_estimators_agree_on_a_furnished_room(furnished):
+    # Welch's t at 24 points and 3 channels, Sidak over all 72.
+    world, lit, lights = furnished
+    rng = np.random.default_rng(12345)
+    pick = rng.choice(np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS), 24, replace=False)
+    at = world.texels.position[pick], world.texels.normal[pick]
+    cosine, _ = estimates(world, lit, lights, *at, estimator="cosine", rays=1024, repeat=64)
+    mis, _ = estimates(world, lit, lights, *at, estimator="mis", rays=128, repeat=64, seed=9)
+    p = stats.ttest_ind(cosine, mis, axis=0, equal_var=False).pvalue
+    assert p.min() >= sidak(p.size), f"p = {p.min():.3g} (level {sidak(p.size):.3g})"
+    # The comparison resolves half a per cent of S on average over the points.
+    both = np.sqrt(cosine.var(axis=0) / 64 + mis.var(axis=0) / 64)
+    resolved = np.sqrt(((both / mis.mean(axis=0)) ** 2).mean() / p.size)
+    assert resolved < 0.005
+    assert abs((cosine.mean(axis=0) / mis.mean(axis=0) - 1).mean()) < 4 * resolved
+
+
+def test_seeds_matter_and_repetition_does_not(furnished):
+    index, patch = np.arange(40), np.arange(40, dtype=np.int32) // 8
+    for estimator in ("mis", "cosine"):
+        runs = [
+            _shade(furnished, index, patch, estimator=estimator, max_rays=128, seed=seed).mean
+            for seed in (0, 0, 1)
+        ]
+        np.testing.assert_array_equal(runs[0], runs[1])
+        assert (runs[0] != runs[2]).mean() > 0.99
+
+
+def test_a_tile_of_whole_patches_gives_the_bits_of_the_whole(furnished):
+    world, _, _ = furnished
+    order, patch = patches_of_texels(world.texels)
+    cut = int(np.searchsorted(patch, patch[len(patch) // 2]))
+    sampling = {"estimator": "mis", "standard_error": 0.1, "max_rays": 256}
+    whole = _shade(furnished, order, patch, **sampling)
+    second = _shade(furnished, order[cut:], patch[cut:], **sampling)
+    np.testing.assert_array_equal(whole.mean[cut:], second.mean)
+    np.testing.assert_array_equal(whole.rays[cut:], second.rays)
+
+
+def test_patches_are_blocks_of_one_object(furnished):
+    texels = furnished[0].texels
+    order, patch = patches_of_texels(texels)
+    assert sorted(order) == list(range(len(texels)))
+    assert (np.diff(patch) >= 0).all()
+    assert (np.diff(patch) <= 1).all()
+    owner = texels.object_index()[order]
+    for number in np.unique(patch):
+        own = patch == number
+        assert len(np.unique(owner[own])) == 1
+        # 8 x 8 texels of a quad in one plane: no further apart than the quad's block.
+        assert own.sum() <= 64
+
+
+@pytest.mark.parametrize("rays", [64, 256])
+def test_the_standard_error_of_aimed_rays_is_an_upper_estimate(furnished, rays: int):
+    # Sobol points spread more evenly over the whole than over each quarter of the sequence, so the
+    # scatter of the four quarters overstates the error of their mean. Measured against replicates:
+    # root mean square error / root mean square claim = 0.6 to 1.0; never above 1.1.
+    world, lit, lights = furnished
+    own = np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS)[::4]
+    at = world.texels.position[own], world.texels.normal[own]
+    replicates, found = estimates(world, lit, lights, *at, estimator="mis", rays=rays, repeat=24)
+    true = replicates.var(axis=0, ddof=1).mean()
+    claimed = (found.standard_error.astype(np.float64) ** 2).mean()
+    assert 0.3 < np.sqrt(true / claimed) < 1.1
+
+
+def test_the_standard_error_of_independent_rays_is_unbiased(furnished):
+    # Four blocks of independent rays: the claimed variance has the true one as its mean. Away from
+    # the lamp's rare hits (many rays) both agree within the scatter of 108 points x 24 replicates.
+    world, lit, lights = furnished
+    own = np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS)[::10]
+    at = world.texels.position[own], world.texels.normal[own]
+    replicates, found = estimates(world, lit, lights, *at, estimator="cosine", rays=512, repeat=24)
+    true = replicates.var(axis=0, ddof=1).mean()
+    claimed = (found.standard_error.astype(np.float64) ** 2).mean()
+    assert true / claimed == pytest.approx(1, abs=0.15)
+
+
+def test_rays_double_until_the_error_that_was_asked_for(furnished):
+    world, lit, lights = furnished
+    order, patch = patches_of_texels(world.texels)
+    reached = _shade(furnished, order, patch, standard_error=0.05, max_rays=4096)
+    exact = _shade(furnished, order, patch, standard_error=0.0, max_rays=4096, seed=77)
+    lit_texels = exact.mean.min(axis=1) > 1e-6
+    relative = (reached.mean / np.maximum(exact.mean, 1e-6) - 1)[lit_texels]
+    assert np.sqrt((relative**2).mean()) < 0.05
+    # Stopping on a noisy error must not bend the mean: 6 times below the error itself.
+    assert abs(relative.mean()) < 0.008
+    assert 64 <= reached.rays.min() < reached.rays.max() <= 4096
+    assert reached.rays.mean() < 1000
+    # One decision per patch.
+    first = np.searchsorted(patch, np.arange(patch[-1] + 1))
+    np.testing.assert_array_equal(reached.rays, reached.rays[first][patch])
+
+
+@pytest.mark.parametrize("with_lights", [True, False])
+@pytest.mark.parametrize("max_rays", [8, 16, 48, 100, 1000])
+def test_no_texel_gets_more_rays_than_allowed(furnished, with_lights: bool, max_rays: int):
+    world, lit, lights = furnished
+    if not with_lights:
+        lights = world.lights(np.ones_like(lit))
+    at = world.texels.position[:64], world.texels.normal[:64]
+    replicates, found = estimates(world, lit, lights, *at, estimator="mis", rays=max_rays, repeat=1)
+    assert np.isfinite(replicates).all()
+    assert found.rays.max() <= max_rays
+
+
+def test_what_escapes_is_counted_and_sees_the_environment():
+    # An open box without its ceiling: from the middle of the floor the opening is a square of
+    # half-width 1 at height 1, form factor F (the corner formula); a uniform environment E0 behind
+    # it and walls of radiance L_w: S = pi (F E0 + (1 - F) L_w), escaped = F.
+    parts = room((-1, -1, 0), (1, 1, 1))
+    world = world_of([parts[0], *parts[2:]])
+    lit = np.full((len(world.texels), 3), 0.25, np.float32)
+    form_factor = 4 / (2 * np.pi) * 2 / np.sqrt(2) * np.arctan(1 / np.sqrt(2))
+    sky = Environment(image=np.full((4, 8, 3), 2.0, np.float32), z_up=True)
+    lamp = world.lights(world.per_object([(1, 1, 1)] * 4 + [(100, 100, 100)]))
+    for lights, estimator in [(lamp, "mis"), (lamp, "cosine"), (world.lights(lit), "mis")]:
+        replicates, found = estimates(
+            world, lit, lights, np.zeros((1, 3)), np.array([[0.0, 0, 1]]),
+            estimator=estimator, rays=256, repeat=256, environment=sky,
+        )  # fmt: skip
+        expected = np.pi * (form_factor * 2.0 + (1 - form_factor) * 0.25)
+        # 1024 independent or better than independent rays per estimate.
+        number = found.escaped.size * 128
+        error = np.sqrt(form_factor * (1 - form_factor) / number)
+        assert abs(found.escaped.mean() - form_factor) < 4 * error
+        off = (replicates.mean() - expected) / (replicates.std() / 16)
+        assert abs(off) < 3.5

@@ -1,0 +1,151 @@
+"""The mixture of lobe, light and cosine samples integrates any roughness without bias."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.brdf import directional_albedo
+from tests.physics.chi2 import assert_same_mean
+from tests.physics.surfaces import World, box, quad, room, world_of
+from usdbrdf.material.lobe_samples import Mixture, non_diffuse, trace_lobe_samples
+from usdbrdf.material.target_frames import SurfacePoints
+from usdbrdf.shading.environment import Environment, black_environment
+from usdbrdf.shading.lights import Lights
+
+PHIS = (0.0, 0.02, 0.1, 0.3, 0.7, 1.0)
+RGB = np.array([3.0, 2.0, 1.0])
+REPEAT = 2048
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _points(position: np.ndarray, to_camera: np.ndarray, repeat: int = REPEAT) -> SurfacePoints:
+    """The same point of a horizontal surface many times: every copy draws its own shift."""
+
+    def copies(vector: np.ndarray) -> np.ndarray:
+        return np.tile(np.asarray(vector, np.float32), (repeat, 1))
+
+    zero = np.zeros(repeat, np.float32)
+    return SurfacePoints(
+        face=zero.astype(np.int32), u=zero, v=zero,
+        position=copies(position), normal=copies(UP), to_camera=copies(to_camera),
+    )  # fmt: skip
+
+
+def _towards(degrees: float) -> np.ndarray:
+    return np.array([np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))])
+
+
+def _assert_albedo(
+    world: World,
+    lit: np.ndarray,
+    lights: Lights,
+    position: np.ndarray,
+    degrees: float,
+    *,
+    environment: Environment | None = None,
+    visible=None,
+    radiance: np.ndarray = RGB,
+) -> None:
+    """base and base + slope equal L times the directional albedo at psi = 0 and 1."""
+    samples = trace_lobe_samples(
+        world.rays, _points(position, _towards(degrees)), world.texture(lit), lights,
+        environment or black_environment(), Mixture(), world.size, 0,
+    )  # fmt: skip
+    found, wanted = [], []
+    for phi in PHIS:
+        base, slope = non_diffuse(samples, phi)
+        found.append([base, base + slope])
+        wanted.append([
+            directional_albedo(np.radians(degrees), phi, psi, steps=300, visible=visible) * radiance
+            for psi in (0.0, 1.0)
+        ])  # fmt: skip
+    # (phi, psi, copy, channel) -> copy first. slack: the quadrature, halving its step moves it so
+    # little even where a mask cuts it.
+    slack = 1e-3 if visible is None else 4e-3
+    assert_same_mean(np.moveaxis(np.array(found, np.float64), 2, 0), wanted, slack=slack)
+
+
+@pytest.mark.parametrize("degrees", [10, 45, 75])
+def test_a_uniform_environment(degrees: float):
+    # L_nd = L * directional albedo. The only triangle of the scene lies under the surface.
+    world = world_of([quad((-1, -1, -2), (2, 0, 0), (0, 2, 0))])
+    lit = world.per_object([(0, 0, 0)])
+    sky = Environment(image=np.tile(RGB.astype(np.float32), (4, 8, 1)), z_up=True)
+    _assert_albedo(world, lit, world.lights(lit), np.zeros(3), degrees, environment=sky)
+
+
+@pytest.mark.parametrize("degrees", [10, 75])
+@pytest.mark.parametrize("aims", ["nowhere", "one wall", "a box"])
+def test_a_furnace(degrees: float, aims: str):
+    # Radiance L from everywhere; whatever the aimed samples aim at must not show.
+    world = world_of(room((-2, -2, 0), (2, 2, 2.5)) + box((0.5, 0.4, 0.6), (1.0, 0.9, 1.2)))
+    lit = world.per_object([tuple(RGB)] * 12)
+    bright = {"nowhere": [], "one wall": [5], "a box": range(6, 12)}[aims]
+    lights = world.lights(world.per_object([(100.0 if i in bright else 1.0,) * 3 for i in range(12)]))
+    assert (len(lights.face) > 0) == (aims != "nowhere")
+    _assert_albedo(world, lit, lights, np.zeros(3), degrees)
+
+
+@pytest.mark.parametrize("degrees", [10, 45])
+def test_half_of_the_sky_behind_a_wall(degrees: float):
+    # A black wall, 2 km wide and high, 1 m away at x = -1: hides the directions with w_x < 0 but
+    # those that pass over it or beside it (1e-3 of them).
+    world = world_of([quad((-1, -1000, -1), (0, 2000, 0), (0, 0, 1000))])
+    lit = world.per_object([(0, 0, 0)])
+    sky = Environment(image=np.tile(RGB.astype(np.float32), (4, 8, 1)), z_up=True)
+
+    def visible(w: np.ndarray) -> np.ndarray:
+        t = -1 / np.minimum(w[..., 0], -1e-12)
+        hit = (w[..., 0] < 0) & (np.abs(t * w[..., 1]) < 1000) & (t * w[..., 2] < 999)
+        return ~hit
+
+    # The lift off the surface is 1e-5 of this scene's size: give it that of the room.
+    small = World(scene=world.scene, texels=world.texels)
+    small.__dict__["size"] = 1.0
+    _assert_albedo(
+        small, lit, small.lights(lit), np.zeros(3), degrees, environment=sky, visible=visible
+    )
+
+
+@pytest.mark.parametrize("degrees", [10, 45])
+@pytest.mark.parametrize("aimed", [True, False])
+def test_a_lamp_half_hidden_by_a_blocker(degrees: float, aimed: bool):
+    # Lamp: [-1, 1] x [-1, 1] at z = 2, looking down. Blocker, black: [0, 1] x [-1, 1] at z = 1.
+    # Seen is where the ray to z = 2 lands on the lamp and, at half that distance, beside the
+    # blocker. The lamp is reached by aimed samples or, aimed elsewhere, by the lobes alone.
+    lamp = quad((-1, -1, 2), (0, 2, 0), (2, 0, 0))
+    blocker = quad((0, -1, 1), (1, 0, 0), (0, 2, 0))
+    decoy = quad((5, 5, 0.5), (0, 0, 0.5), (0, 1, 0))
+    world = world_of([lamp, blocker, decoy, quad((-20, -20, -1), (40, 0, 0), (0, 40, 0))])
+    lit = world.per_object([tuple(RGB), (0, 0, 0), (0, 0, 0), (0, 0, 0)])
+    bright = 0 if aimed else 2
+    lights = world.lights(world.per_object([(100.0 * (i == bright) + 1e-3,) * 3 for i in range(4)]))
+    assert len(lights.face) == 2
+
+    def visible(w: np.ndarray) -> np.ndarray:
+        t = 2 / np.maximum(w[..., 2], 1e-12)
+        x, y = t * w[..., 0], t * w[..., 1]
+        on_lamp = (np.abs(x) < 1) & (np.abs(y) < 1) & (w[..., 2] > 0)
+        hidden = (x / 2 > 0) & (x / 2 < 1) & (np.abs(y / 2) < 1)
+        return on_lamp & ~hidden
+
+    _assert_albedo(world, lit, lights, np.zeros(3), degrees, visible=visible)
+
+
+def test_the_samples_of_a_point_depend_on_the_seed_alone():
+    world = world_of(room((-2, -2, 0), (2, 2, 2.5)))
+    lit = world.per_object([(1, 1, 1)] * 5 + [(9, 9, 9)])
+    points = _points(np.zeros(3), _towards(30), repeat=20)
+
+    def run(seed: int) -> np.ndarray:
+        samples = trace_lobe_samples(
+            world.rays, points, world.texture(lit), world.lights(lit), black_environment(),
+            Mixture(), world.size, seed,
+        )  # fmt: skip
+        return non_diffuse(samples, 0.3)[1]
+
+    np.testing.assert_array_equal(run(0), run(0))
+    assert (run(0) != run(1)).mean() > 0.9
+    # Copies of one point do not share their random numbers.
+    assert len(np.unique(run(0)[:, 0])) == 20

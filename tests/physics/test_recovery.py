@@ -1,0 +1,208 @@
+"""A sphere of known material in a lit box: the fit finds what it was rendered with.
+
+The target frame is rendered here, by NumPy alone: exact sphere, exact box, printed equations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.physics.brdf import f_nd
+from tests.physics.surfaces import World, box, room, sphere, world_of
+from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.material.fit_object import LitScene, View, fit_object
+from usdbrdf.shading.environment import black_environment
+
+CENTRE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.35
+LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.6])
+# Floor, ceiling, walls at y low, y high, x low, x high.
+WALLS = np.array(
+    [[0.3, 0.25, 0.2], [0.5, 0.5, 0.5], [0.2, 0.3, 0.4], [0.4, 0.3, 0.2], [0.25] * 3, [0.35] * 3]
+)
+# The lamp: a box under the ceiling, above the camera's side of the sphere.
+LAMP_LOW, LAMP_HIGH = np.array([0.3, -1.3, 2.3]), np.array([0.9, -0.7, 2.5])
+LAMP = np.array([30.0, 27.0, 24.0])
+SIZE = 56
+SPHERE = 12  # index of the object after six walls and the lamp's six sides
+
+
+class Setup(NamedTuple):
+    world: World
+    pose: np.ndarray
+    intrinsics: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    parts = room(LOW, HIGH) + box(LAMP_LOW, LAMP_HIGH) + [sphere(CENTRE, RADIUS, 64, 128, (256, 128))]
+    pose = np.eye(4)
+    # From y = -1.6, looking along +y: right = x, up = z.
+    pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
+    pose[:3, 3] = [0, -1.6, 1.0]
+    focal = 0.42 * SIZE / np.tan(np.arcsin(RADIUS / 1.6))  # the sphere fills 84 % of the height
+    return Setup(world_of(parts), pose, np.array([focal, focal, SIZE / 2, SIZE / 2]))
+
+
+def _diffuse(position: np.ndarray) -> np.ndarray:
+    """L_d of the sphere: some smooth function of the place."""
+    return (0.25 + 0.2 * (position - CENTRE) @ [0.5, 0.2, 1.0])[..., None] * [1.0, 0.8, 0.6]
+
+
+def _true_radiance(world: World) -> np.ndarray:
+    lit = world.per_object([*WALLS, *[LAMP] * 6, (0, 0, 0)])
+    own = world.texels.of_object(SPHERE)
+    lit[own] = _diffuse(world.texels.position[own].astype(np.float64))
+    return lit
+
+
+def _incident(origin: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """L from the box's inside or the lamp, (..., 3), by the slab method. The sphere is convex."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        exits = np.maximum((LOW - origin) / w, (HIGH - origin) / w)
+        near = np.minimum((LAMP_LOW - origin) / w, (LAMP_HIGH - origin) / w).max(axis=-1)
+        far = np.maximum((LAMP_LOW - origin) / w, (LAMP_HIGH - origin) / w).min(axis=-1)
+    axis = exits.argmin(axis=-1)
+    positive = np.take_along_axis(w, axis[..., None], axis=-1)[..., 0] > 0
+    # Axis z: floor 0, ceiling 1; axis y: 2, 3; axis x: 4, 5.
+    wall = np.array([4, 2, 0])[axis] + positive
+    return np.where(((near < far) & (near > 0))[..., None], LAMP, WALLS[wall])
+
+
+def _sphere_points(setup: Setup, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance along the rays through pixels (R, 2) (NaN: past the sphere) and directions."""
+    origin, direction = (
+        a.astype(np.float64) for a in camera_rays(setup.pose, setup.intrinsics, pixels)
+    )
+    b = ((origin - CENTRE) * direction).sum(axis=-1)
+    c = ((origin - CENTRE) ** 2).sum(axis=-1) - RADIUS**2
+    with np.errstate(invalid="ignore"):
+        return -b - np.sqrt(b * b - c), direction
+
+
+def _render(setup: Setup, phi: float, psi: float, samples: int = 96) -> np.ndarray:
+    """The frame (H, W, 3): each pixel the mean of 3 x 3 points of it, I = L_d + I_nd.
+
+    I_nd by half of the directions from D about the mirror direction and half cosine-distributed,
+    balance heuristic, independent random numbers.
+    """
+    rng = np.random.default_rng(2024)
+    centres = pixel_centres(SIZE, SIZE)
+    offset = (np.arange(3) - 1) / 3
+    offsets = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
+    image = np.zeros((SIZE * SIZE, 3))
+    alpha = max(0.001, phi)
+    for shift in offsets:
+        distance, direction = _sphere_points(setup, centres + shift)
+        on = np.isfinite(distance)
+        x = setup.pose[:3, 3] + distance[on, None] * direction[on]
+        n = (x - CENTRE) / RADIUS
+        wo = -direction[on]
+        t = np.cross(n, [0.3, 0.5, 0.8])
+        t /= np.linalg.norm(t, axis=-1, keepdims=True)
+        frame = np.stack([t, np.cross(n, t), n], axis=1)  # rows: two tangents and the normal
+        u = rng.random((len(x), samples, 2))
+        half = samples // 2
+        tan = alpha * np.sqrt(u[:, :half, 0] / (1 - u[:, :half, 0]))
+        cos_h = 1 / np.sqrt(1 + tan**2)
+        radius = np.concatenate([tan * cos_h, np.sqrt(u[:, half:, 0])], axis=1)
+        up = np.concatenate([cos_h, np.sqrt(1 - u[:, half:, 0])], axis=1)
+        angle = 2 * np.pi * u[..., 1]
+        local = np.stack([radius * np.cos(angle), radius * np.sin(angle), up], axis=-1)
+        w = local @ frame
+        h = w[:, :half]
+        w[:, :half] = 2 * (h @ wo[..., None]) * h - wo[:, None]
+        both = w + wo[:, None]
+        both /= np.linalg.norm(both, axis=-1, keepdims=True)
+        nh = (both * n[:, None]).sum(axis=-1)
+        wh = (both * w).sum(axis=-1)
+        nw = (w * n[:, None]).sum(axis=-1)
+        d = alpha**2 / (np.pi * (1 + (alpha**2 - 1) * nh**2) ** 2)
+        density = 0.5 * d * np.abs(nh) / (4 * np.maximum(wh, 1e-9)) + 0.5 * np.maximum(nw, 0) / np.pi
+        value = f_nd(n[:, None], w, wo[:, None], phi, psi) * nw / np.maximum(density, 1e-12)
+        light = _incident(x[:, None], w)
+        image[on] += _diffuse(x) + (value[..., None] * light).mean(axis=1)
+    return (image / len(offsets)).reshape(SIZE, SIZE, 3).astype(np.float32)
+
+
+def _lit_scene(world: World, radiance: np.ndarray) -> LitScene:
+    emission = world.per_object([(0, 0, 0)] * 6 + [(1, 1, 1)] * 6 + [(0, 0, 0)])
+    return LitScene(
+        scene=world.scene,
+        rays=world.rays,
+        radiance=world.texture(radiance),
+        lights=world.lights(radiance),
+        emission=world.texture(emission),
+        environment=black_environment(),
+        size=world.size,
+    )
+
+
+def _whole(setup: Setup) -> np.ndarray:
+    """(H, W) bool: every corner of the pixel lies on the sphere."""
+    corners = [(-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]
+    inside = [
+        np.isfinite(_sphere_points(setup, pixel_centres(SIZE, SIZE) + c)[0]) for c in corners
+    ]
+    return np.all(inside, axis=0).reshape(SIZE, SIZE)
+
+
+@pytest.mark.parametrize(("phi", "psi"), [(0.06, 0.8), (0.12, 0.3), (0.3, 0.5), (0.56, 0.9)])
+def test_the_material_of_a_sphere_comes_back(setup: Setup, phi: float, psi: float):
+    image = _render(setup, phi, psi)
+    view = View(
+        radiance=image,
+        valid=_whole(setup),
+        world_from_camera=setup.pose,
+        intrinsics=setup.intrinsics,
+    )
+    exact = _true_radiance(setup.world)
+    lit = _lit_scene(setup.world, exact)
+    found, used = fit_object(lit, view, SPHERE, "paper", 800, 0)
+    assert found is not None
+    assert used > 500
+    assert (found.phi, found.psi) == (pytest.approx(phi, abs=0.02), pytest.approx(psi, abs=0.05))
+    assert found.evidence > 0.9
+
+    # The sphere's own L_d a tenth too dark: "scaled" has a factor for that, "paper" has not.
+    darker = exact.copy()
+    darker[setup.world.texels.of_object(SPHERE)] *= np.float32(0.9)
+    off = _lit_scene(setup.world, darker)
+    scaled, _ = fit_object(off, view, SPHERE, "scaled", 800, 0)
+    assert scaled is not None
+    assert (scaled.phi, scaled.psi) == (pytest.approx(phi, abs=0.02), pytest.approx(psi, abs=0.05))
+    literal, _ = fit_object(off, view, SPHERE, "paper", 800, 0)
+    assert literal is not None
+    assert literal.cost > 2 * found.cost
+
+
+def test_a_sphere_without_specular_gets_none(setup: Setup):
+    # psi = 0 keeps the grazing part only: hardly anything but L_d is in the picture.
+    image = _render(setup, 0.9, 0.0)
+    view = View(
+        radiance=image,
+        valid=_whole(setup),
+        world_from_camera=setup.pose,
+        intrinsics=setup.intrinsics,
+    )
+    lit = _lit_scene(setup.world, _true_radiance(setup.world))
+    found, _ = fit_object(lit, view, SPHERE, "paper", 800, 0)
+    assert found is not None
+    assert found.psi < 0.05
+
+
+def test_an_object_of_a_few_pixels_is_not_fitted(setup: Setup):
+    nothing = np.zeros((SIZE, SIZE), bool)
+    nothing[SIZE // 2, SIZE // 2 - 4 : SIZE // 2 + 4] = True
+    view = View(
+        radiance=np.ones((SIZE, SIZE, 3), np.float32),
+        valid=nothing,
+        world_from_camera=setup.pose,
+        intrinsics=setup.intrinsics,
+    )
+    lit = _lit_scene(setup.world, _true_radiance(setup.world))
+    found, used = fit_object(lit, view, SPHERE, "paper", 800, 0)
+    assert found is None
+    assert used == 8

@@ -1,0 +1,403 @@
+"""The command line as a user and a farm meet it: exit codes, sentences, and what is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.scenes import make_capture
+from usdbrdf import cli
+from usdbrdf.cli import main
+from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.progress import set_quiet
+from usdbrdf.scan.adapters import Adapter
+
+COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
+COMMANDS = ("convert", "ingest", "texture", "shade", "fit", "validate", "adapters", "plugin-path")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return make_capture(tmp_path_factory.mktemp("cli") / "scan").folder
+
+
+@pytest.fixture(scope="module")
+def asset(capture):
+    folder = capture.parent / "room"
+    assert main(["convert", str(capture), "-o", str(folder), "-q", *COARSE]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def not_quiet():
+    yield
+    set_quiet(False)
+
+
+def refused(capsys, *arguments):
+    """Exit code and the one line on stderr of a call that says nothing else."""
+    capsys.readouterr()
+    status = main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("usdbrdf: ")
+    assert err.count("\n") == 1
+    assert re.search(r"\[[a-z.-]+\]\n$", err), "a rule's name closes the line"
+    return status, err
+
+
+def run(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        **options,
+    )
+
+
+# Help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_each_command(name, capsys):
+    assert main([name, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "exit codes:" in out
+
+
+def test_help_says_default_and_unit_of_every_option(capsys):
+    main(["convert", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for name, unit, default in (
+        ("--wait S", "seconds", "(default: 0.0)"),
+        ("--crease-angle DEG", "degrees", "(default: 40.0)"),
+        ("--min-component-area M2", "m^2", "(default: 0.01)"),
+        ("--max-nonfinite SHARE", "share", "(default: 0.01)"),
+        ("--meters-per-unit M", "metres", "default: as the format says"),
+        ("--texel-size M", "metres", "default: the frames' median pixel footprint"),
+        ("--quantile P", "quantile", "(default: 0.5)"),
+        ("--max-texels N", "texels", "(default: 4000000)"),
+        ("--standard-error E", "relative", "(default: 0.03)"),
+        ("--rays N", "rays per texel", "default: 2048"),
+        ("--environment HDR", "latitude-longitude", "default: black"),
+        ("--seed N", "random", "(default: 0)"),
+    ):
+        said = text.split(f" {name} ")[-1].split(" --")[0]
+        assert unit in said, name
+        assert default in said, name
+
+
+@pytest.mark.parametrize("name", ["shade", "fit"])
+def test_an_option_means_the_same_in_each_command(name, capsys):
+    main(["convert", "--help"])
+    everything = " ".join(capsys.readouterr().out.split())
+    main([name, "--help"])
+    own = " ".join(capsys.readouterr().out.split())
+    for option in ("--seed N seed", "--environment HDR lat"):
+        sentence = own[own.index(option) :].split(" --")[0].split(" exit codes")[0]
+        assert sentence in everything
+
+
+def test_seed_reaches_shade_and_fit(asset):
+    main(["convert", str(asset.parent / "scan"), "-o", str(asset), *COARSE, "--seed", "7", "-q"])
+    for stamp in ("3-shade", "4-fit"):
+        record = json.loads((asset / f".usdbrdf/stamps/{stamp}.json").read_text())
+        assert record["parameters"]["seed"] == 7
+
+
+# Wrong options
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--texel-size", "0"],
+        ["--texel-size", "nan"],
+        ["--texel", "0.1"],
+        ["--quantile", "1"],
+        ["--max-texels", "0"],
+        ["--rays", "2"],
+        ["--rays", "9999999999"],
+        ["--standard-error", "-1"],
+        ["--seed", "-1"],
+        ["--seed", "1.5"],
+        ["--max-pixels", "3"],
+        ["--fit", "best"],
+        ["--adopt", "--discard"],
+        ["--crease-angle", "181"],
+        ["--up-axis", "x"],
+        ["--wait", "long"],
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_made(options, capture, tmp_path, capsys):
+    status, _ = refused(capsys, "convert", capture, "-o", tmp_path / "out", *options)
+    assert status == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [[], ["paint"], ["convert"], ["fit"], ["adapters", "x"]])
+def test_wrong_commands(arguments, capsys):
+    assert refused(capsys, *arguments)[0] == 2
+
+
+# Inputs and outputs that cannot be used leave nothing behind
+
+
+def test_missing_scan(tmp_path, capsys):
+    status, line = refused(capsys, "convert", tmp_path / "none", "-o", tmp_path / "a" / "b")
+    assert status == 3
+    assert "none: no such file or folder" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_capture_leaves_no_folder(tmp_path, capsys):
+    scan = make_capture(tmp_path / "scan", frames=2)
+    status, _ = refused(capsys, "convert", scan.folder, "-o", tmp_path / "out")
+    assert status == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan"]
+
+
+def test_bad_capture_keeps_an_empty_folder_that_was_there(tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    assert refused(capsys, "convert", tmp_path / "none", "-o", tmp_path / "out")[0] == 3
+    assert (tmp_path / "out").is_dir()
+
+
+def test_refused_later_keeps_what_was_valid(asset, tmp_path, capsys):
+    before = (asset / "layers" / "scan.usdc").read_bytes()
+    status, _ = refused(capsys, "ingest", tmp_path / "none", "-o", asset)
+    assert status == 3
+    assert (asset / "layers" / "scan.usdc").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["texture", "shade", "fit", "validate"])
+def test_steps_without_an_asset(name, tmp_path, capsys):
+    assert refused(capsys, name, tmp_path / "none")[0] == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", ["--mesh", "--objects", "--environment"])
+def test_files_named_by_options_must_exist(option, capture, tmp_path, capsys):
+    call = ("convert", capture, "-o", tmp_path / "out", option, tmp_path / "none")
+    status, line = refused(capsys, *call)
+    assert status == 3
+    assert "none" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_output_that_is_a_file_or_lies_in_one(capture, tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert refused(capsys, "convert", capture, "-o", file)[0] == 4
+    assert refused(capsys, "convert", capture, "-o", file / "out")[0] == 4
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_read_only_output(capture, tmp_path, capsys):
+    tmp_path.chmod(0o555)
+    try:
+        assert refused(capsys, "convert", capture, "-o", tmp_path / "out")[0] == 4
+        assert refused(capsys, "convert", capture, "-o", tmp_path / "a" / "out")[0] == 4
+    finally:
+        tmp_path.chmod(0o755)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system without mkdir")
+@pytest.mark.parametrize("output", ["/proc/out", "/proc/a/out"])
+def test_output_where_nothing_can_be_made(output, capture, capsys):
+    assert refused(capsys, "convert", capture, "-o", output)[0] == 4
+
+
+def test_foreign_folder(capture, tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert refused(capsys, "convert", capture, "-o", tmp_path)[0] == 6
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_busy_folder(asset, capsys):
+    with folder_lock(asset / ".usdbrdf"):
+        assert refused(capsys, "fit", asset)[0] == 5
+
+
+# What is said
+
+
+def test_second_run_is_up_to_date(capture, asset, capsys):
+    main(["convert", str(capture), "-o", str(asset), "-q", *COARSE])
+    assert main(["convert", str(capture), "-o", str(asset), *COARSE]) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    for name in ("ingest", "texture", "shade", "fit"):
+        assert f"{name}: up to date\n" in err
+    assert err.endswith("room.usda: up to date\n")
+
+
+def test_capture_that_holds_its_own_asset(tmp_path, capsys):
+    scan = make_capture(tmp_path / "scan").folder
+    for _ in range(2):
+        assert main(["ingest", str(scan), "-o", str(scan / "asset")]) == 0
+    assert "ingest: up to date" in capsys.readouterr().err
+
+
+def test_quiet_says_nothing(capture, asset, capfd):
+    assert main(["convert", str(capture), "-o", str(asset), "-q", *COARSE]) == 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_json_is_all_there_is_on_stdout(capture, tmp_path):
+    done = run("ingest", capture, "-o", tmp_path / "out", "--json")
+    assert done.returncode == 0
+    summary = json.loads(done.stdout)
+    assert summary["asset"] == str(tmp_path / "out" / "out.usda")
+    assert summary["steps"]["ingest"]["reran"] is True
+    assert summary["steps"]["ingest"]["frames"] == 12
+
+
+def test_json_of_a_refused_run_is_empty(tmp_path, capsys):
+    assert refused(capsys, "ingest", tmp_path / "none", "-o", tmp_path / "out", "--json")[0] == 3
+
+
+def test_message_about_a_strange_name_is_printable(tmp_path, capsys):
+    main(["ingest", str(tmp_path / "no\x1b[31mne"), "-o", str(tmp_path / "out")])
+    assert "\x1b" not in capsys.readouterr().err
+
+
+def test_version_and_plugin_path(capsys):
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"usdbrdf \S+\n", capsys.readouterr().out)
+    assert main(["plugin-path"]) == 0
+    assert (Path(capsys.readouterr().out.strip()) / "plugInfo.json").is_file()
+
+
+def test_adapters_are_listed_one_per_line(monkeypatch, capsys):
+    assert main(["adapters"]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert [line.split()[0] for line in lines[:2]] == ["transforms", "scanner-app"]
+    assert all(re.fullmatch(r"\S+ +\S.+ \(\S+\)", line) for line in lines)
+    assert err == ""
+
+    broken = Adapter(name="bad", description="", origin="p.m", module=None, problem="no\nread")
+    monkeypatch.setattr(cli, "list_adapters", lambda: (broken,))
+    main(["adapters"])
+    assert capsys.readouterr().out == "bad  broken: no read (p.m)\n"
+
+
+def test_validate_prints_findings_and_exits_7(asset, capsys):
+    assert main(["validate", str(asset)]) == 0
+    assert capsys.readouterr().out == ""
+    picture = next((asset / "textures").glob("*.lit.exr"))
+    picture.rename(picture.with_suffix(".away"))
+    try:
+        assert main(["validate", str(asset)]) == 7
+    finally:
+        picture.with_suffix(".away").rename(picture)
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.endswith("does not exist. [validate.missing]") for line in lines)
+    assert all(picture.name in line and re.search(r"\[[\w:.]+\]$", line) for line in lines)
+
+
+# Files edited by hand
+
+
+@pytest.fixture
+def edited_asset(asset, capture):
+    """The asset with one line more in texturing.usda; whole again afterwards."""
+    layer = asset / "layers" / "texturing.usda"
+    main(["convert", str(capture), "-o", str(asset), "-q", *COARSE])
+    made = layer.read_bytes()
+    layer.write_bytes(made + b"# by hand\n")
+    yield layer, made
+    layer.write_bytes(made)
+    for copy in asset.glob("adopted-*.usda"):
+        copy.unlink()
+
+
+def test_edited_by_hand_is_refused(capture, asset, edited_asset, capsys):
+    layer, made = edited_asset
+    status, line = refused(capsys, "convert", capture, "-o", asset, *COARSE)
+    assert status == 6
+    assert "layers/texturing.usda" in line
+    assert "--adopt" in line
+    assert "--discard" in line
+    assert layer.read_bytes() == made + b"# by hand\n"
+
+
+def test_edited_by_hand_is_adopted(capture, asset, edited_asset, capsys):
+    layer, made = edited_asset
+    assert main(["convert", str(capture), "-o", str(asset), "--adopt", *COARSE]) == 0
+    assert layer.read_bytes() == made
+    assert (asset / "adopted-1.usda").is_file()
+    assert "adopted-1.usda" in capsys.readouterr().err
+
+
+def test_edited_by_hand_is_discarded(capture, asset, edited_asset):
+    layer, made = edited_asset
+    assert main(["convert", str(capture), "-o", str(asset), "--discard", "-q", *COARSE]) == 0
+    assert layer.read_bytes() == made
+    assert list(asset.glob("adopted-*")) == []
+
+
+# Ends that come from outside
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals(number, status, capture, tmp_path, monkeypatch, capsys):
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def killed(*_arguments, **_options):
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(cli, "ingest", killed)
+    assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == status
+    assert capsys.readouterr().err.endswith("the same command goes on from here.\n")
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) is handler
+
+
+def test_terminated_while_it_works(capture, tmp_path):
+    arguments = [sys.executable, "-m", "usdbrdf", "convert", str(capture)]
+    arguments += ["-o", str(tmp_path / "out"), "--texel-size", "0.02"]
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr:
+            if line.startswith("texture: "):
+                break
+        process.terminate()
+        assert process.wait(60) == 143
+        assert process.stderr.read().endswith("terminated; the same command goes on from here.\n")
+    assert (tmp_path / "out" / "layers" / "scan.usdc").is_file()
+
+
+@pytest.mark.parametrize("arguments", [["convert", "--help"], ["adapters"]])
+def test_reader_that_went_away(arguments):
+    read, write = os.pipe()
+    os.close(read)
+    process = subprocess.run(
+        [sys.executable, "-m", "usdbrdf", *arguments], stdout=write, stderr=subprocess.PIPE
+    )
+    os.close(write)
+    assert process.stderr == b""
+    assert process.returncode == 0
+
+
+def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys):
+    def broken(*_arguments, **_options):
+        raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(cli, "ingest", broken)
+    assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == 1
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert "defect of usdbrdf" in err
+    assert list(tmp_path.iterdir()) == []

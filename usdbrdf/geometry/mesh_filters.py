@@ -1,0 +1,128 @@
+"""pymeshlab's filters on the objects of a scan; run in a child process, for they crash and hang.
+
+pymeshlab is licensed under the GPL and imported here alone, by the child: we only exchange arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.geometry.weld import welded_ids
+
+Array = npt.NDArray[Any]
+
+# No object is reduced below this, or small ones would vanish beside a large one.
+_MIN_TRIANGLES = 32
+
+
+def repair_sheets(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
+    """Drop null and repeated faces, and separate the surface where more than two faces meet.
+
+    points (V, 3) float32; triangles (F, 3) int32; sheet (F,) int32: each is repaired by itself,
+    and in one sheet faces with the same three positions count as the same whatever their side.
+
+    Returns no positions but where things came from: vertex (W,) int32, the input vertex at whose
+    position each output vertex lies; triangles (G, 3) int32 into those; face (G,) int32, the input
+    face that each output face was.
+    """
+    points, triangles, sheet = (arrays[k] for k in ("points", "triangles", "sheet"))
+    vertices, faces, origins = [], [], []
+    first = 0
+    for index in np.unique(sheet):
+        own = np.flatnonzero(sheet == index)
+        used, corners = np.unique(triangles[own], return_inverse=True)
+        vertex, face, origin = _repaired(points[used], corners.reshape(-1, 3))
+        vertices.append(used[vertex])
+        faces.append(face + first)
+        origins.append(own[origin])
+        first += len(vertex)
+    return {
+        "vertex": np.concatenate(vertices, dtype=np.int32),
+        "triangles": np.concatenate(faces, dtype=np.int32),
+        "face": np.concatenate(origins, dtype=np.int32),
+    }
+
+
+def _repaired(points: Array, triangles: Array) -> tuple[Array, Array, Array]:
+    """(input vertex of each output vertex, output faces, input face of each output face)."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet()
+    # The scalars are names that the filters carry along with what they keep or copy.
+    meshes.add_mesh(
+        pymeshlab.Mesh(
+            points.astype(np.float64),
+            triangles.astype(np.int32),
+            v_scalar_array=np.arange(len(points), dtype=np.float64),
+            f_scalar_array=np.arange(len(triangles), dtype=np.float64),
+        )
+    )
+    # Exporters split vertices at seams; only joined ones show which faces are neighbours.
+    meshes.meshing_remove_duplicate_vertices()
+    meshes.meshing_remove_null_faces()
+    if meshes.current_mesh().face_number() == 0:
+        return np.zeros(0, np.int32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
+    meshes.meshing_remove_duplicate_faces()
+    meshes.meshing_repair_non_manifold_edges(method="Split Vertices")
+    meshes.meshing_remove_unreferenced_vertices()
+    mesh = meshes.current_mesh()
+    return (
+        mesh.vertex_scalar_array().astype(np.int32),
+        mesh.face_matrix(),
+        mesh.face_scalar_array().astype(np.int32),
+    )
+
+
+def decimate_objects(
+    arrays: Mapping[str, Array], parameters: Mapping[str, Any]
+) -> dict[str, Array]:
+    """Quadric edge collapse, object by object, to ``target`` triangles in all. Borders are kept,
+    so that objects do not come apart where they touch.
+
+    points (V, 3) float32; triangles (F, 3) int32; face_object (F,) int32; joined (J,) int32:
+    objects whose neighbouring faces share vertices already. Returns the first three anew.
+    """
+    import pymeshlab
+
+    points, triangles, face_object = (arrays[k] for k in ("points", "triangles", "face_object"))
+    share = parameters["target"] / len(triangles)
+    parts: list[tuple[Array, Array, int]] = []
+    for index in np.unique(face_object):
+        own = triangles[face_object == index]
+        target = max(_MIN_TRIANGLES, round(share * len(own)))
+        part = _part(points, own, weld=index not in arrays["joined"])
+        if target < len(own):
+            meshes = pymeshlab.MeshSet()
+            meshes.add_mesh(pymeshlab.Mesh(part[0].astype(np.float64), part[1]))
+            meshes.meshing_decimation_quadric_edge_collapse(
+                targetfacenum=target, preserveboundary=True, boundaryweight=2.0,
+                preservenormal=True, planarquadric=True, autoclean=True,
+            )  # fmt: skip
+            mesh = meshes.current_mesh()
+            part = (mesh.vertex_matrix().astype(np.float32), mesh.face_matrix())
+        parts.append((*part, int(index)))
+    firsts = np.cumsum([0, *[len(p) for p, _, _ in parts]])
+    return {
+        "points": np.concatenate([p for p, _, _ in parts]),
+        "triangles": np.concatenate(
+            [f + firsts[i] for i, (_, f, _) in enumerate(parts)], dtype=np.int32
+        ),
+        "face_object": np.repeat(
+            np.array([index for _, _, index in parts], np.int32), [len(f) for _, f, _ in parts]
+        ),
+    }
+
+
+def _part(points: Array, triangles: Array, *, weld: bool) -> tuple[Array, Array]:
+    """One object's own vertices and faces; welded, because edges must be shared to be collapsed."""
+    used, corners = np.unique(triangles, return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    own = points[used]
+    if not weld:
+        return own, corners.astype(np.int32)
+    _, first, joined = np.unique(welded_ids(own), return_index=True, return_inverse=True)
+    return own[first], joined[corners].astype(np.int32)
