@@ -68,6 +68,7 @@ def make_capture(
     size: tuple[int, int] = (32, 24),
     room: bool = True,
     subdivisions: int = 4,
+    poses: Double | None = None,
     radiance: Mapping[str, tuple[float, float, float]] | None = None,
     noise: float = 0.0,
     exposure_times: Sequence[float] = (0.02,),
@@ -79,6 +80,7 @@ def make_capture(
 
     room                  False leaves only the box, seen closer, before a black background
     subdivisions          squares along each side of each quad
+    poses                 (N, 4, 4) instead of ``ring_of_poses(frames)``
     noise                 standard deviation relative to the radiance
     exposure_times        taken in turn; the saturation and the floor of a frame scale with
                           1 / exposure, the given values belonging to the first
@@ -86,7 +88,7 @@ def make_capture(
     folder.mkdir(parents=True, exist_ok=True)
     points, triangles, face_object, names = room_mesh(room=room, subdivisions=subdivisions)
     shown = {**RADIANCE, **(radiance or {})}
-    poses = ring_of_poses(frames)
+    poses = ring_of_poses(frames) if poses is None else poses
     width, height = size
     focal = (0.6 if room else 1.2) * width
     intrinsics = np.array([focal, focal, width / 2, height / 2])

@@ -6,32 +6,60 @@ USD follows absolute paths, ``../`` and links without a question, wherever they 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from pxr import Ar, Sdf, Tf, UsdUtils
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.job.child import run_child
 
 _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
 _MAX_LAYERS = 1000
 _MAX_BYTES = 4 << 30
+_TIMEOUT_S = 600.0
 
 
-def check_asset_paths(path: Path, allow: Sequence[Path]) -> None:
-    """InputRefused unless every path in ``path`` and its layers stays beside it or in ``allow``.
+def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
+    """A USD file and every layer that it reaches; InputRefused if one lies elsewhere than beside
+    it or in ``allow``. The files are read in a child process."""
+    found = run_child(
+        "usdbrdf.stage.foreign_paths:layers_in_child",
+        {},
+        {"path": str(path.resolve()), "allow": [str(folder.resolve()) for folder in allow]},
+        _TIMEOUT_S,
+        f"{path}: reading USD",
+    )
+    return tuple(Path(layer) for layer in found["layers"].tolist())
+
+
+def layers_in_child(
+    arrays: Mapping[str, npt.NDArray[Any]], parameters: Mapping[str, Any]
+) -> dict[str, npt.NDArray[Any]]:
+    """The child's part of ``layers_of_usd``."""
+    allow = [Path(folder) for folder in parameters["allow"]]
+    layers = check_asset_paths(Path(parameters["path"]), allow)
+    return {"layers": np.array([str(layer) for layer in layers])}
+
+
+def check_asset_paths(path: Path, allow: Sequence[Path]) -> list[Path]:
+    """The layers that ``path`` reaches, itself first; InputRefused unless every path in them stays
+    beside it or in ``allow``.
 
     Layers, references, payloads, of every variant, and asset-valued attributes count; links are
     judged by where they lead. What a crafted crate file does to USD's own reader is not caught
     here: call this in a child process.
     """
     allowed = [path.resolve().parent, *(folder.resolve() for folder in allow)]
-    waiting, seen, total = [path.resolve()], set[Path](), 0
+    waiting, seen, total = [path.resolve()], list[Path](), 0
     while waiting:
         layer = waiting.pop()
         if layer in seen:
             continue
-        seen.add(layer)
+        seen.append(layer)
         total += layer.stat().st_size
         if len(seen) > _MAX_LAYERS or total > _MAX_BYTES:
             raise InputRefused(
@@ -44,6 +72,7 @@ def check_asset_paths(path: Path, allow: Sequence[Path]) -> None:
             target = _target(layer, reference, allowed)
             if target.suffix.lower() in _LAYER_SUFFIXES and target.is_file():
                 waiting.append(target)
+    return seen
 
 
 def _references(layer: Path) -> list[str]:

@@ -10,8 +10,10 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult, StageRun
 from usdbrdf.scan.adapters import read_scan
+from usdbrdf.scan.geometry_from_usd import USD_SUFFIXES
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.foreign_paths import layers_of_usd
 from usdbrdf.stage.header import StageHeader
 from usdbrdf.stage.root_layer import write_edits, write_pending_layer, write_root
 from usdbrdf.stage.scan_layer import write_scan_layer
@@ -70,16 +72,26 @@ def ingest(
 
 
 def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str]:
-    """Hashes of all that ingest may read: the capture's folder, without the asset if that lies in
-    it, and files named by options."""
+    """Hashes of all that ingest may read: the capture's folder and those that its documents may
+    point into, without the asset if that lies in one, and files named by options."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
+    inputs = {"capture": _hash_of_folder(folder, asset)}
+    for i, outside in enumerate(options.allow_outside):
+        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset)
+    mesh, objects = options.mesh, options.objects
+    if mesh is not None and mesh.is_file():
+        # What a USD mesh refers to may lie beside it, out of the capture.
+        usd = mesh.suffix.lower() in USD_SUFFIXES
+        layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
+        inputs["mesh"] = hash_of_files(layers)
+    if objects is not None and objects.is_file():
+        inputs["objects"] = hash_of_files([objects])
+    return inputs
+
+
+def _hash_of_folder(folder: Path, asset: Path) -> str:
     own = asset.resolve()
     files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
-    inputs = {"capture": hash_of_files(files, folder)}
-    for name in ("mesh", "objects"):
-        path = getattr(options, name)
-        if path is not None and path.is_file():
-            inputs[name] = hash_of_files([path])
-    return inputs
+    return hash_of_files(files, folder)

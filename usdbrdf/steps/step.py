@@ -75,12 +75,13 @@ def hash_of_maps(asset: Asset, *aovs: str) -> str:
 
 
 def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
-    """One SHA-256 over names (relative to ``root``, if given) and contents of many files."""
-    names = sorted(files)
+    """One SHA-256 over names (relative to ``root``, if given) and contents of many files, wherever
+    they lie and in whatever order they come."""
+    names = list(files)
     with environment_failures("reading the inputs"), ThreadPoolExecutor() as pool:
         digests = list(pool.map(sha256_of, names))
-    joined = hashlib.sha256()
-    for name, digest in zip(names, digests, strict=True):
-        shown = name.relative_to(root).as_posix() if root else name.name
-        joined.update(f"{shown}\0{digest}\n".encode())
-    return joined.hexdigest()
+    lines = [
+        f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
+        for name, digest in zip(names, digests, strict=True)
+    ]
+    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()

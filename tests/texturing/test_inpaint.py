@@ -1,0 +1,108 @@
+"""Unseen texels take after the nearest seen ones of their own object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, box, quad, world_of
+from usdbrdf.texturing.inpaint import inpaint
+
+
+@pytest.fixture(scope="module")
+def pair() -> World:
+    """Two squares that touch along x = 1, so that the nearest texels are often the other's."""
+    return world_of([
+        quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size=(16, 16)),
+        quad((1, 0, 0), (1, 0, 0), (0, 1, 0), size=(16, 16)),
+    ])  # fmt: skip
+
+
+def test_known_texels_are_returned_unchanged(pair: World):
+    rng = np.random.default_rng(12345)
+    values = rng.lognormal(0, 2, (len(pair.texels), 3)).astype(np.float32)
+    known = rng.random(len(pair.texels)) < 0.5
+    values[~known] = np.nan
+    filled = inpaint(pair.texels, values, known)
+    np.testing.assert_array_equal(filled[known], values[known])
+    assert np.isfinite(filled).all()
+
+
+def test_holes_are_filled_from_their_own_object_only(pair: World):
+    values = pair.per_object([(0.2, 0.3, 0.4), (5, 6, 7)])
+    # The strip along the shared edge is unseen on both.
+    known = np.abs(pair.texels.position[:, 0] - 1) > 0.2
+    assert 50 < np.count_nonzero(~known) < 300
+    filled = inpaint(pair.texels, np.where(known[:, None], values, 0), known)
+    np.testing.assert_allclose(filled, values, rtol=1e-5)
+
+
+def test_a_gap_between_two_values_takes_their_geometric_mean(pair: World):
+    # Symmetric about the middle of the gap: 4 neighbours of 0.1 and 4 of 10 give 1.
+    x, y, _ = pair.texels.position.T
+    own = np.arange(len(pair.texels)) < 256
+    gap = own & (np.abs(x - 0.5) < 0.04) & (np.abs(y - 0.5) < 0.5)
+    values = np.where(x < 0.5, 0.1, 10.0)[:, None].astype(np.float32) * np.ones(3, np.float32)
+    filled = inpaint(pair.texels, values, ~gap)
+    assert np.exp(np.log(filled[gap]).mean()) == pytest.approx(1, rel=0.3)
+    assert filled.min() >= 0.1 * (1 - 1e-6)
+    assert filled.max() <= 10 * (1 + 1e-6)
+
+
+def test_an_object_that_nobody_saw_takes_the_nearest_of_the_scene(pair: World):
+    values = pair.per_object([(0.2, 0.3, 0.4), (5, 6, 7)])
+    known = pair.texels.object_index() == 0
+    filled = inpaint(pair.texels, values, known)
+    np.testing.assert_allclose(filled[~known], np.tile([[0.2, 0.3, 0.4]], (256, 1)), rtol=1e-5)
+
+
+def test_a_scene_that_nobody_saw_is_black(pair: World):
+    values = np.full((len(pair.texels), 3), np.nan, np.float32)
+    filled = inpaint(pair.texels, values, np.zeros(len(values), bool))
+    np.testing.assert_array_equal(filled, 0)
+
+
+def test_the_same_facing_counts_for_nearness():
+    # One object of two sheets 2 cm apart, back to back; only a stripe of each is seen. The hole in
+    # the upper one is nearer to the lower one's stripe in space, but not in space and facing.
+    upper = quad((0, 0, 0.02), (1, 0, 0), (0, 1, 0), size=(32, 32))
+    lower = quad((0, 0, 0), (0, 1, 0), (1, 0, 0), size=(32, 32))
+    both = _merged([upper, lower])
+    texels = both.texels
+    up = texels.normal[:, 2] > 0
+    x = texels.position[:, 0]
+    known = np.where(up, x < 0.2, x > 0.2)
+    values = np.where(up, 1.0, 9.0)[:, None].astype(np.float32) * np.ones(3, np.float32)
+    filled = inpaint(texels, values, known)
+    near = up & (x > 0.2) & (x < 0.35)
+    np.testing.assert_allclose(filled[near], 1, rtol=1e-5)
+
+
+def test_one_known_texel_is_enough():
+    world = world_of(box((0, 0, 0), (1, 1, 1)))
+    known = np.zeros(len(world.texels), bool)
+    known[5] = True
+    values = np.full((len(known), 3), 0.3, np.float32)
+    np.testing.assert_allclose(inpaint(world.texels, values, known), 0.3, rtol=1e-5)
+
+
+def _merged(parts: list) -> World:
+    """Parts side by side in the atlas of one object."""
+    from dataclasses import replace
+
+    from usdbrdf.geometry.scene import SceneObject
+    from usdbrdf.geometry.texels import texels_from_atlas
+
+    scene = world_of(parts).scene
+    uv = scene.corner_uv.copy()
+    uv[..., 0] = (uv[..., 0] + scene.face_object[:, None]) / len(parts)
+    whole = SceneObject(
+        prim_path="/x/geo/a", identifier="a", label="a", class_name="",
+        first_face=0, num_faces=len(uv),
+    )  # fmt: skip
+    one = replace(
+        scene, objects=(whole,), corner_uv=uv, face_object=np.zeros(len(uv), np.int32)
+    )
+    width, height = parts[0].size
+    resolution = np.array([[width * len(parts), height]], np.int32)
+    return World(scene=one, texels=texels_from_atlas(one, resolution))

@@ -1,0 +1,249 @@
+"""Which texels a frame gives a sample, and which value."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, quad, world_of
+from tests.scenes import look_at
+from usdbrdf.texturing.samples_from_frame import (
+    CLIPPED,
+    NOTHING,
+    SAMPLE,
+    first_surfaces,
+    samples_from_frame,
+)
+
+WIDTH, HEIGHT = 80, 60
+LENS = np.array([80.0, 80.0, 40.0, 30.0])
+EYE = np.array([0.1, -0.2, 2.0])
+
+
+class Shot(NamedTuple):
+    kind: np.ndarray
+    radiance: np.ndarray
+
+
+def _camera(eye: np.ndarray = EYE, target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    return look_at(np.asarray(eye, np.float64), np.asarray(target, np.float64))
+
+
+def _shoot(
+    world: World,
+    image: np.ndarray,
+    pose: np.ndarray,
+    valid: np.ndarray | None = None,
+    clipped: np.ndarray | None = None,
+) -> Shot:
+    surfaces = first_surfaces(
+        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
+    )
+    nowhere = np.zeros((HEIGHT, WIDTH), bool)
+    kind, radiance = samples_from_frame(
+        world.texels,
+        world.texels.object_index(),
+        surfaces,
+        image.astype(np.float32),
+        ~nowhere if valid is None else valid,
+        nowhere if clipped is None else clipped,
+        pose,
+        LENS,
+    )
+    return Shot(kind, radiance)
+
+
+def _pixel_of(pose: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Column, row (T,) of world points, written out once more."""
+    local = (position.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
+    depth = -local[:, 2]
+    return LENS[2] + LENS[0] * local[:, 0] / depth, LENS[3] - LENS[1] * local[:, 1] / depth
+
+
+def _picture_of_plane(pose: np.ndarray, value) -> np.ndarray:
+    """What a pinhole camera sees of the plane z = 0 with radiance value(x, y) (..., 3)."""
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack(
+        [(column - LENS[2]) / LENS[0], (LENS[3] - row) / LENS[1], -np.ones_like(row)], axis=-1
+    )
+    direction = local @ pose[:3, :3].T
+    t = -pose[2, 3] / direction[..., 2]
+    point = pose[:3, 3] + t[..., None] * direction
+    return value(point[..., 0], point[..., 1])
+
+
+def _pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.stack([1 + 0.4 * x, 2 + 0.3 * y, 1.5 + 0.2 * x - 0.3 * y], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def plane() -> World:
+    """One square metre facing up, texels of 2.5 cm: about as large as a pixel (1 / 40 m)."""
+    return world_of([quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(40, 40))])
+
+
+def test_a_textured_square_yields_its_radiance(plane: World):
+    pose = _camera()
+    shot = _shoot(plane, _picture_of_plane(pose, _pattern), pose)
+    seen = shot.kind == SAMPLE
+    # All but the texels whose 3 x 3 pixels reach past the square's edge.
+    inside = np.abs(plane.texels.position[:, :2]).max(axis=1) < 0.45
+    assert seen[inside].all()
+    assert not seen.all()
+    assert (shot.kind[~seen] == NOTHING).all()
+    # A linear pattern seen through a pinhole is nearly linear over a pixel; bilinear reading keeps
+    # it to the second order, (1/80)^2 of the range.
+    expected = _pattern(*plane.texels.position[seen, :2].T)
+    np.testing.assert_allclose(shot.radiance[seen], expected, atol=2e-4)
+
+
+def test_half_a_pixel_matters(plane: World):
+    # The value at a texel is that of the image there, first pixel's centre at (0.5, 0.5): an image
+    # of its own coordinates gives back the projection, to the average over the texel's footprint.
+    pose = _camera()
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    shot = _shoot(plane, np.stack([column, row, 0 * row], axis=-1), pose)
+    seen = shot.kind == SAMPLE
+    column, row = _pixel_of(pose, plane.texels.position[seen])
+    np.testing.assert_allclose(shot.radiance[seen, 0], column, atol=0.01)
+    np.testing.assert_allclose(shot.radiance[seen, 1], row, atol=0.01)
+
+
+def test_large_texels_average_over_their_footprint():
+    # Texels of 10 cm, four pixels wide; the picture has columns of alternating 0 and 2.
+    world = world_of([quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(10, 10))])
+    pose = _camera((0, -1e-3, 2.0))
+    stripes = np.zeros((HEIGHT, WIDTH, 3))
+    stripes[:, ::2] = 2
+    shot = _shoot(world, stripes, pose)
+    seen = shot.kind == SAMPLE
+    assert seen.sum() >= 64
+    np.testing.assert_allclose(shot.radiance[seen], 1, atol=0.15)
+
+
+def test_an_occluder_leaves_no_samples_behind_it_or_near_its_edge(plane: World):
+    floor = quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(40, 40))
+    world = world_of([floor, quad((-0.1, -0.1, 0.5), (0.2, 0, 0), (0, 0.2, 0), size=(8, 8))])
+    pose = _camera()
+    image = _picture_of_plane(pose, _pattern)
+    # The occluder's pixels are bright red: a sample that took any of it would show.
+    first = first_surfaces(
+        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
+    )
+    image[first.object == 1] = (100, 0, 0)
+    shot = _shoot(world, image, pose)
+    own = world.texels.of_object(0)
+    position = world.texels.position[own]
+    # The segment from the texel to the eye crosses z = 0.5 at a quarter of its length.
+    crossing = position[:, :2] + 0.25 * (EYE[:2] - position[:, :2])
+    behind = np.abs(crossing).max(axis=1) < 0.1
+    # A pixel is 1/80 * 1.5 m = 1.9 cm wide on the occluder: within half a pixel of its edge the
+    # texel's own 3 x 3 pixels show the occluder.
+    edge = np.abs(crossing).max(axis=1) < 0.1 + 0.009
+    clear = np.abs(crossing).max(axis=1) > 0.1 + 2.2 * 1.5 / 80
+    assert behind.sum() > 50
+    assert (shot.kind[own][behind] == NOTHING).all()
+    assert (shot.kind[own][edge] == NOTHING).all()
+    inside = np.abs(position[:, :2]).max(axis=1) < 0.45
+    assert (shot.kind[own][clear & inside] == SAMPLE).all()
+    seen = shot.kind[own] == SAMPLE
+    np.testing.assert_allclose(
+        shot.radiance[own][seen], _pattern(*position[seen, :2].T), atol=2e-4
+    )
+
+
+def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
+    # A step of 20 cm within one object: no sample mixes the upper with the lower side.
+    from dataclasses import replace
+
+    parts = [
+        quad((-0.5, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(20, 40)),
+        quad((0, -0.5, 0.2), (0.5, 0, 0), (0, 1, 0), size=(20, 40)),
+    ]
+    world = world_of(parts)
+    pose = _camera((-0.3, 0, 2.0))
+    one = World(
+        scene=replace(world.scene, face_object=np.zeros(4, np.int32)), texels=world.texels
+    )
+    size = np.array([WIDTH, HEIGHT], np.int32)
+    surfaces = first_surfaces(one.rays, one.scene.face_object, pose, LENS, size)
+    upper = surfaces.point[..., 2] > 0.1
+    image = np.where(upper[..., None], 9.0, 1.0) * np.ones(3)
+    everywhere = np.ones((HEIGHT, WIDTH), bool)
+    kind, radiance = samples_from_frame(
+        one.texels, np.zeros(len(one.texels), np.int32), surfaces, image.astype(np.float32),
+        everywhere, ~everywhere, pose, LENS,
+    )  # fmt: skip
+    seen = kind == SAMPLE
+    high = one.texels.position[:, 2] > 0.1
+    assert seen[high].sum() > 400
+    assert seen[~high].sum() > 400
+    np.testing.assert_allclose(radiance[seen & high], 9)
+    np.testing.assert_allclose(radiance[seen & ~high], 1)
+
+
+def test_saturated_pixels_make_clipped_texels(plane: World):
+    pose = _camera()
+    column, row = _pixel_of(pose, plane.texels.position)
+    clipped = np.zeros((HEIGHT, WIDTH), bool)
+    clipped[:, 30:38] = True
+    shot = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose, valid=~clipped, clipped=clipped)
+    free = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose).kind == SAMPLE
+    # The footprint reaches about a pixel to either side.
+    well_inside = free & (column > 32) & (column < 36)
+    well_outside = free & ((column < 28) | (column > 40))
+    assert well_inside.sum() > 50
+    assert (shot.kind[well_inside] == CLIPPED).all()
+    assert (shot.kind[well_outside] == SAMPLE).all()
+    # At the border some pixels are saturated and some are not: neither a sample nor a bound.
+    assert (shot.kind[free & (np.abs(column - 30) < 0.4)] == NOTHING).all()
+    np.testing.assert_array_equal(shot.radiance[shot.kind != SAMPLE], 0)
+    assert row.size == len(plane.texels)
+
+
+def test_one_bad_pixel_spoils_the_texels_that_read_it_and_no_others(plane: World):
+    pose = _camera()
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[28, 41] = False
+    image = np.ones((HEIGHT, WIDTH, 3))
+    image[28, 41] = 1e6
+    shot = _shoot(plane, image, pose, valid=valid)
+    free = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose).kind == SAMPLE
+    column, row = _pixel_of(pose, plane.texels.position)
+    away = np.maximum(np.abs(column - 41.5), np.abs(row - 28.5))
+    assert (shot.kind[free & (away < 0.9)] == NOTHING).all()
+    assert (shot.kind[free & (away > 2)] == SAMPLE).all()
+    np.testing.assert_allclose(shot.radiance[shot.kind == SAMPLE], 1, rtol=1e-6)
+
+
+def test_surfaces_that_face_away_give_nothing(plane: World):
+    pose = _camera((0.1, -0.2, -2.0))
+    shot = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose)
+    assert (shot.kind == NOTHING).all()
+
+
+def test_surfaces_seen_too_flat_give_nothing(plane: World):
+    # Cosine 0.08 < 0.1 at the middle; at cosine 0.3 samples are taken.
+    for cosine, taken in ((0.08, False), (0.3, True)):
+        eye = 2 * np.array([0, -np.sqrt(1 - cosine**2), cosine])
+        shot = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), _camera(eye))
+        middle = np.abs(plane.texels.position[:, :2]).max(axis=1) < 0.1
+        assert (shot.kind[middle] == SAMPLE).all() == taken
+        assert (shot.kind[middle] == NOTHING).all() != taken
+
+
+def test_nothing_comes_from_behind_the_camera_or_from_the_image_border(plane: World):
+    # The camera stands over the square and looks away, up.
+    away = _camera((0, 0, 1.0), (0, -0.1, 3))
+    assert (_shoot(plane, np.ones((HEIGHT, WIDTH, 3)), away).kind == NOTHING).all()
+    # So near that the square fills the image: the outermost pixels are left out.
+    pose = _camera((0, -1e-3, 0.5))
+    shot = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose)
+    column, row = _pixel_of(pose, plane.texels.position[shot.kind == SAMPLE])
+    assert column.min() >= 1
+    assert column.max() <= WIDTH - 1
+    assert row.min() >= 1
+    assert row.max() <= HEIGHT - 1
+    assert (shot.kind == SAMPLE).sum() > 200
