@@ -33,6 +33,12 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="wait up to this many seconds for a busy asset folder",
     )
+    parser.set_defaults(hand_edits="refuse")
+
+
+def add_edit_options(parser: argparse.ArgumentParser) -> None:
+    """What to do about files of ours that somebody changed: only for the command that can write
+    all of them again."""
     edits = parser.add_mutually_exclusive_group()
     edits.add_argument(
         "--adopt",
@@ -184,10 +190,10 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--fit",
         dest="method",
-        choices=("scaled", "paper"),
+        choices=("views", "scaled", "paper"),
         default=known.method,
-        help="scaled: L_d times a free factor, class prior where evidence is missing; "
-        "paper: the paper's residual, its minimum always kept",
+        help="views: many views per texel, L_d free; scaled: one target frame, L_d times a free "
+        "factor; paper: one target frame, the paper's residual",
     )
     add(
         "--max-pixels",

@@ -97,7 +97,7 @@ def working_on(
 def _settle(asset: Asset, edited: list[str], hand_edits: str) -> None:
     if edited and hand_edits == "refuse":
         raise OwnershipConflict(
-            f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run again "
+            f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `convert` "
             "with --adopt to keep the changes beside edits.usda, or --discard to drop them. "
             "[ownership.edited]"
         )

@@ -38,7 +38,7 @@ def _as_published(values: list[float], p: float) -> tuple[list[float], list[int]
     """Heights and positions of the five markers, box 1 of the paper word for word, in doubles."""
     q = sorted(values[:5])
     n = [1, 2, 3, 4, 5]
-    wanted = [1, 1 + 2 * p, 1 + 4 * p, 3 + 2 * p, 5]
+    wanted: list[float] = [1, 1 + 2 * p, 1 + 4 * p, 3 + 2 * p, 5]
     step = [0, p / 2, p, (1 + p) / 2, 1]
     for x in values[5:]:
         # B1: the cell k of x, extending the extremes.
@@ -81,7 +81,8 @@ def test_the_published_example_ends_where_it_should():
     assert round(float(spread(state, 0.5)[0, 0]), 2) == round(heights[3] - heights[1], 2)
 
 
-@pytest.mark.parametrize("p", [0.1, 0.5, 0.9])
+# Eighths: the desired positions are exact in binary, so "off by one or more" has one meaning.
+@pytest.mark.parametrize("p", [0.125, 0.5, 0.875])
 @pytest.mark.parametrize("kind", sorted(DISTRIBUTIONS))
 def test_every_step_follows_the_published_algorithm(kind: str, p: float):
     samples = DISTRIBUTIONS[kind](np.random.default_rng(12345), (120, 6, 3)).astype(np.float32)
@@ -162,11 +163,11 @@ def test_ordered_samples_are_the_worst_case_and_still_bounded(order: str, p: flo
 def test_the_order_of_the_markers_never_breaks():
     rng = np.random.default_rng(12345)
     # Many ties, jumps over ten decades, and a texel that stops being seen.
-    samples = 10.0 ** rng.integers(-5, 5, (300, 50, 3))
+    samples = (10.0 ** rng.integers(-5, 5, (300, 50, 3))).astype(np.float32)
     state = QuantileState.empty(50)
     for i, row in enumerate(samples):
         texel = np.arange(50 if i < 150 else 25, dtype=np.int32)
-        update(state, texel, row[: len(texel)].astype(np.float32), 0.5)
+        update(state, texel, row[: len(texel)], 0.5)
         assert (np.diff(state.heights[: len(texel), :, : min(i + 1, 5)], axis=2) >= 0).all()
     np.testing.assert_array_equal(state.count, np.where(np.arange(50) < 25, 300, 150))
     np.testing.assert_array_equal(state.heights[:25, :, 0], samples.min(axis=0)[:25])

@@ -123,6 +123,25 @@ def test_large_texels_average_over_their_footprint():
     np.testing.assert_allclose(shot.radiance[seen], 1, atol=0.15)
 
 
+def test_large_texels_do_not_read_over_the_edge_of_their_object():
+    # 10 cm texels, four pixels wide: the edge lies two pixels from the centres of the nearest ones,
+    # outside of their 3 x 3 pixels but not of what bilinear reading of their footprint touches.
+    world = world_of([
+        quad((-0.5, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(5, 10)),
+        quad((0, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(5, 10)),
+    ])  # fmt: skip
+    pose = _camera((0.008, -1e-3, 2.0), (0.008, 0, 0))
+    image = _picture_of_plane(pose, lambda x, y: np.where(x < 0, 1.0, 9.0)[..., None] * np.ones(3))
+    shot = _shoot(world, image, pose)
+    seen = shot.kind == SAMPLE
+    left = world.texels.object_index() == 0
+    # The texels away from the edge are seen in any case.
+    x, y = np.abs(world.texels.position[:, :2]).T
+    assert seen[(x > 0.1) & (x < 0.4) & (y < 0.4)].all()
+    np.testing.assert_allclose(shot.radiance[seen & left], 1, rtol=1e-6)
+    np.testing.assert_allclose(shot.radiance[seen & ~left], 9, rtol=1e-6)
+
+
 def test_an_occluder_leaves_no_samples_behind_it_or_near_its_edge(plane: World):
     floor = quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(40, 40))
     world = world_of([floor, quad((-0.1, -0.1, 0.5), (0.2, 0, 0), (0, 0.2, 0), size=(8, 8))])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -59,6 +59,14 @@ class Texels:
 
     def __len__(self) -> int:
         return len(self.face)
+
+    def take(self, index: npt.NDArray[np.int64]) -> Texels:
+        """The surface points of some texels; the atlas stays the whole one."""
+        names = (
+            "pixel", "face", "barycentric", "position", "normal", "geometric_normal", "step_x",
+            "step_y", "area", "interior",
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def of_object(self, index: int) -> slice:
         """The texels of one object."""

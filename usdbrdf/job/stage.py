@@ -28,6 +28,7 @@ from usdbrdf.files.documents import json_text
 from usdbrdf.job.checkpoints import Checkpoints
 from usdbrdf.job.publishing import can_publish, publish_stage
 from usdbrdf.job.stamp import (
+    Stamp,
     check_relative,
     journal_path,
     read_stamp,
@@ -155,7 +156,7 @@ def run_stage(
         run = StageRun(asset, name, folder)
         summary = json.loads(json_text(work(run)))
         finished = replace(wanted, summary=summary, **_staged(run, verify))
-        finished = replace(finished, earlier=_earlier(asset, order, name))
+        finished = replace(finished, earlier=_earlier(asset, order, finished))
         fault_point(f"stage:{name}:before_publish")
         write_stamp(journal_path(asset, name), finished)
         publish_stage(asset, folder, finished, order)
@@ -172,17 +173,21 @@ def _staged(run: StageRun, verify: Callable[[Path], None] | None) -> dict[str, A
     return {"outputs": hashes, "once": sorted(run.once)}
 
 
-def _earlier(asset: Path, order: int, name: str) -> dict[str, list[str]]:
-    """The hashes of this stage's files as they may lie there now, from its stamp and journal."""
+def _earlier(asset: Path, order: int, finished: Stamp) -> dict[str, list[str]]:
+    """The hashes of this stage's files as they may lie there now: from its stamp and journal, and
+    of what is about to be replaced, such as an empty layer that another stage put there."""
     earlier: dict[str, set[str]] = {}
     for stamp in (
-        read_stamp(stamp_path(asset, order, name)),
-        read_stamp(journal_path(asset, name)),
+        read_stamp(stamp_path(asset, order, finished.stage)),
+        read_stamp(journal_path(asset, finished.stage)),
     ):
         for relative, sha256 in (stamp.outputs if stamp else {}).items():
             earlier.setdefault(relative, set()).add(sha256)
         for relative, hashes in (stamp.earlier if stamp else {}).items():
             earlier.setdefault(relative, set()).update(hashes)
+    for relative in finished.outputs:
+        if (asset / relative).is_file():
+            earlier.setdefault(relative, set()).add(sha256_of(asset / relative))
     return {relative: sorted(hashes) for relative, hashes in earlier.items()}
 
 

@@ -1,28 +1,30 @@
 """Roughness by a two-level grid, specular by closed-form least squares (paper, section 3.4.2).
 
-The image model is I = I_d + base(phi) + psi slope(phi). ``paper`` takes I_d as given; ``scaled``
-lets each channel scale it by a free factor, which is eliminated before psi is solved for: the
-median texture still holds the specular light that is seen from everywhere, and taken literally it
-leaves nothing for psi to explain.
+The image model is I = I_d + base(phi) + psi slope(phi). What is taken for I_d is said by a linear
+projection that removes it, from the images and from the lobe alike:
+
+    nothing       I_d was subtracted already: the paper's residual
+    multiple_of   I_d times a free factor per channel: the median texture still holds the specular
+                  light that is seen from everywhere, and taken literally leaves none to psi
+    mean_of       an I_d of its own for every texel, the same in all frames that see it: L_d need
+                  not be known at all
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
-
-Residual = Literal["paper", "scaled"]
 Basis = Callable[[float], tuple[Float, Float]]
+Projection = Callable[[Double], Double]
 
 GRID = 11
-# Costs this close, relatively, are not told apart by a frame of some thousand noisy pixels.
+# Costs this close, relatively, are not told apart by some thousand noisy pixels.
 _FLAT = 0.01
 
 
@@ -39,36 +41,37 @@ class GridFit:
     evidence: float
 
 
-def fit_grid(
-    observed: Float, diffuse: Float, weight: Float, basis: Basis, residual: Residual
-) -> GridFit:
-    """Fit one object.
+def fit_grid(observed: Float, weight: Float, basis: Basis, without_diffuse: Projection) -> GridFit:
+    """Fit one object to P observations.
 
-    observed, diffuse  (P, 3) float32, radiance of the target frame and of L_d seen from it
-    weight             (P, 1) float32, of the squared residual
-    basis              phi -> (base, slope), (P, 3) each
+    observed         (P, 3) float32, radiance
+    weight           (P, 1) float32, of the squared residual
+    basis            phi -> (base, slope), (P, 3) each
+    without_diffuse  projection of (P, 3) values that are multiplied by the root of the weight
+
     Two levels of K = 11: [0, 1], then between the neighbours of the first level's minimiser. Where
-    the cost is flat around its minimum (with psi at 0 hardly anything depends on phi), the minimiser
-    is noise; phi is then the middle of the flat interval.
+    the cost is flat around its minimum (with psi at 0 hardly anything depends on phi), the
+    minimiser is noise; phi is then the middle of the flat interval.
     """
     root = np.sqrt(weight).astype(np.float64)
-    target, known = observed * root, diffuse * root
+    target = without_diffuse(observed * root)
     tried: dict[float, tuple[float, float]] = {}
 
     def level(low: float, high: float) -> tuple[float, float]:
-        grid = low + np.arange(GRID) * (high - low) / (GRID - 1)
+        grid = [float(phi) for phi in low + np.arange(GRID) * (high - low) / (GRID - 1)]
         for phi in grid:
-            if float(phi) not in tried:
-                base, slope = basis(float(phi))
-                tried[float(phi)] = _best_psi(target, known, base * root, slope * root, residual)
-        best = min(range(GRID), key=lambda k: tried[float(grid[k])][0])
-        return float(grid[max(best - 1, 0)]), float(grid[min(best + 1, GRID - 1)])
+            if phi not in tried:
+                base, slope = basis(phi)
+                rest = target - without_diffuse(base * root)
+                tried[phi] = _best_psi(rest, without_diffuse(slope * root))
+        best = min(range(GRID), key=lambda k: tried[grid[k]][0])
+        return grid[max(best - 1, 0)], grid[min(best + 1, GRID - 1)]
 
     level(*level(0.0, 1.0))
     low, phi, high = _flat_interval(tried)
     cost, psi = tried[phi]
-    without = _cost(target, known, np.zeros_like(target), residual)
-    evidence = 1.0 - cost / without if without > 0 else 0.0
+    unexplained = float((target * target).sum())
+    evidence = 1.0 - cost / unexplained if unexplained > 0 else 0.0
     return GridFit(
         phi=phi,
         psi=psi,
@@ -77,6 +80,44 @@ def fit_grid(
         cost=cost / max(target.size, 1),
         evidence=max(0.0, evidence),
     )
+
+
+def nothing(values: Double) -> Double:
+    """The projection for residuals from which I_d is subtracted."""
+    return values
+
+
+def multiple_of(diffuse: Double) -> Projection:
+    """Takes the best multiple of ``diffuse`` (P, 3), weighted like the values, off each channel."""
+    square = np.maximum((diffuse * diffuse).sum(axis=0), 1e-30)
+
+    def project(values: Double) -> Double:
+        rest: Double = values - diffuse * ((diffuse * values).sum(axis=0) / square)
+        return rest
+
+    return project
+
+
+def mean_of(group: npt.NDArray[np.int64], root_weight: Double) -> Projection:
+    """Takes the weighted mean over each group off its members: group (P,), root_weight (P, 1)."""
+    root = root_weight[:, 0]
+    square = np.maximum(np.bincount(group, root * root), 1e-30)
+
+    def project(values: Double) -> Double:
+        means = [np.bincount(group, root * values[:, c]) / square for c in range(3)]
+        rest: Double = values - root_weight * np.stack(means, axis=-1)[group]
+        return rest
+
+    return project
+
+
+def _best_psi(rest: Double, slope: Double) -> tuple[float, float]:
+    """(cost, psi) for one roughness; the cost is that of the clamped psi (``base`` stays at 0)."""
+    square = float((slope * slope).sum())
+    psi = float((slope * rest).sum()) / square if square > 0 else 0.0
+    psi = min(1.0, max(0.0, psi))
+    left = rest - psi * slope
+    return float((left * left).sum()), psi
 
 
 def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, float, float]:
@@ -92,31 +133,3 @@ def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, floa
     middle = (phis[first] + phis[last]) / 2
     nearest = min(phis[first : last + 1], key=lambda phi: (abs(phi - middle), phi))
     return phis[first], nearest, phis[last]
-
-
-def _best_psi(
-    target: Double, known: Double, base: Double, slope: Double, residual: Residual
-) -> tuple[float, float]:
-    """(cost, psi) for one roughness; the cost is that of the clamped psi (``base`` stays at 0)."""
-    rest = _explain(target - base, known, residual)
-    free = slope if residual == "paper" else _without(slope, known)
-    square = float((free * free).sum())
-    psi = float((free * rest).sum()) / square if square > 0 else 0.0
-    psi = min(1.0, max(0.0, psi))
-    return _cost(target, known, base + psi * slope, residual), psi
-
-
-def _cost(target: Double, known: Double, non_diffuse: Double, residual: Residual) -> float:
-    rest = _explain(target - non_diffuse, known, residual)
-    return float((rest * rest).sum())
-
-
-def _explain(light: Double, known: Double, residual: Residual) -> Double:
-    """What the diffuse image leaves unexplained of ``light``."""
-    return light - known if residual == "paper" else _without(light, known)
-
-
-def _without(light: Double, known: Double) -> Double:
-    """``light`` with its best multiple of ``known`` taken out of each channel."""
-    square = np.maximum((known * known).sum(axis=0), 1e-30)
-    return light - known * ((known * light).sum(axis=0) / square)

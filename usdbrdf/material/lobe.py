@@ -2,7 +2,8 @@
 
     f_nd = G D F
     D = alpha^2 / (pi (1 + (alpha^2 - 1) (n.h)^2)^2),        alpha = max(0.001, phi)
-    G = G1(n.w, y) G1(n.wo, y),  G1(x, y) = 1 / (x + sqrt(x^2 + y^2 - x^2 y^2)),  y = (phi/2 + 1/2)^2
+    G = G1(n.w, y) G1(n.wo, y),                              y = (phi/2 + 1/2)^2
+        G1(x, y) = 1 / (x + sqrt(x^2 + y^2 - x^2 y^2))
     F = F0 + (1 - F0) (1 - w.h)^5,                           F0 = 0.08 psi
 
 G1 already contains the microfacet denominator: G = G_smith / (4 n.w n.wo). F is affine in psi, so
@@ -44,7 +45,7 @@ def distribution(sin2_h: float, alpha: float) -> float:
 def masking(x: float, phi: float) -> float:
     """G1(x, y) with y = (phi/2 + 1/2)^2."""
     y = (0.5 * phi + 0.5) ** 2
-    return 1.0 / (x + np.sqrt(x * x + y * y - x * x * y * y))
+    return float(1.0 / (x + np.sqrt(x * x + y * y - x * x * y * y)))
 
 
 @kernel
@@ -101,4 +102,4 @@ def reflected_density(sin2_h: float, cos_wh: float, alpha: float) -> float:
     D(h) (n.h) / (4 w.h)."""
     if cos_wh <= 0:
         return 0.0
-    return distribution(sin2_h, alpha) * np.sqrt(max(0.0, 1.0 - sin2_h)) / (4.0 * cos_wh)
+    return float(distribution(sin2_h, alpha) * np.sqrt(max(0.0, 1.0 - sin2_h)) / (4.0 * cos_wh))

@@ -7,35 +7,20 @@ same samples integrate a mirror and a matte lobe, and the grid search is arithme
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from usdbrdf.geometry.rays import RayScene, lift_from_surface
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
-from usdbrdf.kernel import parallel_kernel
-from usdbrdf.material.lobe import (
-    F0_OF_PSI,
-    alpha_of_phi,
-    distribution,
-    grazing,
-    half_vector,
-    masking,
-    reflected_density,
-    sample_half_vector,
-)
+from usdbrdf.material.lit_scene import LitScene
+from usdbrdf.material.lobe_kernels import SampleArrays, draw_directions, integrate, weigh
 from usdbrdf.material.target_frames import SurfacePoints
-from usdbrdf.shading.environment import Environment, environment_at
+from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.lights import Lights
-from usdbrdf.shading.warps import (
-    cosine_direction,
-    patch_shifts,
-    sobol_points,
-    tangent_frame,
-    triangle_point,
-)
+from usdbrdf.shading.warps import patch_shifts, sobol_points
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -60,6 +45,11 @@ class LobeSamples:
     grazing: Float
     weighted: Float
     cos_out: Float
+
+    @property
+    def arrays(self) -> SampleArrays:
+        """What the kernels take, besides ``weighted``."""
+        return self.cos_in, self.sin2_half, self.grazing, self.cos_out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,136 +86,50 @@ def trace_lobe_samples(
     shift = patch_shifts(count, 3, seed)
     directions = np.zeros((count * total, 3), np.float32)
     chosen = np.full((count, total), -1, np.int32)
-    _draw(
-        points.normal, points.to_camera, origin, sequence, shift, mixture.per_lobe, mixture.lights,
-        LOBE_ALPHAS, *lights.arrays, directions.reshape(count, total, 3), chosen,
+    counts = mixture.per_lobe, mixture.lights
+    draw_directions(
+        points.normal, points.to_camera, origin, (sequence, shift), counts, LOBE_ALPHAS,
+        lights.arrays, directions.reshape(count, total, 3), chosen,
     )  # fmt: skip
     hits = rays.closest(np.repeat(origin, total, axis=0), directions)
-    incident = radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
-    cos_in, sin2_half, graze = (np.zeros((count, total), np.float32) for _ in range(3))
-    _weigh(
-        points.normal, points.to_camera, directions.reshape(count, total, 3), chosen,
-        hits.face.reshape(count, total), hits.distance.reshape(count, total), lights.density,
-        lights.normals, *environment.arrays, mixture.per_lobe, mixture.lights, LOBE_ALPHAS,
-        incident, cos_in, sin2_half, graze,
-    )  # fmt: skip
-    return LobeSamples(
-        cos_in=cos_in,
-        sin2_half=sin2_half,
-        grazing=graze,
-        weighted=incident,
+    samples = LobeSamples(
+        cos_in=np.zeros((count, total), np.float32),
+        sin2_half=np.zeros((count, total), np.float32),
+        grazing=np.zeros((count, total), np.float32),
+        weighted=radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3),
         cos_out=np.einsum("rd,rd->r", points.normal, points.to_camera),
     )
+    weigh(
+        points.normal, points.to_camera, directions.reshape(count, total, 3), chosen,
+        (hits.face.reshape(count, total), hits.distance.reshape(count, total)), counts,
+        LOBE_ALPHAS, lights.arrays, environment.arrays, samples.weighted, samples.arrays,
+    )  # fmt: skip
+    return samples
+
+
+def lobe_basis(
+    lit: LitScene, points: SurfacePoints, num_groups: int, seed: int
+) -> Callable[[float], tuple[Float, Float]]:
+    """phi -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3) each: the mean over
+    equally many consecutive ``points`` per group. The rays are traced here, once."""
+    samples = trace_lobe_samples(
+        lit.rays, points, lit.radiance, lit.lights, lit.environment, Mixture(), lit.size, seed
+    )
+
+    def mean(values: Float) -> Float:
+        means: Float = values.reshape(num_groups, -1, 3).mean(axis=1)
+        return means
+
+    def basis(phi: float) -> tuple[Float, Float]:
+        base, slope = non_diffuse(samples, phi)
+        return mean(base), mean(slope)
+
+    return basis
 
 
 def non_diffuse(samples: LobeSamples, phi: float) -> tuple[Float, Float]:
     """I_nd = base + psi * slope of every point, (R, 3) float32 each, for one roughness."""
     base = np.zeros((len(samples.cos_out), 3), np.float32)
     slope = np.zeros_like(base)
-    _integrate(
-        samples.cos_in, samples.sin2_half, samples.grazing, samples.weighted, samples.cos_out,
-        phi, base, slope,
-    )  # fmt: skip
+    integrate(samples.arrays, samples.weighted, phi, base, slope)
     return base, slope
-
-
-@parallel_kernel
-def _draw(  # type: ignore[no-untyped-def]
-    normal, to_camera, origin, sequence, shift, per_lobe, num_lights, alphas,
-    light_face, cumulative, light_density, corners, face_normals, directions, chosen,
-):  # fmt: skip
-    """Directions of every technique in turn; ``chosen`` keeps the light triangle that a direction
-    was sent to (-1 for the others)."""
-    lobes = len(alphas) * per_lobe
-    for r in prange(len(normal)):
-        n = normal[r]
-        wo = to_camera[r]
-        tx, ty, tz, bx, by, bz = tangent_frame(n)
-        for k in range(directions.shape[1]):
-            u1 = (sequence[k, 0] + shift[r, 0]) % 1.0
-            u2 = (sequence[k, 1] + shift[r, 1]) % 1.0
-            if k < lobes:
-                # The techniques take turns, so each sees an evenly spread part of the sequence.
-                hx, hy, hz = sample_half_vector(u1, u2, alphas[k % len(alphas)])
-                x = hx * tx + hy * bx + hz * n[0]
-                y = hx * ty + hy * by + hz * n[1]
-                z = hx * tz + hy * bz + hz * n[2]
-                along = 2 * (x * wo[0] + y * wo[1] + z * wo[2])
-                x, y, z = along * x - wo[0], along * y - wo[1], along * z - wo[2]
-            elif k < lobes + num_lights:
-                pick = ((k - lobes + shift[r, 2]) / num_lights) % 1.0
-                which = min(np.searchsorted(cumulative, pick, side="right"), len(light_face) - 1)
-                f = light_face[which]
-                u, v = triangle_point(u1, u2)
-                p = corners[f]
-                x = (1 - u - v) * p[0, 0] + u * p[1, 0] + v * p[2, 0] - origin[r, 0]
-                y = (1 - u - v) * p[0, 1] + u * p[1, 1] + v * p[2, 1] - origin[r, 1]
-                z = (1 - u - v) * p[0, 2] + u * p[1, 2] + v * p[2, 2] - origin[r, 2]
-                length = max(np.sqrt(x * x + y * y + z * z), 1e-9)
-                x, y, z = x / length, y / length, z / length
-                chosen[r, k] = f
-            else:
-                dx, dy, dz = cosine_direction(u1, u2)
-                x = dx * tx + dy * bx + dz * n[0]
-                y = dx * ty + dy * by + dz * n[1]
-                z = dx * tz + dy * bz + dz * n[2]
-            directions[r, k, 0] = x
-            directions[r, k, 1] = y
-            directions[r, k, 2] = z
-
-
-@parallel_kernel
-def _weigh(  # type: ignore[no-untyped-def]
-    normal, to_camera, directions, chosen, face, distance, light_density, face_normals,
-    environment, z_up, per_lobe, num_lights, alphas, incident, cos_in, sin2_half, graze,
-):  # fmt: skip
-    """Turn incident radiance (R, K, 3), in place, into L cos / (sum of all techniques' densities)."""
-    num_cosine = directions.shape[1] - per_lobe * len(alphas) - num_lights
-    for r in prange(len(normal)):
-        n = normal[r]
-        for k in range(directions.shape[1]):
-            w = directions[r, k]
-            f = face[r, k]
-            cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
-            light = 0.0
-            if f >= 0 and num_lights > 0 and light_density[f] > 0:
-                m = face_normals[f]
-                facing = -(w[0] * m[0] + w[1] * m[1] + w[2] * m[2])
-                if facing > 0:
-                    light = light_density[f] * distance[r, k] * distance[r, k] / facing
-            # A ray sent to a point on a light counts only if that is what it meets.
-            missed = chosen[r, k] >= 0 and (light <= 0 or chosen[r, k] != f)
-            if cosine <= 0 or missed:
-                incident[r, k] = 0
-                continue
-            s2, cos_wh = half_vector(n, w, to_camera[r])
-            density = num_cosine * cosine / np.pi + num_lights * light
-            for a in alphas:
-                density += per_lobe * reflected_density(s2, cos_wh, a)
-            cos_in[r, k] = cosine
-            sin2_half[r, k] = s2
-            graze[r, k] = grazing(cos_wh)
-            for c in range(3):
-                value = incident[r, k, c]
-                if f < 0:
-                    value = environment_at(environment, z_up, w[0], w[1], w[2], c)
-                incident[r, k, c] = value * cosine / density
-
-
-@parallel_kernel
-def _integrate(  # type: ignore[no-untyped-def]
-    cos_in, sin2_half, graze, weighted, cos_out, phi, base, slope
-):
-    alpha = alpha_of_phi(phi)
-    for r in prange(len(cos_out)):
-        if cos_out[r] <= 0:
-            continue
-        out = masking(cos_out[r], phi)
-        for k in range(cos_in.shape[1]):
-            if cos_in[r, k] <= 0:
-                continue
-            dg = distribution(sin2_half[r, k], alpha) * masking(cos_in[r, k], phi) * out
-            x = graze[r, k]
-            for c in range(3):
-                base[r, c] += dg * x * weighted[r, k, c]
-                slope[r, c] += F0_OF_PSI * dg * (1.0 - x) * weighted[r, k, c]

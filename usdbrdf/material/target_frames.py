@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,18 @@ class SurfacePoints:
     position: Float
     normal: Float
     to_camera: Float
+
+    def take(self, index: npt.NDArray[np.int64]) -> SurfacePoints:
+        """Some of the points."""
+        return SurfacePoints(**{name: values[index] for name, values in vars(self).items()})
+
+    @staticmethod
+    def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
+        """Points after points."""
+        names = vars(parts[0])
+        return SurfacePoints(
+            **{name: np.concatenate([vars(part)[name] for part in parts]) for name in names}
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

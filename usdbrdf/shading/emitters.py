@@ -27,8 +27,8 @@ _MIN_PATCH = 16
 class Emitters:
     """emissive (T,) bool per texel; is_lamp (num_objects,) bool: the object shines as a whole;
     radiance (num_objects, 3) float32: area-weighted mean of its emissive, seen texels (0 where
-    there are none); lower_bound (num_objects,) bool: more than a tenth of that area was
-    saturated in every frame, so the radiance can only be larger."""
+    there are none); lower_bound (num_objects,) bool: less than a tenth of that area was ever seen
+    unsaturated, so the radiance can only be larger."""
 
     emissive: Bool
     is_lamp: Bool
@@ -62,9 +62,13 @@ def find_emitters(
         else:
             emissive[own] = _connected(texels, i, shines[own] & known[own])
         weight = area * emissive[own]
+        exact = weight * seen[own]
+        # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
+        lower_bound[i] = exact.sum() < 0.1 * weight.sum()
+        if not lower_bound[i]:
+            weight = exact
         if weight.sum() > 0:
             mean[i] = (radiance[own] * weight[:, None]).sum(axis=0) / weight.sum()
-            lower_bound[i] = (weight * clipped[own]).sum() > 0.1 * weight.sum()
     return Emitters(emissive=emissive, is_lamp=is_lamp, radiance=mean, lower_bound=lower_bound)
 
 

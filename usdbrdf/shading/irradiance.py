@@ -100,11 +100,13 @@ def irradiance_at(
     patch: Int,
     sampling: Sampling,
     scene_size: float,
+    dark: float = 0.0,
 ) -> Irradiance:
     """S at N surface points.
 
     position, normal (N, 3) float32, world; patch (N,) int32 ascending: points of one patch share
     their random shift and their stopping. scene_size: metres, for the lift off the surface.
+    dark: W/m^2; where S is below it the standard error is held against ``dark`` instead of S.
     """
     count = len(position)
     origin = lift_from_surface(position, normal, scene_size)
@@ -112,12 +114,15 @@ def irradiance_at(
     escaped = np.zeros(count)
     done = np.zeros(count, np.int64)
     active = np.arange(count)
+    # No two patches are numbered alike and none has more than 64 points, so in the whole scene no
+    # two points share their random numbers.
+    identity = 64 * int(patch[0]) + active if count else active
     pairs = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     techniques = _Techniques(rays, radiance, lights, environment, sampling, pairs)
     if sampling.estimator == "cosine":
         rounds = [(0, sampling.max_rays)]
     else:
-        ends = [0, _FIRST_ROUND // pairs]
+        ends = [0, max(1, min(_FIRST_ROUND, sampling.max_rays) // pairs)]
         while 2 * ends[-1] * pairs <= sampling.max_rays:
             ends.append(2 * ends[-1])
         rounds = list(pairwise(ends))
@@ -129,12 +134,13 @@ def irradiance_at(
         block_sums = sums[active]
         block_escaped = escaped[active]
         techniques.run(
-            origin[active], normal[active], patch[active], active, first, last,
+            origin[active], normal[active], patch[active], identity[active], first, last,
             block_sums, block_escaped,
         )  # fmt: skip
         sums[active], escaped[active], done[active] = block_sums, block_escaped, last
         error = _standard_error(sums[active], last)
-        active = active[_noisy(patch[active], sums[active], error, last, sampling.standard_error)]
+        error_target = sampling.standard_error
+        active = active[_noisy(patch[active], sums[active], error, last, error_target, dark)]
         if not len(active):
             break
     mean = sums.sum(axis=1) / done[:, None]
@@ -152,13 +158,15 @@ def _standard_error(sums: Double, samples: Any) -> Double:
     return np.asarray(means.std(axis=1, ddof=1) / np.sqrt(_BLOCKS))
 
 
-def _noisy(patch: Int, sums: Double, error: Double, samples: int, target: float) -> Any:
+def _noisy(
+    patch: Int, sums: Double, error: Double, samples: int, target: float, dark: float
+) -> Any:
     """(N,) bool: does the point's patch still miss the target relative standard error?"""
     index = patch - patch[0]
     points = np.maximum(np.bincount(index), 1)
     mean = np.bincount(index, sums.sum(axis=(1, 2)) / (3 * samples)) / points
     square = np.bincount(index, (error**2).mean(axis=1)) / points
-    return (np.sqrt(square) > target * np.maximum(mean, 1e-12))[index]
+    return (np.sqrt(square) > target * np.maximum(mean, max(dark, 1e-12)))[index]
 
 
 class _Techniques:

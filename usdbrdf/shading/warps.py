@@ -30,8 +30,9 @@ def patch_shifts(num_patches: int, dimensions: int, seed: int) -> Double:
 @kernel
 def hashed_uniform(seed: int, index: int, draw: int) -> float:
     """A uniform number in [0, 1) that depends on its arguments only (splitmix64 finaliser)."""
+    # Odd offsets, since the finaliser leaves 0 where it is.
     x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(index)
-    x = x * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(draw)
+    x = (x + np.uint64(0x632BE59BD9B4E019)) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(draw)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     x = x ^ (x >> np.uint64(31))

@@ -52,7 +52,7 @@ def meshes_from_usd(
     found = run_child(
         "usdbrdf.stage.foreign:read_in_child",
         {},
-        {"path": str(path), "allow": [str(folder) for folder in allow]},
+        {"path": str(path.resolve()), "allow": [str(folder.resolve()) for folder in allow]},
         _TIMEOUT_S,
         f"{path}: reading USD",
     )

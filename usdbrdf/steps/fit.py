@@ -1,9 +1,10 @@
-"""Step 4: roughness and specular per object from its target frame, written as material.usda."""
+"""Step 4: roughness and specular per object, written as material.usda."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,9 +14,13 @@ import numpy.typing as npt
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.surface_radiance import surface_texture
+from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stage import StageResult, StageRun
-from usdbrdf.material.fit_object import LitScene, View, fit_object
+from usdbrdf.material.fit_target import Residual, fit_target_frame
+from usdbrdf.material.fit_views import fit_views
+from usdbrdf.material.lit_scene import LitScene, View
+from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.prior import class_prior
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
 from usdbrdf.scan.frame_reading import read_frame
@@ -29,23 +34,30 @@ from usdbrdf.stage.records import FittedObject
 from usdbrdf.steps.atlas import Atlas, atlas_from_stage
 from usdbrdf.steps.step import Step, hash_of_files, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
-from usdbrdf.steps.texture import FILLED
+from usdbrdf.steps.texture import FILLED, MEASURED
 
+Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
 
-# Below this evidence the target frame does not tell one material from another (on captures with
-# known materials no such fit could be trusted), and the class prior is written instead.
+# Below this evidence the frames do not tell one material from another (on captures with known
+# materials no such fit could be trusted), and the class prior is written instead.
 MIN_EVIDENCE = 0.1
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
 
+Method = Literal["views", "scaled", "paper"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """method "scaled": L_d times a free factor per channel, relative residuals, class prior where
-    the evidence is missing; "paper": the paper's residual, its minimum always kept."""
+    """method "views": many views of the same texels, L_d free per texel; "scaled": the target frame
+    alone, L_d times a free factor per channel (what "views" falls back to for an object that too
+    few frames show); "paper": the target frame, the paper's residual, its minimum always kept.
+    max_pixels: of the target frame. Without evidence the first two write the class prior."""
 
-    method: Literal["scaled", "paper"] = "scaled"
+    method: Method = "views"
     max_pixels: int = 1500
     environment: Path | None = None
     seed: int = 0
@@ -57,9 +69,9 @@ class FitOptions:
 
 def fit(asset: Asset, options: FitOptions) -> StageResult:
     """Choose target frames, fit every object, write material.usda."""
+    layers = weaker_layers(asset, "material")
     stage = open_weaker(asset, "material")
     frames = frames_from_stage(stage)
-    layers = weaker_layers(asset, "material")
     step = Step(
         asset=asset,
         name="fit",
@@ -77,19 +89,16 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         atlas = atlas_from_stage(stage)
         environment = environment_from_file(options.environment, step.header.up_axis)
         lit = _lit_scene(atlas, environment)
-        target, mirrored = _target_frames(run, lit, frames)
+        survey = _survey(run, atlas, lit, frames, options)
         seen = atlas.map("coverage")[:, 0] != FILLED
         objects = []
         numbers = range(len(lit.scene.objects))
         for i in progress(numbers, total=len(numbers), label="fit", unit="objects"):
             own = atlas.texels.of_object(i)
             found = run.checkpoint(
-                f"object-{i}",
-                lambda i=i: _fit_arrays(lit, frames, i, int(target[i]), options),  # type: ignore[misc]
+                f"object-{i}", partial(_fit_arrays, lit, atlas.texels, frames, survey, i, options)
             )
-            objects.append(
-                _record(lit, i, found["numbers"], int(target[i]), options, bool(seen[own].any()))
-            )
+            objects.append(_record(lit, i, found, options, bool(seen[own].any())))
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
             asset,
@@ -105,7 +114,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
                     "status": item.status,
                     "evidence": round(item.evidence, 4) if math.isfinite(item.evidence) else 0.0,
                     "target_frame": item.target_frame,
-                    "highlight_pixels": int(mirrored[i]),
+                    "highlight_pixels": int(survey.mirrored[i]),
                 }
                 for i, item in enumerate(objects)
             }
@@ -131,22 +140,51 @@ def _lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
     )
 
 
-def _target_frames(run: StageRun, lit: LitScene, frames: Frames) -> tuple[Int, Int]:
-    def count() -> dict[str, npt.NDArray[Any]]:
+@dataclass(frozen=True, kw_only=True)
+class _Survey:
+    """What one pass over the frames gathers: per object the target frame (-1: none) and its number
+    of highlight pixels; the observations of followed texels."""
+
+    target: Int
+    mirrored: Int
+    observations: Observations
+
+
+def _survey(
+    run: StageRun, atlas: Atlas, lit: LitScene, frames: Frames, options: FitOptions
+) -> _Survey:
+    def gather() -> dict[str, npt.NDArray[Any]]:
+        measured = (atlas.map("coverage")[:, 0] == MEASURED) & atlas.texels.interior
+        usable = measured & ~(atlas.map_where_present("emission", 3) > 0).any(axis=1)
+        if options.method != "views":
+            usable[:] = False
+        follower = Follower(lit, atlas.texels, usable, len(frames), options.seed)
         counts = []
-        for i in progress(
-            range(len(frames)), total=len(frames), label="fit: target frames", unit="frames"
-        ):
-            counts.append(_count(lit, frames, i))
+        numbers = range(len(frames))
+        for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
+            pixels = read_frame(frames, i)
+            counts.append(_count(lit, frames, i, pixels.valid))
+            view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
+            follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
         target, mirrored = choose_target_frames(counts)
-        return {"target": target, "mirrored": mirrored}
+        chosen = follower.chosen(atlas.texels, options.seed)
+        return {"target": target, "mirrored": mirrored, **chosen.arrays()}
 
-    found = run.checkpoint("targets", count)
-    return found["target"], found["mirrored"]
+    found = run.checkpoint("survey", gather)
+    target, mirrored = found.pop("target"), found.pop("mirrored")
+    return _Survey(target=target, mirrored=mirrored, observations=Observations(**found))
 
 
-def _count(lit: LitScene, frames: Frames, i: int) -> FrameCounts:
-    valid = read_frame(frames, i).valid
+def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
+    return View(
+        radiance=radiance,
+        valid=valid,
+        world_from_camera=frames.world_from_camera[i],
+        intrinsics=frames.intrinsics[i],
+    )
+
+
+def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
     stride = max(1, round(math.sqrt(valid.size / _COUNTED_PIXELS)))
     return count_frame(
         lit.rays, lit.scene, lit.emission, valid, frames.world_from_camera[i],
@@ -155,23 +193,32 @@ def _count(lit: LitScene, frames: Frames, i: int) -> FrameCounts:
 
 
 def _fit_arrays(
-    lit: LitScene, frames: Frames, index: int, target: int, options: FitOptions
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    survey: _Survey,
+    index: int,
+    options: FitOptions,
 ) -> dict[str, npt.NDArray[Any]]:
-    """phi, psi, cost, evidence, pixels of one object; NaN where it could not be fitted."""
-    numbers = np.full(5, np.nan)
-    if target >= 0 and not _is_lamp(lit, index):
-        pixels = read_frame(frames, target)
-        view = View(
-            radiance=np.nan_to_num(pixels.radiance),
-            valid=pixels.valid,
-            world_from_camera=frames.world_from_camera[target],
-            intrinsics=frames.intrinsics[target],
+    """phi, psi, cost, evidence (NaN where the object could not be fitted), the number of samples,
+    and the target frame (-1 where many frames were used)."""
+    found, used, target = None, 0, -1
+    if options.method == "views":
+        own = survey.observations.of_texels(texels.of_object(index))
+        nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
+        found, used = fit_views(
+            lit, texels, own, lambda frame: _view(frames, frame, *nothing), index, options.seed
         )
-        found, used = fit_object(lit, view, index, options.method, options.max_pixels, options.seed)
-        if found is not None:
-            numbers[:4] = found.phi, found.psi, found.cost, found.evidence
-        numbers[4] = used
-    return {"numbers": numbers}
+    if found is None and survey.target[index] >= 0 and not _is_lamp(lit, index):
+        target = int(survey.target[index])
+        pixels = read_frame(frames, target)
+        view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
+        residual: Residual = "paper" if options.method == "paper" else "scaled"
+        found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
+    numbers = np.full(4, np.nan)
+    if found is not None:
+        numbers[:] = found.phi, found.psi, found.cost, found.evidence
+    return {"numbers": numbers, "used": np.array(used), "target": np.array(target)}
 
 
 def _is_lamp(lit: LitScene, index: int) -> bool:
@@ -184,14 +231,14 @@ def _is_lamp(lit: LitScene, index: int) -> bool:
 def _record(
     lit: LitScene,
     index: int,
-    numbers: npt.NDArray[np.float64],
-    target: int,
+    found: dict[str, npt.NDArray[Any]],
     options: FitOptions,
     seen: bool,
 ) -> FittedObject:
     obj = lit.scene.objects[index]
-    phi, psi, cost, evidence, pixels = (float(number) for number in numbers)
+    phi, psi, cost, evidence = (float(number) for number in found["numbers"])
     fitted = math.isfinite(phi)
+    target = int(found["target"])
     if fitted and evidence >= MIN_EVIDENCE:
         status = "measured"
     elif fitted and options.method == "paper":
@@ -208,6 +255,6 @@ def _record(
         evidence=evidence,
         status=status,
         target_frame=target if fitted else -1,
-        num_pixels=int(pixels) if math.isfinite(pixels) else 0,
-        method=options.method,
+        num_pixels=int(found["used"]),
+        method="scaled" if fitted and options.method == "views" and target >= 0 else options.method,
     )

@@ -15,7 +15,7 @@ from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.asset import ROLES, Asset
 from usdbrdf.stage.foreign_paths import layers_of_usd
 from usdbrdf.stage.header import StageHeader
-from usdbrdf.stage.root_layer import write_edits, write_pending_layer, write_root
+from usdbrdf.stage.root_layer import check_root, write_edits, write_pending_layer, write_root
 from usdbrdf.stage.scan_layer import write_scan_layer
 from usdbrdf.steps.step import Step, hash_of_files
 
@@ -50,6 +50,7 @@ def ingest(
         for warning in scan.warnings:
             say(f"warning: {warning}")
         header = StageHeader.of_scan(asset.name, scan)
+        check_root(asset, header)
         write_scan_layer(
             run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, step.provenance
         )

@@ -41,7 +41,7 @@ class TextureOptions:
 
     texel_size: float | None = None
     quantile: float = 0.5
-    max_texels: int = 4_000_000
+    max_texels: int = 1_000_000
 
     def __post_init__(self) -> None:
         if self.texel_size is not None and not self.texel_size > 0:

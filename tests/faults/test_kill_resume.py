@@ -1,0 +1,267 @@
+"""SIGKILL inside each of the four steps, then the same command: the same bytes as undisturbed.
+
+The undisturbed run uses the program as it is; the disturbed ones cut shading into small tiles, so
+that there is something in between to be killed, and differ in nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import usdbrdf.steps.fit
+import usdbrdf.steps.shade
+import usdbrdf.steps.texture
+from tests.scenes import make_capture
+from usdbrdf.cli import main
+from usdbrdf.files import atomic
+from usdbrdf.files.atomic import TEMPORARY_PREFIX, sha256_of
+from usdbrdf.job.ownership import edited_files
+
+TILE = 64  # texels
+PROGRAM = f"""
+import sys
+import usdbrdf.steps.shade
+usdbrdf.steps.shade._TILE = {TILE}
+from usdbrdf.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+# 20 frames: texturing saves its state once, after the 16th.
+NUM_FRAMES, FIRST_UNSAVED = 20, 16
+# Enough for four objects and a lamp, and for pixels to fit to.
+OPTIONS = {
+    "ingest": [],
+    "texture": ["--texel-size", "0.25"],
+    "shade": ["--rays", "16"],
+    "fit": ["--max-pixels", "60"],
+}
+STEPS = tuple(OPTIONS)
+FAULTS = {
+    "ingest": [
+        "stage:ingest:before_write:1",
+        "stage:ingest:before_publish",
+        "publish:before_replace:3",  # after job.json and the journal: scan.usdc
+        "stage:ingest:mid_publish",
+    ],
+    "texture": [
+        "stage:texture:checkpoint:1",  # charts
+        "image:before_write:7",
+        "stage:texture:mid_publish:9",
+        "stage:texture:before_stamp",
+    ],
+    "shade": [
+        "stage:shade:checkpoint:3",
+        "publish:before_replace:2",  # the second tile
+        "image:before_write:5",
+        "stage:shade:mid_publish:4",
+    ],
+    "fit": [
+        "stage:fit:checkpoint:1",  # target frames
+        "stage:fit:checkpoint:3",  # two objects
+        "stage:fit:before_write",
+        "stage:fit:mid_publish",
+    ],
+}
+IN_STEPS = [(step, fault) for step, faults in FAULTS.items() for fault in faults]
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """A folder with the capture; assets are BASE/<case>/room, all equally far from it."""
+    folder = tmp_path_factory.mktemp("kill")
+    make_capture(folder / "scan", frames=NUM_FRAMES, size=(24, 18), subdivisions=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(base):
+    """Asset after each step by its name, and what was there "before" the first."""
+    stages = {"before": base / "before" / "room"}
+    stages["before"].mkdir(parents=True)
+    for before, step in zip(("before", *STEPS), STEPS, strict=False):
+        stages[step] = base / f"after-{step}" / "room"
+        shutil.copytree(stages[before], stages[step])
+        assert main(command(step, base, stages[step])) == 0
+    return stages
+
+
+@pytest.fixture
+def small_tiles(monkeypatch):
+    monkeypatch.setattr(usdbrdf.steps.shade, "_TILE", TILE)
+
+
+@pytest.fixture
+def case(base, undisturbed, small_tiles, request):
+    """Makes the asset of this test as it was before a step."""
+    folder = base / f"case-{request.node.name}".replace("/", "-").replace(":", "-")
+
+    def before(step: str) -> Path:
+        asset = folder / "room"
+        shutil.copytree(undisturbed[("before", *STEPS)[STEPS.index(step)]], asset)
+        return asset
+
+    yield before
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def command(name: str, base: Path, asset: Path) -> list[str]:
+    place = [str(asset)] if name in STEPS[1:] else [str(base / "scan"), "-o", str(asset)]
+    options = [option for step in STEPS if name in (step, "convert") for option in OPTIONS[step]]
+    return [name, "-q", *place, *options]
+
+
+def start(arguments: list[str], fault: str = "") -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "USDBRDF_FAULT": fault},
+        stderr=subprocess.PIPE,
+    )
+
+
+def killed_at(arguments: list[str], fault: str) -> None:
+    process = start(arguments, f"kill@{fault}")
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL, said.decode()
+
+
+def hashes(asset: Path) -> dict[str, str]:
+    """SHA-256 of every file, the state folder's too; none of them is litter."""
+    files = [path for path in sorted(asset.rglob("*")) if path.is_file()]
+    assert not [path for path in files if path.name.startswith(TEMPORARY_PREFIX)]
+    assert not list((asset / ".usdbrdf" / "work").iterdir())
+    return {path.relative_to(asset).as_posix(): sha256_of(path) for path in files}
+
+
+@pytest.mark.parametrize(("step", "fault"), IN_STEPS)
+def test_killed_step_resumes_to_the_same_bytes(base, undisturbed, case, step, fault):
+    asset = case(step)
+    call = command(step, base, asset)
+    killed_at(call, fault)
+    assert edited_files(asset) == []
+    assert main(call) == 0
+    assert hashes(asset) == hashes(undisturbed[step])
+
+
+def test_a_convert_killed_once_in_every_step_ends_in_the_same_bytes(base, undisturbed, case):
+    asset = case("ingest")
+    call = command("convert", base, asset)
+    for step in STEPS:
+        killed_at(call, f"stage:{step}:mid_publish")
+    assert main(call) == 0
+    assert hashes(asset) == hashes(undisturbed["fit"])
+
+
+# Finished pieces are not computed again
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Counts the calls of functions, by name; and the frame that texturing begins with."""
+    counted: Counter[str] = Counter()
+
+    def count(module, name):
+        function = getattr(module, name)
+
+        def counting(*arguments, **options):
+            counted[name] += 1
+            if name == "radiance_from_frames":
+                counted["first frame"] = arguments[-1]
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(module, name, counting)
+
+    count(usdbrdf.steps.texture, "unwrap")
+    count(usdbrdf.steps.texture, "radiance_from_frames")
+    count(usdbrdf.steps.shade, "irradiance_at")
+    count(usdbrdf.steps.fit, "choose_target_frames")
+    count(usdbrdf.steps.fit, "_fit_arrays")
+    return counted
+
+
+def resumed_after(fault: str, step: str, base: Path, asset: Path, calls: Counter[str]) -> Counter:
+    """Calls of the second run."""
+    call = command(step, base, asset)
+    killed_at(call, fault)
+    calls.clear()
+    assert main(call) == 0
+    return Counter(calls)
+
+
+def test_texturing_goes_on_after_the_last_saved_frame(base, undisturbed, case, calls):
+    asset = case("texture")
+    found = resumed_after("stage:texture:checkpoint:2", "texture", base, asset, calls)
+    assert found == {"radiance_from_frames": 1, "first frame": FIRST_UNSAVED}
+    assert hashes(asset) == hashes(undisturbed["texture"])
+
+
+def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls):
+    asset = case("shade")
+    assert main(command("shade", base, asset)) == 0
+    tiles = calls["irradiance_at"]
+    assert tiles > 6
+    shutil.rmtree(asset)
+    found = resumed_after("stage:shade:checkpoint:4", "shade", base, case("shade"), calls)
+    assert found == {"irradiance_at": tiles - 4}
+
+
+def test_fitting_fits_only_the_objects_that_are_missing(base, case, calls):
+    found = resumed_after("stage:fit:checkpoint:3", "fit", base, case("fit"), calls)
+    assert found == {"_fit_arrays": 5 - 2}  # and the target frames are kept
+
+
+def test_a_published_step_is_finished_without_its_work(base, case, calls):
+    assert not resumed_after("stage:shade:mid_publish:6", "shade", base, case("shade"), calls)
+
+
+# Other ways to be interrupted
+
+
+@pytest.mark.parametrize("fault", ["before_publish", "mid_publish:3"])
+def test_full_disk_while_publishing(base, undisturbed, case, monkeypatch, capsys, fault):
+    asset = case("fit")
+    before = hashes(asset)
+    call = ["shade", str(asset), *OPTIONS["shade"], "--seed", "1"]
+    monkeypatch.setenv("USDBRDF_FAULT", f"enospc@stage:shade:{fault}")
+    atomic._passes.clear()
+    assert main([*call]) == 4
+    assert "No space left on device" in capsys.readouterr().err
+    monkeypatch.delenv("USDBRDF_FAULT")
+    now = {name: sha256_of(asset / name) for name in before}
+    changed = {name for name in before if now[name] != before[name]}
+    # What is not the old file is the new one, and whole.
+    assert len(changed - {".usdbrdf/lock"}) == (3 if fault.startswith("mid") else 0)
+    assert edited_files(asset) == []
+    assert main(call) == 0
+    after = hashes(asset)
+    assert {name: after[name] for name in changed} == {name: now[name] for name in changed}
+    assert main(["shade", str(asset), *OPTIONS["shade"]]) == 0
+    assert hashes(asset) == before
+
+
+def test_a_second_run_is_refused_and_the_first_stops_when_told_to(base, undisturbed, case):
+    asset = case("ingest")
+    call = command("convert", base, asset)
+    first = start(call)
+    _wait_for(lambda: (asset / ".usdbrdf/lock").is_file() and (asset / ".usdbrdf/lock").read_text())
+    assert main(call) == 5
+    _wait_for(lambda: any((asset / ".usdbrdf" / "work").glob("texture-*")))
+    first.terminate()
+    _, said = first.communicate(timeout=10)
+    assert first.returncode == 143, said.decode()
+    assert main(call) == 0
+    assert hashes(asset) == hashes(undisturbed["fit"])
+
+
+def _wait_for(condition) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)

@@ -1,0 +1,96 @@
+"""Charts by xatlas in a child process, and the packing that needs no charts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import box, quad, sphere, world_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.texels import texels_from_atlas
+from usdbrdf.geometry.unwrap import MAX_SIDE, PADDING, pack_triangles_singly, unwrap
+
+
+def test_packed_triangles_have_cells_of_their_own():
+    rng = np.random.default_rng(12345)
+    corners = rng.random((23, 3, 3)).astype(np.float32)
+    uv, (width, height) = pack_triangles_singly(corners, 0.05)
+    assert uv.min() >= 0
+    assert uv.max() <= 1
+    pixel = uv.astype(np.float64) * [width, height]
+    low, high = pixel.min(axis=1), pixel.max(axis=1)
+    # Bounding boxes of any two cells are at least two paddings apart in x or in y.
+    for i in range(len(uv)):
+        gap = np.maximum(low - high[i], low[i] - high).max(axis=1)
+        assert (np.delete(gap, i) >= 2 * PADDING - 1e-3).all()
+    # ... and one padding from the border.
+    assert low.min() >= PADDING - 1e-3
+    assert (high.max(axis=0) <= np.array([width, height]) - PADDING + 1e-3).all()
+
+
+def test_packed_texels_are_at_most_the_size_that_was_asked_for():
+    corners = np.array([[[0, 0, 0], [0.8, 0, 0], [0, 0.5, 0]]], np.float32)
+    uv, (width, height) = pack_triangles_singly(corners, 0.01)
+    side = np.ptp(uv[0] * [width, height], axis=0)
+    # The longest edge, 0.943 m, sets the cell: 95 texels.
+    np.testing.assert_allclose(side, 95, atol=1e-2)
+
+
+def test_a_single_tiny_triangle_still_gets_texels():
+    uv, size = pack_triangles_singly(np.full((1, 3, 3), 0.5, np.float32), 0.1)
+    assert min(size) >= 1 + 2 * PADDING
+    assert np.isfinite(uv).all()
+
+
+@pytest.fixture(scope="module")
+def unwrapped():
+    """A sphere and a box as two objects, unwrapped at 2 cm."""
+    scene = world_of([
+        sphere((0, 0, 0), 0.5, 16, 32, (8, 8)), quad((2, 0, 0), (1, 0, 0), (0, 0.5, 0))
+    ]).scene  # fmt: skip
+    uv, resolution = unwrap(scene, 0.02)
+    return replace(scene, corner_uv=uv), resolution
+
+
+def test_charts_have_texels_of_the_size_that_was_asked_for(unwrapped):
+    scene, resolution = unwrapped
+    assert scene.corner_uv.min() >= 0
+    assert scene.corner_uv.max() <= 1
+    texels = texels_from_atlas(scene, resolution)
+    for index, area in enumerate((np.pi, 0.5)):
+        own = texels.of_object(index)
+        # The same density on all objects: area of a texel = 4 cm^2, flattened spheres vary.
+        assert np.median(texels.area[own]) == pytest.approx(0.02**2, rel=0.25)
+        interior = texels.interior[own]
+        assert texels.area[own][interior].sum() == pytest.approx(area, rel=0.03)
+
+
+def test_no_two_triangles_share_a_texel_centre(unwrapped):
+    scene, resolution = unwrapped
+    pixel = scene.corner_uv * resolution[scene.face_object][:, None]
+    for index in range(2):
+        width, height = resolution[index]
+        taken = np.zeros((height, width), int)
+        for p in pixel[scene.face_object == index].astype(np.float64):
+            x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+            a, b = p[1] - p[0], p[2] - p[0]
+            det = a[0] * b[1] - a[1] * b[0]
+            if abs(det) < 1e-9:
+                continue
+            u = ((x - p[0, 0]) * b[1] - (y - p[0, 1]) * b[0]) / det
+            v = (a[0] * (y - p[0, 1]) - a[1] * (x - p[0, 0])) / det
+            taken += (u > 1e-6) & (v > 1e-6) & (u + v < 1 - 1e-6)
+        assert taken.max() == 1
+
+
+def test_an_atlas_beyond_the_limit_is_refused_with_the_cure():
+    scene = world_of(box((0, 0, 0), (40, 40, 40))).scene
+    scene = replace(
+        scene,
+        objects=(replace(scene.objects[0], num_faces=len(scene.triangles)),),
+        face_object=np.zeros(len(scene.triangles), np.int32),
+    )
+    with pytest.raises(InputRefused, match=f"limit {MAX_SIDE}.*larger --texel-size"):
+        unwrap(scene, 0.001)

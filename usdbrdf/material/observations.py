@@ -1,0 +1,174 @@
+"""Which texels, seen in which frames, tell most about an object's lobe.
+
+A lobe shows in how a texel's radiance changes with the view. So, of every object, some thousand
+texels are followed through all frames, and those are kept on which the light in the mirror
+direction changes most between the frames that see them, along with as many taken at random.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.geometry.rays import lift_from_surface
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.material.lit_scene import LitScene, View
+from usdbrdf.shading.warps import patch_shifts
+from usdbrdf.texturing.samples_from_frame import SAMPLE, first_surfaces, samples_from_frame
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+# Followed per object, kept per object, and views kept per texel.
+_FOLLOWED = 3000
+_KEPT = 320
+_VIEWS = 12
+_MIN_VIEWS = 3
+# Bounds the table of followed texels times frames (12 bytes each).
+_MAX_CELLS = 12_000_000
+# The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
+# reaches is not known yet.
+_PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """M samples of texels by frames, sorted by object and texel.
+
+    texel (M,) int32; frame (M,) int32; radiance (M, 3) float32; noise (M,) float32, the frame's
+    noise floor
+    """
+
+    texel: Int
+    frame: Int
+    radiance: Float
+    noise: Float
+
+    def of_texels(self, own: slice) -> Observations:
+        """Those of one object's texels."""
+        first, last = np.searchsorted(self.texel, [own.start, own.stop])
+        part = slice(int(first), int(last))
+        return Observations(**{name: values[part] for name, values in vars(self).items()})
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return dict(vars(self))
+
+
+class Follower:
+    """Follows some texels of every object through the frames, one ``add`` per frame."""
+
+    def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
+        """usable (T,): texels worth following (measured, not emissive)."""
+        self._lit = lit
+        self._index = _texels_to_follow(texels, usable, frames, seed)
+        self._texels = texels.take(self._index)
+        self._owner = texels.object_index()[self._index]
+        # Offsets of the proxy's half vectors, the same for all texels so that views compare.
+        self._jitter = _PROXY_ALPHA * (2 * patch_shifts(_PROXY_RAYS, 3, seed) - 1)
+        self._radiance: list[Float] = []
+        self._proxy: list[Float] = []
+        self._noise: list[float] = []
+
+    def add(self, view: View, clipped: Bool, noise_floor: float) -> None:
+        """Sample the followed texels in the next frame."""
+        height, width = view.valid.shape
+        surfaces = first_surfaces(
+            self._lit.rays, self._lit.scene.face_object, view.world_from_camera, view.intrinsics,
+            np.array([width, height], np.int32),
+        )  # fmt: skip
+        kind, radiance = samples_from_frame(
+            self._texels, self._owner, surfaces, view.radiance, view.valid, clipped,
+            view.world_from_camera, view.intrinsics,
+        )  # fmt: skip
+        radiance[kind != SAMPLE] = np.nan
+        proxy = np.full(len(kind), np.nan, np.float32)
+        seen = np.flatnonzero(kind == SAMPLE)
+        proxy[seen] = self._mirrored_light(seen, view.world_from_camera[:3, 3])
+        self._radiance.append(radiance)
+        self._proxy.append(proxy)
+        self._noise.append(noise_floor)
+
+    def chosen(self, texels: Texels, seed: int) -> Observations:
+        """The texels and views to fit, after the last frame."""
+        radiance, proxy = np.stack(self._radiance), np.stack(self._proxy)
+        known = np.isfinite(proxy)
+        light = np.where(known, proxy, 0)
+        views = known.sum(axis=0)
+        mean = light.sum(axis=0) / np.maximum(views, 1)
+        contrast = np.where(known, np.abs(proxy - mean), 0).max(axis=0)
+        level = np.where(known[..., None], radiance, 0).sum(axis=(0, 2)) / np.maximum(3 * views, 1)
+        score = np.where(views >= _MIN_VIEWS, contrast / (level + level.mean() + 1e-9), -1)
+        pairs = []
+        random = np.random.default_rng([seed, 1])
+        for own in (texels.of_object(i) for i in range(len(texels.resolution))):
+            low, high = np.searchsorted(self._index, [own.start, own.stop])
+            for column in _informative(score[low:high], random) + low:
+                for frame in _views_of(known[:, column], light[:, column]):
+                    pairs.append((column, frame))
+        column, frame = np.array(pairs, np.int64).reshape(-1, 2).T
+        return Observations(
+            texel=self._index[column].astype(np.int32),
+            frame=frame.astype(np.int32),
+            radiance=radiance[frame, column],
+            noise=np.asarray(self._noise, np.float32)[frame],
+        )
+
+    def _mirrored_light(self, which: npt.NDArray[np.int64], eye: Double) -> Float:
+        """Mean L_d about the mirror direction, (len(which),): what a highlight would show."""
+        position, normal = self._texels.position[which], self._texels.normal[which]
+        to_eye = (eye - position).astype(np.float32)
+        to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-12)
+        origin = lift_from_surface(position, normal, self._lit.size)
+        total = np.zeros(len(which), np.float32)
+        for offset in self._jitter:
+            half = (normal + offset).astype(np.float32)
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            along = 2 * np.einsum("td,td->t", half, to_eye)[:, None]
+            direction = np.ascontiguousarray(along * half - to_eye, np.float32)
+            hits = self._lit.rays.closest(origin, direction)
+            total += self._lit.radiance.at(hits.face, hits.u, hits.v).mean(axis=1)
+        mean: Float = total / np.float32(len(self._jitter))
+        return mean
+
+
+def _texels_to_follow(
+    texels: Texels, usable: Bool, frames: int, seed: int
+) -> npt.NDArray[np.int64]:
+    """Ascending indices of at most _FOLLOWED usable texels of each object, picked at random."""
+    random = np.random.default_rng([seed, 0])
+    objects = len(texels.resolution)
+    limit = min(_FOLLOWED, max(_KEPT, _MAX_CELLS // max(frames * objects, 1)))
+    picked = []
+    for own in (texels.of_object(i) for i in range(objects)):
+        candidates = own.start + np.flatnonzero(usable[own])
+        take = min(limit, len(candidates))
+        picked.append(np.sort(random.choice(candidates, take, replace=False)))
+    return np.concatenate(picked)
+
+
+def _informative(score: Float, random: np.random.Generator) -> npt.NDArray[np.int64]:
+    """Half of the kept texels from the best fifth by score, half from all that have a score."""
+    good = np.flatnonzero(score >= 0)
+    if len(good) <= _KEPT:
+        return good
+    best = good[np.argsort(-score[good], kind="stable")[: max(_KEPT // 2, len(good) // 5)]]
+    first = random.choice(best, _KEPT // 2, replace=False)
+    others = np.setdiff1d(good, first)
+    second = random.choice(others, _KEPT - len(first), replace=False)
+    return np.sort(np.concatenate([first, second]))
+
+
+def _views_of(known: Bool, light: Float) -> npt.NDArray[np.int64]:
+    """At most _VIEWS frames of a texel: the third with most mirrored light, the rest spread."""
+    frames = np.flatnonzero(known)
+    if len(frames) <= _VIEWS:
+        return frames
+    brightest = frames[np.argsort(-light[frames], kind="stable")[: _VIEWS // 3]]
+    rest = np.setdiff1d(frames, brightest)
+    spread = rest[np.linspace(0, len(rest) - 1, _VIEWS - len(brightest)).round().astype(int)]
+    return np.sort(np.concatenate([brightest, spread]))
