@@ -52,24 +52,21 @@ FAULTS = {
         "stage:ingest:mid_publish",
     ],
     "texture": [
-        "stage:texture:checkpoint:1",  # charts
         "image:before_write:7",
         "stage:texture:mid_publish:9",
         "stage:texture:before_stamp",
     ],
     "shade": [
-        "stage:shade:checkpoint:3",
         "publish:before_replace:2",  # the second tile
         "image:before_write:5",
-        "stage:shade:mid_publish:4",
     ],
     "fit": [
         "stage:fit:checkpoint:1",  # target frames
-        "stage:fit:checkpoint:3",  # two objects
         "stage:fit:before_write",
         "stage:fit:mid_publish",
     ],
 }
+# More places are in the tests of what is computed again.
 IN_STEPS = [(step, fault) for step, faults in FAULTS.items() for fault in faults]
 
 
@@ -186,39 +183,43 @@ def calls(monkeypatch):
     return counted
 
 
-def resumed_after(fault: str, step: str, base: Path, asset: Path, calls: Counter[str]) -> Counter:
-    """Calls of the second run."""
-    call = command(step, base, asset)
-    killed_at(call, fault)
-    calls.clear()
-    assert main(call) == 0
-    return Counter(calls)
+@pytest.fixture
+def resumed(base, undisturbed, case, calls):
+    """Kills a step and runs it again, to the same bytes; returns the calls of the second run."""
+
+    def after(step: str, fault: str) -> Counter[str]:
+        asset = case(step)
+        call = command(step, base, asset)
+        killed_at(call, f"stage:{step}:{fault}")
+        calls.clear()
+        assert main(call) == 0
+        assert hashes(asset) == hashes(undisturbed[step])
+        return Counter(calls)
+
+    return after
 
 
-def test_texturing_goes_on_after_the_last_saved_frame(base, undisturbed, case, calls):
-    asset = case("texture")
-    found = resumed_after("stage:texture:checkpoint:2", "texture", base, asset, calls)
+def test_texturing_goes_on_after_the_last_saved_frame(resumed):
+    found = resumed("texture", "checkpoint:2")  # the first are the charts
     assert found == {"radiance_from_frames": 1, "first frame": FIRST_UNSAVED}
-    assert hashes(asset) == hashes(undisturbed["texture"])
 
 
-def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls):
+def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resumed):
     asset = case("shade")
     assert main(command("shade", base, asset)) == 0
     tiles = calls["irradiance_at"]
     assert tiles > 6
     shutil.rmtree(asset)
-    found = resumed_after("stage:shade:checkpoint:4", "shade", base, case("shade"), calls)
-    assert found == {"irradiance_at": tiles - 4}
+    assert resumed("shade", "checkpoint:4") == {"irradiance_at": tiles - 4}
 
 
-def test_fitting_fits_only_the_objects_that_are_missing(base, case, calls):
-    found = resumed_after("stage:fit:checkpoint:3", "fit", base, case("fit"), calls)
-    assert found == {"_fit_arrays": 5 - 2}  # and the target frames are kept
+def test_fitting_fits_only_the_objects_that_are_missing(resumed):
+    # The first checkpoint are the target frames.
+    assert resumed("fit", "checkpoint:3") == {"_fit_arrays": 5 - 2}
 
 
-def test_a_published_step_is_finished_without_its_work(base, case, calls):
-    assert not resumed_after("stage:shade:mid_publish:6", "shade", base, case("shade"), calls)
+def test_a_step_that_was_being_published_is_not_computed_again(resumed):
+    assert not resumed("shade", "mid_publish:6")
 
 
 # Other ways to be interrupted

@@ -100,13 +100,13 @@ def irradiance_at(
     patch: Int,
     sampling: Sampling,
     scene_size: float,
-    dark: float = 0.0,
+    dark: Float | None = None,
 ) -> Irradiance:
     """S at N surface points.
 
     position, normal (N, 3) float32, world; patch (N,) int32 ascending: points of one patch share
     their random shift and their stopping. scene_size: metres, for the lift off the surface.
-    dark: W/m^2; where S is below it the standard error is held against ``dark`` instead of S.
+    dark: (N,) W/m^2; where S is below it, the standard error is held against it instead of S.
     """
     count = len(position)
     origin = lift_from_surface(position, normal, scene_size)
@@ -114,6 +114,7 @@ def irradiance_at(
     escaped = np.zeros(count)
     done = np.zeros(count, np.int64)
     active = np.arange(count)
+    floor = np.zeros(count) if dark is None else dark.astype(np.float64)
     # No two patches are numbered alike and none has more than 64 points, so in the whole scene no
     # two points share their random numbers.
     identity = 64 * int(patch[0]) + active if count else active
@@ -140,7 +141,9 @@ def irradiance_at(
         sums[active], escaped[active], done[active] = block_sums, block_escaped, last
         error = _standard_error(sums[active], last)
         error_target = sampling.standard_error
-        active = active[_noisy(patch[active], sums[active], error, last, error_target, dark)]
+        active = active[
+            _noisy(patch[active], sums[active], error, last, error_target, floor[active])
+        ]
         if not len(active):
             break
     mean = sums.sum(axis=1) / done[:, None]
@@ -159,14 +162,15 @@ def _standard_error(sums: Double, samples: Any) -> Double:
 
 
 def _noisy(
-    patch: Int, sums: Double, error: Double, samples: int, target: float, dark: float
+    patch: Int, sums: Double, error: Double, samples: int, target: float, dark: Double
 ) -> Any:
     """(N,) bool: does the point's patch still miss the target relative standard error?"""
     index = patch - patch[0]
     points = np.maximum(np.bincount(index), 1)
     mean = np.bincount(index, sums.sum(axis=(1, 2)) / (3 * samples)) / points
     square = np.bincount(index, (error**2).mean(axis=1)) / points
-    return (np.sqrt(square) > target * np.maximum(mean, max(dark, 1e-12)))[index]
+    floor = np.maximum(np.bincount(index, dark) / points, 1e-12)
+    return (np.sqrt(square) > target * np.maximum(mean, floor))[index]
 
 
 class _Techniques:

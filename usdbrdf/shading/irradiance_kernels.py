@@ -29,6 +29,8 @@ Int = npt.NDArray[np.int32]
 Long = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
+OWN_SHIFT = 1 / 8
+
 # Where N points take their random numbers from: Sobol points (S, 5), or none of them for
 # independent numbers; a shift per patch (P, 5); each point's patch (N,); seed; identity (N,).
 Draws: TypeAlias = tuple[Double, Double, Int, int, Long]
@@ -43,7 +45,10 @@ def _uniform(draws: Draws, point: int, sample: int, dimension: int) -> float:
     points, shift, patch, seed, identity = draws
     if len(points) == 0:
         return hashed_uniform(seed, identity[point], sample * 2 + dimension)
-    x = points[sample, dimension] + shift[patch[point], dimension]
+    # The point's own part of the shift is small: rays of a patch stay nearly parallel, while the
+    # errors of its points differ and do not show as a block.
+    own = hashed_uniform(seed, identity[point], dimension) * OWN_SHIFT
+    x = points[sample, dimension] + shift[patch[point], dimension] + own
     fraction: float = x - np.floor(x)
     return fraction
 

@@ -102,8 +102,9 @@ def _trace(
     radiance = surface_texture(texels, scene.face_object, lit)
     lights = lights_from_radiance(scene, texels, lit)
     size = float(np.linalg.norm(np.ptp(scene.points, axis=0)))
-    # In light that would make the median texel's albedo 10, no albedo is to be had anyway.
-    dark = 0.1 * np.pi * float(np.median(lit.mean(axis=1)))
+    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
+    # surfaces lit from outside the scan.
+    dark = np.pi * lit.mean(axis=1)
     order, patch = patches_of_texels(texels)
     tiles = list(_tiles(patch))
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
@@ -112,7 +113,7 @@ def _trace(
         index = order[first:last]
         found = irradiance_at(
             rays, radiance, lights, environment, texels.position[index], texels.normal[index],
-            patch[first:last], sampling, size, dark,
+            patch[first:last], sampling, size, dark[index],
         )  # fmt: skip
         return dict(vars(found))
 
