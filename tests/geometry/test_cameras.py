@@ -21,9 +21,7 @@ def test_the_first_pixel_is_centred_at_one_half():
 
 def test_a_stride_keeps_every_nth_pixel():
     whole = pixel_centres(7, 5).reshape(5, 7, 2)
-    np.testing.assert_array_equal(
-        pixel_centres(7, 5, 3), whole[::3, ::3].reshape(-1, 2)
-    )
+    np.testing.assert_array_equal(pixel_centres(7, 5, 3), whole[::3, ::3].reshape(-1, 2))
 
 
 def test_the_axes_are_right_up_and_backwards():

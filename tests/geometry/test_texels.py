@@ -13,7 +13,7 @@ from usdbrdf.geometry.texels import Texels, texels_from_atlas
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 
 
-def _icosphere_like() -> World:
+def _sphere() -> World:
     return world_of([sphere((0.3, -0.2, 1), 0.7, 24, 48, (192, 96))])
 
 
@@ -43,12 +43,13 @@ def _mesh_area(scene: Scene) -> float:
 
 @pytest.mark.parametrize("kind", ["sphere", "packed"])
 def test_areas_of_the_interior_texels_add_up_to_the_mesh(kind: str):
-    # A texel counts for the triangle that its centre lies in: a sum over centres of a grid.
+    # A texel counts for the triangle that its centre lies in: a sum over the centres of a grid.
+    # Packed triangles have centres all along their hypotenuse, which count too: 1 / side more.
     if kind == "sphere":
-        world = _icosphere_like()
+        world = _sphere()
         scene, texels = world.scene, world.texels
     else:
-        scene, texels = _packed(0.02)
+        scene, texels = _packed(0.008)
     assert texels.area[texels.interior].sum() == pytest.approx(_mesh_area(scene), rel=0.02)
     assert (texels.area > 0).all()
 
@@ -78,14 +79,44 @@ def test_every_position_lies_on_its_triangle():
     local = texels.pixel - texels.first_pixel[owner]
     width = texels.resolution[owner, 0]
     centre = np.stack([local % width, local // width], axis=-1) + 0.5
-    np.testing.assert_allclose(at[texels.interior], centre[texels.interior], atol=2e-3)
-    # Border texels are moved onto their triangle, by less than a texel and a bit.
-    moved = np.linalg.norm(at - centre, axis=1)[~texels.interior]
-    assert moved.max() < 2.0
+    # (those on an edge a little inside of it).
+    off = np.abs(at - centre)[texels.interior].max(axis=1)
+    assert np.median(off) < 2e-3
+    assert off.max() < 0.5
+
+
+def test_border_texels_move_onto_the_surface_by_less_than_a_texel_and_no_further():
+    # The chart ends 0.4 texels short of the outer centres; both triangles are 250 texels large.
+    scene = world_of([quad((0, 0, 0), (5, 0, 0), (0, 5, 0))]).scene
+    scene = replace(
+        scene, corner_uv=(10.1 / 270 + scene.corner_uv * 249.8 / 270).astype(np.float32)
+    )
+    texels = texels_from_atlas(scene, np.array([[270, 270]], np.int32))
+    border = ~texels.interior
+    assert border.sum() > 500
+    at = (texels.barycentric[:, :, None] * texels.corner_pixel[texels.face]).sum(axis=1)
+    centre = np.stack([texels.pixel % 270, texels.pixel // 270], axis=-1) + 0.5
+    moved = np.linalg.norm(at - centre, axis=1)
+    assert moved[border].max() < 1.0
+    assert moved.max() < 1.0
+    assert (texels.barycentric.min(axis=1) > 0)[border].all()
+
+
+def test_no_texel_lies_exactly_on_the_edge_of_its_triangle():
+    # Atlas packers like to put a chart's corners onto texel centres; a ray that starts exactly on
+    # an edge shared with a wall starts inside of the wall, or behind it.
+    scene = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0))]).scene
+    scene = replace(scene, corner_uv=(2.5 / 20 + scene.corner_uv * 15 / 20).astype(np.float32))
+    texels = texels_from_atlas(scene, np.array([[20, 20]], np.int32))
+    assert texels.interior.sum() == 256
+    away = np.minimum(texels.position[:, :2], 1 - texels.position[:, :2]).min(axis=1)
+    # A hundredth of a texel at least, half of one at most.
+    assert away.min() > 0.009 / 15
+    assert away.min() < 0.5 / 15
 
 
 def test_normals_are_unit_and_point_outwards():
-    world = _icosphere_like()
+    world = _sphere()
     texels = world.texels
     radial = texels.position - np.array([0.3, -0.2, 1], np.float32)
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
@@ -114,7 +145,9 @@ def test_gutters_show_the_nearest_texel_of_their_own_atlas():
         for pixel in rng.choice(gutter, 50):
             away = (local % width - pixel % width) ** 2 + (local // width - pixel // width) ** 2
             chosen = local[shown[pixel] - own.start]
-            distance = (chosen % width - pixel % width) ** 2 + (chosen // width - pixel // width) ** 2
+            distance = (chosen % width - pixel % width) ** 2 + (
+                chosen // width - pixel // width
+            ) ** 2
             assert distance == away.min()
 
 
@@ -134,11 +167,12 @@ def test_pictures_and_tables_convert_into_each_other():
 
 
 def test_v_is_up_and_rows_run_down():
-    # uv (0, 0) is the lower left corner of the picture: its last row.
+    # uv (0, 0) is the lower left corner of the picture: its last row. (Texels on a triangle's edge
+    # may be moved off it by some hundredths of their size, here 0.25.)
     texels = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size=(4, 4))]).texels
     picture = texels.image(0, texels.position)
-    np.testing.assert_allclose(picture[-1, 0], [0.125, 0.125, 0], atol=1e-6)
-    np.testing.assert_allclose(picture[0, 0], [0.125, 0.875, 0], atol=1e-6)
+    np.testing.assert_allclose(picture[-1, 0], [0.125, 0.125, 0], atol=0.01)
+    np.testing.assert_allclose(picture[0, 0], [0.125, 0.875, 0], atol=0.01)
 
 
 def test_rasterising_twice_gives_the_same_bits():

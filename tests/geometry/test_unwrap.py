@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.physics.surfaces import box, quad, sphere, world_of
+from tests.physics.surfaces import quad, sphere, world_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import MAX_SIDE, PADDING, pack_triangles_singly, unwrap
+from usdbrdf.geometry.unwrap import PADDING, pack_triangles_singly, unwrap
 
 
 def test_packed_triangles_have_cells_of_their_own():
@@ -63,8 +63,10 @@ def test_charts_have_texels_of_the_size_that_was_asked_for(unwrapped):
         own = texels.of_object(index)
         # The same density on all objects: area of a texel = 4 cm^2, flattened spheres vary.
         assert np.median(texels.area[own]) == pytest.approx(0.02**2, rel=0.25)
+        # xatlas puts a chart's corners onto texel centres, so texels at both ends of a chart count:
+        # (51 x 26) / (50 x 25) on the square.
         interior = texels.interior[own]
-        assert texels.area[own][interior].sum() == pytest.approx(area, rel=0.03)
+        assert texels.area[own][interior].sum() == pytest.approx(area, rel=0.08)
 
 
 def test_no_two_triangles_share_a_texel_centre(unwrapped):
@@ -85,12 +87,8 @@ def test_no_two_triangles_share_a_texel_centre(unwrapped):
         assert taken.max() == 1
 
 
-def test_an_atlas_beyond_the_limit_is_refused_with_the_cure():
-    scene = world_of(box((0, 0, 0), (40, 40, 40))).scene
-    scene = replace(
-        scene,
-        objects=(replace(scene.objects[0], num_faces=len(scene.triangles)),),
-        face_object=np.zeros(len(scene.triangles), np.int32),
-    )
-    with pytest.raises(InputRefused, match=f"limit {MAX_SIDE}.*larger --texel-size"):
-        unwrap(scene, 0.001)
+def test_an_atlas_beyond_the_limit_is_refused_with_the_cure(monkeypatch):
+    monkeypatch.setattr("usdbrdf.geometry.unwrap.MAX_SIDE", 64)
+    scene = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0))]).scene
+    with pytest.raises(InputRefused, match=r"limit 64.*larger --texel-size than 0.01 m"):
+        unwrap(scene, 0.01)

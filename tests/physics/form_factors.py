@@ -8,11 +8,14 @@ import numpy.typing as npt
 Double = npt.NDArray[np.float64]
 
 
-def polygon_irradiance(point: npt.ArrayLike, normal: npt.ArrayLike, polygon: npt.ArrayLike) -> float:
+def polygon_irradiance(
+    point: npt.ArrayLike, normal: npt.ArrayLike, polygon: npt.ArrayLike
+) -> float:
     """Irradiance from a planar polygon (K, 3) of unit radiance (Lambert 1760).
 
-    E = 1/2 sum_i theta_i n . unit(r_i x r_i+1), with r_i the unit vectors to the corners and theta_i
-    the angle between r_i and r_i+1, for the part of the polygon above the receiver's horizon.
+    E = 1/2 sum_i theta_i n . unit(r_i x r_i+1), with r_i the unit vectors to the corners and
+    theta_i the angle between r_i and r_i+1, for the part of the polygon above the receiver's
+    horizon.
     """
     n = np.asarray(normal, np.float64)
     corners = _above_horizon(np.asarray(polygon, np.float64) - np.asarray(point), n)

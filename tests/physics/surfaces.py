@@ -141,12 +141,12 @@ def disc(centre: Vector, radius: float, normal_z: int, segments: int = 512) -> P
     triangles = np.stack([0 * k, k + 1, (k + 1) % segments + 1], axis=-1).astype(np.int32)
     uv = 0.5 + 0.5 * np.concatenate([[[0, 0]], ring[:, :2]])
     normals = np.broadcast_to([0.0, 0.0, float(normal_z)], (segments, 3, 3))
-    return Part(points=points, triangles=triangles, uv=uv[triangles], normals=normals, size=(64, 64))
+    return Part(
+        points=points, triangles=triangles, uv=uv[triangles], normals=normals, size=(64, 64)
+    )
 
 
-def sphere(
-    centre: Vector, radius: float, rows: int, columns: int, size: tuple[int, int]
-) -> Part:
+def sphere(centre: Vector, radius: float, rows: int, columns: int, size: tuple[int, int]) -> Part:
     """A latitude-longitude sphere with the exact normals at its vertices."""
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     theta, azimuth = np.pi * (1 - v.ravel()), 2 * np.pi * u.ravel()
@@ -158,7 +158,10 @@ def sphere(
     b = a + columns + 1
     # At the poles one of the two triangles has no area.
     triangles = np.concatenate(
-        [np.stack([a, a + 1, b + 1], axis=-1)[i > 0], np.stack([a, b + 1, b], axis=-1)[i < rows - 1]]
+        [
+            np.stack([a, a + 1, b + 1], axis=-1)[i > 0],
+            np.stack([a, b + 1, b], axis=-1)[i < rows - 1],
+        ]
     ).astype(np.int32)
     uv = np.stack([u.ravel(), v.ravel()], axis=-1)
     return Part(

@@ -38,14 +38,14 @@ def _floor() -> Part:
 
 
 def test_the_closed_form_itself():
-    # A square of half-width a at height h straight above: E = 4 * 2 * (1/2) * corner terms;
-    # for a = h E. M. Sparrow and R. D. Cess' corner formula gives, per quarter,
-    # (1 / 2 pi) [X / sqrt(1 + X^2) atan(Y / sqrt(1 + X^2)) + the same with X and Y exchanged],
-    # X = Y = 1: F = 4 * (1 / 2 pi) * 2 / sqrt(2) * atan(1 / sqrt(2)), E = pi F.
+    # A square of half-width a straight above at height a, by the form factor of a point under a
+    # rectangle's corner (Sparrow and Cess), X = Y = 1, four quarters:
+    # F = 4 / (2 pi) [X / sqrt(1 + X^2) atan(Y / sqrt(1 + X^2)) + the same with X and Y exchanged]
+    #   = 4 / (2 pi) * 2 / sqrt(2) * atan(1 / sqrt(2)), and E = pi F.
     square = [[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
     form_factor = 4 / (2 * np.pi) * 2 / np.sqrt(2) * np.arctan(1 / np.sqrt(2))
     assert polygon_irradiance([0, 0, 0], [0, 0, 1], square) == pytest.approx(np.pi * form_factor)
-    # Standing on edge in the horizon's plane, half of it counts; by symmetry one half is the other.
+    # Of a receiver that stands upright half of it is above the horizon, to either side alike.
     halves = [polygon_irradiance([0, 0, 0], [s, 0, 0], square) for s in (1, -1)]
     assert halves[0] == pytest.approx(halves[1])
     # Equal large discs close together see nothing but each other.

@@ -3,11 +3,15 @@ same, L = Le + rho L, so L = Le / (1 - rho), whatever the shape of the box."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.physics.chi2 import assert_same_mean
-from tests.physics.surfaces import World, box, estimates, room, world_of
+from tests.physics.surfaces import World, box, estimates, quad, room, world_of
+from usdbrdf.geometry.texels import texels_from_atlas
+from usdbrdf.geometry.unwrap import unwrap
 from usdbrdf.shading.albedo import albedo_from_irradiance
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
@@ -57,6 +61,30 @@ def test_no_ray_leaves_a_closed_box(furnace: World, estimator: str):
     found = _shade(furnace, _somewhere_bright(furnace), estimator, 1024)
     leaks = np.count_nonzero(found.escaped[furnace.texels.interior])
     assert leaks == 0, f"rays escaped from {leaks} texels"
+
+
+def test_no_ray_leaves_a_closed_room_with_real_charts():
+    # Charts of the real unwrapper, walls that no axis follows: texels at the room's edges and
+    # corners must not see past the wall they touch. S / pi = 1 at every one of them.
+    turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
+    walls = [
+        quad(*((part.points[[0, 1, 3]] - [[0, 0, 0], part.points[0], part.points[0]]) @ turn.T))
+        for part in room((0.123, 0.377, -1.01), (4.2, 3.3, 2.5))
+    ]
+    scene = world_of(walls).scene
+    uv, resolution = unwrap(scene, 0.07)
+    scene = replace(scene, corner_uv=uv)
+    world = World(scene=scene, texels=texels_from_atlas(scene, resolution))
+    order, patch = patches_of_texels(world.texels)
+    ones = np.ones((len(order), 3), np.float32)
+    found = irradiance_at(
+        world.rays, world.texture(ones), world.lights(ones), black_environment(),
+        world.texels.position[order], world.texels.normal[order], patch,
+        Sampling(standard_error=0.0, max_rays=64), world.size,
+    )  # fmt: skip
+    leaks = found.escaped > 0
+    assert not leaks.any(), f"{leaks.sum()} of {len(leaks)} texels, up to {found.escaped.max():.0%}"
+    np.testing.assert_allclose(found.mean, np.pi, rtol=1e-4)
 
 
 def test_lights_in_the_list_do_not_change_the_answer(furnace: World):

@@ -46,7 +46,9 @@ def test_both_estimators_agree_on_a_furnished_room(furnished):
     # Welch's t at 24 points and 3 channels, Sidak over all 72.
     world, lit, lights = furnished
     rng = np.random.default_rng(12345)
-    pick = rng.choice(np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS), 24, replace=False)
+    pick = rng.choice(
+        np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS), 24, replace=False
+    )
     at = world.texels.position[pick], world.texels.normal[pick]
     cosine, _ = estimates(world, lit, lights, *at, estimator="cosine", rays=1024, repeat=64)
     mis, _ = estimates(world, lit, lights, *at, estimator="mis", rays=128, repeat=64, seed=9)
@@ -91,7 +93,7 @@ def test_patches_are_blocks_of_one_object(furnished):
     for number in np.unique(patch):
         own = patch == number
         assert len(np.unique(owner[own])) == 1
-        # 8 x 8 texels of a quad in one plane: no further apart than the quad's block.
+        # 8 x 8 texels of the atlas.
         assert own.sum() <= 64
 
 
@@ -122,12 +124,11 @@ def test_the_standard_error_of_independent_rays_is_unbiased(furnished):
 
 
 def test_rays_double_until_the_error_that_was_asked_for(furnished):
-    world, lit, lights = furnished
-    order, patch = patches_of_texels(world.texels)
+    order, patch = patches_of_texels(furnished[0].texels)
     reached = _shade(furnished, order, patch, standard_error=0.05, max_rays=4096)
     exact = _shade(furnished, order, patch, standard_error=0.0, max_rays=4096, seed=77)
-    lit_texels = exact.mean.min(axis=1) > 1e-6
-    relative = (reached.mean / np.maximum(exact.mean, 1e-6) - 1)[lit_texels]
+    assert exact.mean.min() > 1e-3
+    relative = reached.mean / exact.mean - 1
     assert np.sqrt((relative**2).mean()) < 0.05
     # Stopping on a noisy error must not bend the mean: 6 times below the error itself.
     assert abs(relative.mean()) < 0.008

@@ -1,4 +1,4 @@
-"""The lobe of equations 3 to 6: normalised, reciprocal, affine in psi, never more than all light."""
+"""The lobe of equations 3 to 6: normalised, reciprocal, affine in psi, never more than it gets."""
 
 from __future__ import annotations
 

@@ -82,7 +82,9 @@ def test_a_furnace(degrees: float, aims: str):
     world = world_of(room((-2, -2, 0), (2, 2, 2.5)) + box((0.5, 0.4, 0.6), (1.0, 0.9, 1.2)))
     lit = world.per_object([tuple(RGB)] * 12)
     bright = {"nowhere": [], "one wall": [5], "a box": range(6, 12)}[aims]
-    lights = world.lights(world.per_object([(100.0 if i in bright else 1.0,) * 3 for i in range(12)]))
+    lights = world.lights(
+        world.per_object([(100.0 if i in bright else 1.0,) * 3 for i in range(12)])
+    )
     assert (len(lights.face) > 0) == (aims != "nowhere")
     _assert_albedo(world, lit, lights, np.zeros(3), degrees)
 

@@ -156,9 +156,12 @@ def test_lights_are_picked_with_the_density_they_report():
     lights = world.lights(world.per_object([(20, 10, 5), (60, 60, 60), (0.1, 0.1, 0.1)]))
     assert sorted(lights.face) == list(range(26))
     corners = lights.corners.astype(np.float64)
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    ) / 2
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        / 2
+    )
     # A density over area: it integrates to one, and vanishes on what is no light.
     assert (lights.density * area).sum() == pytest.approx(1, rel=1e-6)
     assert (lights.density[26:] == 0).all()
@@ -252,8 +255,18 @@ def test_tangent_frames_are_orthonormal_and_right_handed():
     rng = np.random.default_rng(12345)
     normals = rng.standard_normal((500, 3))
     # Around the pole at -z, where the older formula divides by zero, and on it.
-    near = np.stack([1e-5 * rng.standard_normal(100), 1e-5 * rng.standard_normal(100), -np.ones(100)])
-    special = [[0, 0, -1], [0, 0, 1], [0, 0, -1.0], [1, 0, 0], [0, -1, 0], [0, 1, -0.0], [1, 0, -1e-9]]
+    near = np.stack(
+        [1e-5 * rng.standard_normal(100), 1e-5 * rng.standard_normal(100), -np.ones(100)]
+    )
+    special = [
+        [0, 0, -1],
+        [0, 0, 1],
+        [0, 0, -1.0],
+        [1, 0, 0],
+        [0, -1, 0],
+        [0, 1, -0.0],
+        [1, 0, -1e-9],
+    ]
     normals = np.concatenate([normals, near.T, special])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     for n in [*normals, *normals.astype(np.float32)]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tests.physics.surfaces import World, box, quad, world_of
+from tests.physics.surfaces import Part, World, box, quad, world_of
+from usdbrdf.geometry.scene import SceneObject
+from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.texturing.inpaint import inpaint
 
 
@@ -86,13 +90,8 @@ def test_one_known_texel_is_enough():
     np.testing.assert_allclose(inpaint(world.texels, values, known), 0.3, rtol=1e-5)
 
 
-def _merged(parts: list) -> World:
+def _merged(parts: list[Part]) -> World:
     """Parts side by side in the atlas of one object."""
-    from dataclasses import replace
-
-    from usdbrdf.geometry.scene import SceneObject
-    from usdbrdf.geometry.texels import texels_from_atlas
-
     scene = world_of(parts).scene
     uv = scene.corner_uv.copy()
     uv[..., 0] = (uv[..., 0] + scene.face_object[:, None]) / len(parts)
@@ -100,9 +99,7 @@ def _merged(parts: list) -> World:
         prim_path="/x/geo/a", identifier="a", label="a", class_name="",
         first_face=0, num_faces=len(uv),
     )  # fmt: skip
-    one = replace(
-        scene, objects=(whole,), corner_uv=uv, face_object=np.zeros(len(uv), np.int32)
-    )
+    one = replace(scene, objects=(whole,), corner_uv=uv, face_object=np.zeros(len(uv), np.int32))
     width, height = parts[0].size
     resolution = np.array([[width * len(parts), height]], np.int32)
     return World(scene=one, texels=texels_from_atlas(one, resolution))

@@ -128,7 +128,9 @@ def test_a_highlight_in_a_fifth_of_the_frames_does_not_move_the_median():
     # What the method rests on: 80 % of the samples at 1 +- 0.02, 20 % of them up to ten times that.
     rng = np.random.default_rng(12345)
     shape = (200, 200, 3)
-    samples = np.where(rng.random(shape) < 0.2, rng.uniform(5, 10, shape), rng.normal(1, 0.02, shape))
+    samples = np.where(
+        rng.random(shape) < 0.2, rng.uniform(5, 10, shape), rng.normal(1, 0.02, shape)
+    )
     state = _fed(samples.astype(np.float32), 0.5)
     exact = np.quantile(samples, 0.5, axis=0)
     off = np.abs(quantile(state, 0.5) / exact - 1)

@@ -37,7 +37,7 @@ def room(tmp_path_factory) -> Room:
     points, triangles, owner, names = room_mesh(subdivisions=2)
     world = world_of([_part(points[triangles[owner == i]]) for i in range(len(names))])
     middle = np.array([ROOM[0] / 2, ROOM[1] / 2, 1.2])
-    up = [look_at(pose[:3, 3], middle + [0.3, 0.1, 1.2]) for pose in ring_of_poses(6)]
+    up = [look_at(pose[:3, 3], middle + np.array([0.3, 0.1, 1.2])) for pose in ring_of_poses(6)]
     poses = np.array([*ring_of_poses(6), *up])
     shown = np.array([RADIANCE[name] for name in names], np.float32)
     for i, pose in enumerate(poses):

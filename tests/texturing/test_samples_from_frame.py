@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,9 @@ class Shot(NamedTuple):
     radiance: np.ndarray
 
 
-def _camera(eye: np.ndarray = EYE, target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def _camera(
+    eye: np.ndarray = EYE, target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
     return look_at(np.asarray(eye, np.float64), np.asarray(target, np.float64))
 
 
@@ -112,23 +115,26 @@ def test_half_a_pixel_matters(plane: World):
 
 
 def test_large_texels_average_over_their_footprint():
-    # Texels of 10 cm, four pixels wide; the picture has columns of alternating 0 and 2.
+    # Texels of 10 cm, four pixels wide; the picture has stripes of two dark and two bright columns,
+    # so every footprint holds as much of both wherever it starts.
     world = world_of([quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(10, 10))])
-    pose = _camera((0, -1e-3, 2.0))
+    pose = _camera((0.008, -1e-3, 2.0), (0.008, 0, 0))
     stripes = np.zeros((HEIGHT, WIDTH, 3))
-    stripes[:, ::2] = 2
+    stripes[:, np.arange(WIDTH) // 2 % 2 == 0] = 2
     shot = _shoot(world, stripes, pose)
     seen = shot.kind == SAMPLE
     assert seen.sum() >= 64
-    np.testing.assert_allclose(shot.radiance[seen], 1, atol=0.15)
+    np.testing.assert_allclose(shot.radiance[seen], 1, atol=0.05)
 
 
-def test_large_texels_do_not_read_over_the_edge_of_their_object():
-    # 10 cm texels, four pixels wide: the edge lies two pixels from the centres of the nearest ones,
-    # outside of their 3 x 3 pixels but not of what bilinear reading of their footprint touches.
+@pytest.mark.parametrize("size", [(20, 40), (5, 10)])
+def test_texels_do_not_read_over_the_edge_of_their_object(size: tuple[int, int]):
+    # Two objects side by side in one plane. Texels of one pixel: their 3 x 3 pixels tell. Texels
+    # of four pixels: the edge lies two pixels from the centres of the nearest ones, outside of
+    # their 3 x 3 pixels but not of what bilinear reading of their footprint touches.
     world = world_of([
-        quad((-0.5, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(5, 10)),
-        quad((0, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(5, 10)),
+        quad((-0.5, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=size),
+        quad((0, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=size),
     ])  # fmt: skip
     pose = _camera((0.008, -1e-3, 2.0), (0.008, 0, 0))
     image = _picture_of_plane(pose, lambda x, y: np.where(x < 0, 1.0, 9.0)[..., None] * np.ones(3))
@@ -168,24 +174,19 @@ def test_an_occluder_leaves_no_samples_behind_it_or_near_its_edge(plane: World):
     inside = np.abs(position[:, :2]).max(axis=1) < 0.45
     assert (shot.kind[own][clear & inside] == SAMPLE).all()
     seen = shot.kind[own] == SAMPLE
-    np.testing.assert_allclose(
-        shot.radiance[own][seen], _pattern(*position[seen, :2].T), atol=2e-4
-    )
+    np.testing.assert_allclose(shot.radiance[own][seen], _pattern(*position[seen, :2].T), atol=2e-4)
 
 
 def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
-    # A step of 20 cm within one object: no sample mixes the upper with the lower side.
-    from dataclasses import replace
-
+    # A step of 20 cm within one object, seen from the side that hides part of the lower level: no
+    # sample of the lower level is one of the upper.
     parts = [
         quad((-0.5, -0.5, 0), (0.5, 0, 0), (0, 1, 0), size=(20, 40)),
         quad((0, -0.5, 0.2), (0.5, 0, 0), (0, 1, 0), size=(20, 40)),
     ]
     world = world_of(parts)
-    pose = _camera((-0.3, 0, 2.0))
-    one = World(
-        scene=replace(world.scene, face_object=np.zeros(4, np.int32)), texels=world.texels
-    )
+    pose = _camera((0.3, -1e-3, 2.0))
+    one = World(scene=replace(world.scene, face_object=np.zeros(4, np.int32)), texels=world.texels)
     size = np.array([WIDTH, HEIGHT], np.int32)
     surfaces = first_surfaces(one.rays, one.scene.face_object, pose, LENS, size)
     upper = surfaces.point[..., 2] > 0.1
@@ -198,7 +199,7 @@ def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
     seen = kind == SAMPLE
     high = one.texels.position[:, 2] > 0.1
     assert seen[high].sum() > 400
-    assert seen[~high].sum() > 400
+    assert 400 < seen[~high].sum() < 800
     np.testing.assert_allclose(radiance[seen & high], 9)
     np.testing.assert_allclose(radiance[seen & ~high], 1)
 

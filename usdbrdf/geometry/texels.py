@@ -20,6 +20,8 @@ Number = TypeVar("Number", bound=np.generic)
 # A texel whose centre lies outside every triangle, but no further than this from one (in texels),
 # still belongs to the chart: bilinear lookup at the chart's border reads it.
 _BORDER = 0.75
+# How far from its triangle's edges a texel's point stays, in texels (less in slivers).
+_INSET = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +115,7 @@ def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
     width = resolution[scene.face_object[face], 0]
     local = pixel - first_pixel[scene.face_object[face]]
     centre = np.stack([local % width, local // width], axis=-1) + np.float32(0.5)
-    barycentric = _barycentric(corner_pixel[face], centre, interior)
+    barycentric = _barycentric(corner_pixel[face], centre)
     corners = scene.points[scene.triangles[face]]
     geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = np.einsum("tc,tcd->td", barycentric, scene.corner_normals[face])
@@ -187,11 +189,12 @@ def _distance_to_triangle(x: Float, y: Float, px: float, py: float) -> float:
     return float(np.sqrt(nearest))
 
 
-def _barycentric(corners: Float, points: npt.NDArray[np.floating], interior: Bool) -> Float:
+def _barycentric(corners: Float, points: npt.NDArray[np.floating]) -> Float:
     """Barycentric coordinates (T, 3) of points (T, 2) in triangles (T, 3, 2).
 
-    Border texels are moved onto the triangle, a little inside its edge: exactly on it, a ray would
-    start on whatever touches the object there.
+    Every texel is moved to _INSET texels inside its triangle's edges: packers like to put a chart's
+    corners onto texel centres, and exactly on an edge a ray would start on, or behind, whatever
+    touches the object there.
     """
     a = (corners[:, 1] - corners[:, 0]).astype(np.float64)
     b = (corners[:, 2] - corners[:, 0]).astype(np.float64)
@@ -200,10 +203,13 @@ def _barycentric(corners: Float, points: npt.NDArray[np.floating], interior: Boo
     det = np.where(np.abs(det) < 1e-12, 1e-12, det)
     u = (p[:, 0] * b[:, 1] - p[:, 1] * b[:, 0]) / det
     v = (a[:, 0] * p[:, 1] - a[:, 1] * p[:, 0]) / det
-    weights = np.stack([1 - u - v, u, v], axis=-1)
-    clamped = np.clip(weights, 0.02, None)
-    clamped /= clamped.sum(axis=-1, keepdims=True)
-    return np.where(interior[:, None], weights, clamped).astype(np.float32)
+    # A weight is the distance from the opposite edge, over the triangle's height above it.
+    edge = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
+    inset = np.minimum(_INSET * edge / np.abs(det)[:, None], 0.1)
+    weights = np.maximum(np.stack([1 - u - v, u, v], axis=-1), inset)
+    weights /= weights.sum(axis=-1, keepdims=True)
+    barycentric: Float = weights.astype(np.float32)
+    return barycentric
 
 
 def _surface_steps(corners: Float, corner_pixel: Float) -> tuple[Float, Float]:

@@ -32,6 +32,7 @@ def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
     texel_size is in metres: equal areas of surface get equal numbers of texels on all objects.
     Raises InputRefused when an atlas would be larger than 16,384 texels on a side.
     """
+    _refuse_huge(scene, texel_size)
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     result = run_child(
@@ -53,6 +54,20 @@ def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
                 f"{MAX_SIDE}). Choose a larger --texel-size than {texel_size:g} m. [texturing.size]"
             )
     return result["corner_uv"], result["resolution"]
+
+
+def _refuse_huge(scene: Scene, texel_size: float) -> None:
+    """Packing what cannot fit takes xatlas minutes; the area alone tells it at once."""
+    corners = scene.points[scene.triangles].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.bincount(scene.face_object, np.linalg.norm(cross, axis=1) / 2)
+    for obj, square_metres in zip(scene.objects, area, strict=True):
+        if square_metres / texel_size**2 > MAX_SIDE**2:
+            raise InputRefused(
+                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need more than {MAX_SIDE} x "
+                f"{MAX_SIDE} texels. Choose a larger --texel-size than {texel_size:g} m. "
+                "[texturing.size]"
+            )
 
 
 def unwrap_objects(

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.material.grid_fit import GridFit, fit_grid, mean_of
 from usdbrdf.material.lit_scene import LitScene, View, sub_pixel_points
-from usdbrdf.material.lobe_samples import lobe_basis
+from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.target_frames import SurfacePoints
 
@@ -29,6 +29,8 @@ _FOOTPRINT = 0.5
 # Relative error of a sample besides the frame's noise: poses, footprints, L_d as incident light.
 _MODEL_ERROR = 0.03
 MIN_OBSERVATIONS = 48
+# Noise in the lobe itself draws psi towards 0: wide lobes get more rays than a picture would need.
+_MIXTURE = Mixture(per_lobe=8, lights=24, cosine=16)
 
 
 def fit_views(
@@ -54,7 +56,10 @@ def fit_views(
     points = points.take(np.flatnonzero(np.repeat(several, 4)))
     observed = _take(observed, np.flatnonzero(several))
     group = np.unique(observed.texel, return_inverse=True)[1].astype(np.int64)
-    basis = lobe_basis(lit, points, len(group), seed)
+    # Views of a texel share their random numbers: what they have in common then cancels in their
+    # differences, which are all that is fitted.
+    stream = (4 * group[:, None] + np.arange(4)).ravel()
+    basis = lobe_basis(lit, points, len(group), seed, _MIXTURE, stream)
     level = np.bincount(group, observed.radiance.mean(axis=1)) / np.bincount(group)
     weight = 1 / ((_MODEL_ERROR * level[group]) ** 2 + observed.noise.astype(np.float64) ** 2)
     root = np.sqrt(weight)[:, None]

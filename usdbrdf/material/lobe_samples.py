@@ -25,6 +25,7 @@ from usdbrdf.shading.warps import patch_shifts, sobol_points
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
+Long = npt.NDArray[np.int64]
 
 LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
 
@@ -74,8 +75,12 @@ def trace_lobe_samples(
     mixture: Mixture,
     scene_size: float,
     seed: int,
+    stream: Long | None = None,
 ) -> LobeSamples:
-    """Trace the mixture at R surface points; all of ``points`` must lie on the surface."""
+    """Trace the mixture at R surface points; all of ``points`` must lie on the surface.
+
+    stream (R,): points of the same number share their random numbers; default: none do.
+    """
     if not len(lights.face):
         mixture = Mixture(
             per_lobe=mixture.per_lobe, lights=0, cosine=mixture.cosine + mixture.lights
@@ -84,6 +89,8 @@ def trace_lobe_samples(
     origin = lift_from_surface(points.position, points.normal, scene_size)
     sequence = sobol_points(int(np.ceil(np.log2(total))), 2)
     shift = patch_shifts(count, 3, seed)
+    if stream is not None:
+        shift = shift[stream]
     directions = np.zeros((count * total, 3), np.float32)
     chosen = np.full((count, total), -1, np.int32)
     counts = mixture.per_lobe, mixture.lights
@@ -108,12 +115,17 @@ def trace_lobe_samples(
 
 
 def lobe_basis(
-    lit: LitScene, points: SurfacePoints, num_groups: int, seed: int
+    lit: LitScene,
+    points: SurfacePoints,
+    num_groups: int,
+    seed: int,
+    mixture: Mixture = Mixture(),
+    stream: Long | None = None,
 ) -> Callable[[float], tuple[Float, Float]]:
     """phi -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3) each: the mean over
     equally many consecutive ``points`` per group. The rays are traced here, once."""
     samples = trace_lobe_samples(
-        lit.rays, points, lit.radiance, lit.lights, lit.environment, Mixture(), lit.size, seed
+        lit.rays, points, lit.radiance, lit.lights, lit.environment, mixture, lit.size, seed, stream
     )
 
     def mean(values: Float) -> Float:

@@ -115,9 +115,9 @@ def irradiance_at(
     done = np.zeros(count, np.int64)
     active = np.arange(count)
     floor = np.zeros(count) if dark is None else dark.astype(np.float64)
-    # No two patches are numbered alike and none has more than 64 points, so in the whole scene no
-    # two points share their random numbers.
-    identity = 64 * int(patch[0]) + active if count else active
+    # A point's number within its patch of at most 64: so no two points of the scene share their
+    # random numbers, and a point draws the same ones whatever tile it comes in.
+    identity = 64 * patch.astype(np.int64) + active - np.searchsorted(patch, patch)
     pairs = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     techniques = _Techniques(rays, radiance, lights, environment, sampling, pairs)
     if sampling.estimator == "cosine":
@@ -239,8 +239,8 @@ class _Techniques:
         draws what the whole would."""
         low, high = int(patch.min()), int(patch.max())
         seed = self.sampling.seed
-        shifts = [patch_shifts(1, 5, seed * 0x10000 + number) for number in range(low, high + 1)]
-        return self.points, np.concatenate(shifts), patch - low, seed, identity
+        shifts = patch_shifts(high - low + 1, 5, seed, low)
+        return self.points, shifts, patch - low, seed, identity
 
 
 def _block_of(sample: Long, first: int, last: int) -> Long:

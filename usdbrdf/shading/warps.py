@@ -22,11 +22,6 @@ def sobol_points(log2_count: int, dimensions: int) -> Double:
     return points
 
 
-def patch_shifts(num_patches: int, dimensions: int, seed: int) -> Double:
-    """One random shift per patch, (num_patches, dimensions): the same for any number of threads."""
-    return np.random.default_rng([seed, 0x5EED]).random((num_patches, dimensions))
-
-
 @kernel
 def hashed_uniform(seed: int, index: int, draw: int) -> float:
     """A uniform number in [0, 1) that depends on its arguments only (splitmix64 finaliser)."""
@@ -37,6 +32,18 @@ def hashed_uniform(seed: int, index: int, draw: int) -> float:
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     x = x ^ (x >> np.uint64(31))
     return float(x >> np.uint64(11)) * 2.0**-53
+
+
+@kernel
+def patch_shifts(num_patches: int, dimensions: int, seed: int, first: int = 0) -> Double:
+    """The random shifts of patches ``first`` and on, (num_patches, dimensions): a patch's shift
+    depends on its number and the seed only."""
+    shifts = np.zeros((num_patches, dimensions))
+    for i in range(num_patches):
+        for d in range(dimensions):
+            # Other draws than a point's own ones, whose numbers are counted from 0 as well.
+            shifts[i, d] = hashed_uniform(seed, first + i, 16 + d)
+    return shifts
 
 
 @kernel

@@ -1,9 +1,9 @@
 """What one frame says about each texel: visible, valid, and which radiance.
 
 The loop is over texels, not pixels. A texel takes a sample where it faces the camera, where the
-3 x 3 pixels around its projection all show its own object near its own tangent plane (so it is
-unoccluded, and away from depth edges and the image border), and where every pixel of its footprint
-lies between noise floor and saturation in every channel.
+pixels around its projection (3 x 3, or as many as its footprint covers) all show its own object
+near its own tangent plane (so it is unoccluded, and away from depth edges and the image border),
+and where every pixel of its footprint lies between noise floor and saturation in every channel.
 """
 
 from __future__ import annotations
@@ -151,16 +151,21 @@ def _sample(
         if depth < 0 or column < 1 or row < 1 or column > width - 2 or row > height - 2:
             continue
         pixel_size = depth / intrinsics[0]
-        if not _shows_surface(
-            row, column, p, n, texel_object[t], pixel_size, seen_object, seen_point
-        ):
-            continue
         ux, vx, _ = _project(p, sx, sy, 1.0, 0.0, intrinsics, camera_from_world)
         uy, vy, _ = _project(p, sx, sy, 0.0, 1.0, intrinsics, camera_from_world)
         span_x = np.sqrt((ux - u) ** 2 + (vx - v) ** 2)
         span_y = np.sqrt((uy - u) ** 2 + (vy - v) ** 2)
         taps_x = min(_MAX_TAPS, max(1, int(np.ceil(span_x))))
         taps_y = min(_MAX_TAPS, max(1, int(np.ceil(span_y))))
+        # How far from the centre bilinear reading of the footprint's taps reaches, in pixels.
+        off_x, off_y = 0.5 - 0.5 / taps_x, 0.5 - 0.5 / taps_y
+        wide = off_x * abs(ux - u) + off_y * abs(uy - u)
+        high = off_x * abs(vx - v) + off_y * abs(vy - v)
+        reach = max(1, int(np.ceil(max(wide, high) + 0.5)))
+        if not _shows_surface(
+            row, column, reach, p, n, texel_object[t], pixel_size, seen_object, seen_point
+        ):
+            continue
         total = np.zeros(3)
         num_valid = 0
         num_clipped = 0
@@ -185,6 +190,7 @@ def _sample(
 def _shows_surface(
     row: int,
     column: int,
+    reach: int,
     p: Float,
     n: Float,
     own: int,
@@ -192,9 +198,12 @@ def _shows_surface(
     seen_object: Int,
     seen_point: Float,
 ) -> bool:
-    """Do the 3 x 3 pixels around show object ``own`` within a pixel's size of its tangent plane?"""
-    for j in range(row - 1, row + 2):
-        for i in range(column - 1, column + 2):
+    """Do all pixels within ``reach`` show object ``own``, a pixel's size off its plane at most?"""
+    height, width = seen_object.shape
+    if row < reach or column < reach or row + reach >= height or column + reach >= width:
+        return False
+    for j in range(row - reach, row + reach + 1):
+        for i in range(column - reach, column + reach + 1):
             if seen_object[j, i] != own:
                 return False
             s = seen_point[j, i]

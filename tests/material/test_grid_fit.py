@@ -1,0 +1,176 @@
+"""The grid over roughness with specular in closed form, on made-up image models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from usdbrdf.material.grid_fit import GridFit, fit_grid, mean_of, multiple_of, nothing
+
+PIXELS = 300
+Residual = Literal["paper", "scaled"]
+
+
+def _scene(seed: int = 12345):
+    """diffuse (P, 3) and a basis whose shape over the pixels depends on phi."""
+    rng = np.random.default_rng(seed)
+    diffuse = rng.uniform(0.2, 0.8, (PIXELS, 3)).astype(np.float32)
+    place = rng.uniform(-1, 1, PIXELS)
+
+    def basis(phi: float) -> tuple[np.ndarray, np.ndarray]:
+        width = 0.1 + phi
+        lobe = np.exp(-((place / width) ** 2)) / width
+        light = (lobe[:, None] * [1.0, 0.9, 0.8]).astype(np.float32)
+        return np.float32(0.1) * light, light
+
+    return diffuse, basis
+
+
+def _fit(
+    observed: np.ndarray,
+    diffuse: np.ndarray,
+    basis: Callable,
+    residual: Residual,
+    weight: np.ndarray | None = None,
+) -> GridFit:
+    if weight is None:
+        weight = np.ones((len(diffuse), 1), np.float32)
+    if residual == "paper":
+        return fit_grid((observed - diffuse).astype(np.float32), weight, basis, nothing)
+    without = multiple_of(diffuse * np.sqrt(weight.astype(float)))
+    return fit_grid(observed.astype(np.float32), weight, basis, without)
+
+
+def _render(diffuse, basis, phi: float, psi: float):
+    base, slope = basis(phi)
+    return diffuse + base + psi * slope
+
+
+@pytest.mark.parametrize("residual", ["paper", "scaled"])
+@pytest.mark.parametrize(("phi", "psi"), [(0.0, 0.4), (0.3, 0.25), (0.64, 0.9), (1.0, 0.5)])
+def test_what_lies_on_the_grid_is_found_exactly(residual: Residual, phi: float, psi: float):
+    # Level 2 has steps of 0.02 in the interior, of 0.01 at the ends.
+    diffuse, basis = _scene()
+    found = _fit(_render(diffuse, basis, phi, psi), diffuse, basis, residual)
+    assert (found.phi, found.psi) == (pytest.approx(phi, abs=1e-6), pytest.approx(psi, abs=1e-4))
+    assert found.cost < 1e-10
+    assert found.evidence > 0.999
+
+
+def test_what_lies_between_is_found_to_half_a_step():
+    diffuse, basis = _scene()
+    found = _fit(_render(diffuse, basis, 0.431, 0.6), diffuse, basis, "paper")
+    assert found.phi == pytest.approx(0.431, abs=0.0101)
+    assert found.psi == pytest.approx(0.6, abs=0.05)
+
+
+def test_a_wrong_level_of_the_diffuse_image_bends_paper_but_not_scaled():
+    diffuse, basis = _scene()
+    observed = _render(diffuse, basis, 0.3, 0.25)
+    scale = np.array([0.9, 0.8, 0.95], np.float32)
+    scaled = _fit(observed, diffuse * scale, basis, "scaled")
+    assert (scaled.phi, scaled.psi) == (pytest.approx(0.3, abs=1e-6), pytest.approx(0.25, abs=1e-4))
+    paper = _fit(observed, diffuse * scale, basis, "paper")
+    assert abs(paper.psi - 0.25) > 0.02 or abs(paper.phi - 0.3) > 0.05
+
+
+@pytest.mark.parametrize(("true", "clamped"), [(1.7, 1.0), (-0.5, 0.0)])
+def test_specular_stays_in_its_range(true: float, clamped: float):
+    diffuse, basis = _scene()
+    found = _fit(_render(diffuse, basis, 0.3, true), diffuse, basis, "paper")
+    assert found.psi == clamped
+    # The cost is that of the clamped value, not of the unconstrained minimum.
+    base, slope = basis(found.phi)
+    rest = _render(diffuse, basis, 0.3, true) - diffuse - base - clamped * slope
+    assert found.cost == pytest.approx((rest.astype(float) ** 2).mean(), rel=1e-4)
+    assert found.cost > 1e-4
+
+
+def test_weights_choose_which_pixels_count():
+    diffuse, basis = _scene()
+    observed = _render(diffuse, basis, 0.3, 0.25)
+    observed[:100] += 3  # outliers
+    weight = np.ones((PIXELS, 1), np.float32)
+    weight[:100] = 0
+    for residual in ("paper", "scaled"):
+        found = _fit(observed, diffuse, basis, residual, weight)
+        assert found.phi == pytest.approx(0.3, abs=1e-6)
+        assert found.psi == pytest.approx(0.25, abs=1e-4)
+    assert _fit(observed, diffuse, basis, "paper").psi != pytest.approx(0.25, abs=0.05)
+
+
+def test_evidence_is_the_share_of_the_residual_that_the_lobe_explains():
+    # Observed = diffuse + lobe + noise with a known power: evidence = 1 - noise / (noise + lobe).
+    diffuse, basis = _scene()
+    base, slope = basis(0.3)
+    lobe = base + 0.5 * slope
+    noise = np.random.default_rng(1).standard_normal(lobe.shape)
+    noise *= np.sqrt((lobe**2).mean() / (noise**2).mean())
+    found = _fit(diffuse + lobe + noise, diffuse, basis, "paper")
+    assert found.evidence == pytest.approx(0.5, abs=0.05)
+    # Nothing to explain, nothing explained.
+    nothing = _fit(diffuse.copy(), diffuse, lambda phi: (0 * base, 0 * slope), "paper")
+    assert nothing.evidence == 0
+    assert nothing.psi == 0
+
+
+def test_a_free_level_per_group_needs_no_diffuse_image():
+    # 50 texels with six views each; every texel has a diffuse radiance of its own, unknown, and
+    # samples of different weight. Only the change between a texel's views is left to explain.
+    _, basis = _scene()
+    group = np.arange(PIXELS, dtype=np.int64) // 6
+    texture = np.random.default_rng(5).lognormal(0, 1, (50, 3))
+    observed = _render(texture[group], basis, 0.3, 0.25)
+    weight = np.random.default_rng(6).uniform(0.1, 3, (PIXELS, 1))
+    found = fit_grid(observed.astype(np.float32), weight, basis, mean_of(group, np.sqrt(weight)))
+    assert (found.phi, found.psi) == (pytest.approx(0.3, abs=1e-6), pytest.approx(0.25, abs=1e-3))
+    assert found.evidence > 0.999
+
+
+@pytest.mark.parametrize("kind", ["multiple", "mean"])
+def test_what_is_projected_out_is_gone_and_stays_gone(kind: str):
+    rng = np.random.default_rng(12345)
+    values = rng.standard_normal((PIXELS, 3))
+    root = rng.uniform(0.5, 2, (PIXELS, 1))
+    group = rng.integers(0, 40, PIXELS).astype(np.int64)
+    if kind == "multiple":
+        diffuse = rng.uniform(0.2, 0.8, (PIXELS, 3)) * root
+        project, removed = multiple_of(diffuse), diffuse * [3, -1, 0.5]
+    else:
+        project, removed = mean_of(group, root), root * rng.standard_normal((40, 3))[group]
+    np.testing.assert_allclose(project(removed), 0, atol=1e-12)
+    np.testing.assert_allclose(project(values + removed), project(values), atol=1e-12)
+    np.testing.assert_allclose(project(project(values)), project(values), atol=1e-12)
+    # Orthogonal: nothing is lost but that.
+    assert (project(values) * removed).sum() == pytest.approx(0, abs=1e-9)
+
+
+def test_a_flat_cost_gives_the_middle_of_what_fits():
+    # No lobe at all: every roughness fits alike.
+    diffuse, basis = _scene()
+    noise = 0.01 * np.random.default_rng(1).standard_normal(diffuse.shape)
+    found = _fit(diffuse + noise, diffuse, lambda phi: tuple(0 * b for b in basis(phi)), "paper")
+    assert (found.phi_low, found.phi_high) == (0, 1)
+    assert found.phi == pytest.approx(0.5, abs=0.06)
+    sharp = _fit(_render(diffuse, basis, 0.3, 0.5) + noise, diffuse, basis, "paper")
+    assert sharp.phi_low >= 0.26
+    assert sharp.phi_high <= 0.34
+
+
+def test_two_levels_ask_for_at_most_twenty_two_roughnesses():
+    diffuse, basis = _scene()
+    asked: list[float] = []
+
+    def counting(phi: float):
+        asked.append(phi)
+        return basis(phi)
+
+    _fit(_render(diffuse, basis, 0.43, 0.6), diffuse, counting, "paper")
+    assert len(asked) <= 22
+    assert len(set(asked)) == len(asked)
+    assert set(np.round(np.linspace(0, 1, 11), 12)) <= {round(phi, 12) for phi in asked}
+    assert min(asked) >= 0
+    assert max(asked) <= 1

@@ -1,0 +1,113 @@
+"""What shines by itself, and what only reflects a lot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, quad, room, world_of
+from usdbrdf.shading.emitters import find_emitters
+
+LAMP = 6
+ALBEDO = 0.5
+SHADING = 2.0
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """A room of six walls and a lamp."""
+    lamp = quad((1.5, 1, 2.4), (0, 1, 0), (1, 0, 0), size=(16, 16))
+    return world_of([*room((0, 0, 0), (4, 3, 2.5), size=(16, 16)), lamp])
+
+
+@pytest.fixture
+def lit(world: World) -> np.ndarray:
+    """L_d = rho S / pi everywhere but on the lamp, which shines with 8, 7, 6."""
+    wall = (ALBEDO * SHADING / np.pi,) * 3
+    return world.per_object([wall] * 6 + [(8, 7, 6)])
+
+
+def _find(world: World, lit: np.ndarray, seen=None, clipped=None):
+    shading = np.full_like(lit, SHADING)
+    everywhere = np.ones(len(lit), bool)
+    return find_emitters(
+        world.texels,
+        lit,
+        shading,
+        everywhere if seen is None else seen,
+        ~everywhere if clipped is None else clipped,
+    )
+
+
+def test_the_lamp_is_found_and_nothing_else(world: World, lit: np.ndarray):
+    found = _find(world, lit)
+    np.testing.assert_array_equal(found.is_lamp, [False] * 6 + [True])
+    np.testing.assert_array_equal(found.emissive, world.texels.object_index() == LAMP)
+    np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
+    np.testing.assert_array_equal(found.radiance[:LAMP], 0)
+    assert not found.lower_bound.any()
+
+
+def test_a_glossy_surface_somewhat_over_one_is_no_emitter(world: World, lit: np.ndarray):
+    # pi L_d / S = 1.1: ambient specular light kept in L_d on a whole wall.
+    lit[world.texels.object_index() == 2] = 1.1 * SHADING / np.pi
+    found = _find(world, lit)
+    assert not found.is_lamp[2]
+    assert not found.emissive[world.texels.object_index() == 2].any()
+    # One at 1.5 is none that a reflector could reach.
+    lit[world.texels.object_index() == 2] = 1.5 * SHADING / np.pi
+    assert _find(world, lit).is_lamp[2]
+
+
+def test_single_noisy_texels_are_no_lamps(world: World, lit: np.ndarray):
+    wall = np.flatnonzero(world.texels.object_index() == 0)
+    # Isolated in the atlas: every fourth texel of every fourth row.
+    local = wall.reshape(16, 16)[::4, ::4].ravel()
+    lit[local] = 50
+    assert not _find(world, lit).emissive[wall].any()
+    # 5 x 5 that hang together: a spot in the ceiling.
+    patch = wall.reshape(16, 16)[4:9, 4:9].ravel()
+    lit[patch] = 50
+    found = _find(world, lit)
+    np.testing.assert_array_equal(np.flatnonzero(found.emissive[wall]), np.sort(patch - wall[0]))
+    assert not found.is_lamp[0]
+    np.testing.assert_allclose(found.radiance[0], 50, rtol=1e-5)
+
+
+def test_dark_corners_are_no_lamps(world: World, lit: np.ndarray):
+    # Where S is nearly 0 any L_d exceeds it; but it is dark.
+    own = world.texels.object_index() == 3
+    lit[own] = 1e-3
+    shading = np.full_like(lit, SHADING)
+    shading[own] = 1e-6
+    everywhere = np.ones(len(lit), bool)
+    found = find_emitters(world.texels, lit, shading, everywhere, ~everywhere)
+    assert not found.emissive[own].any()
+
+
+def test_a_clipped_lamp_is_a_lower_bound(world: World, lit: np.ndarray):
+    own = world.texels.object_index() == LAMP
+    found = _find(world, lit, seen=~own, clipped=own)
+    assert found.is_lamp[LAMP]
+    np.testing.assert_array_equal(found.lower_bound, [False] * 6 + [True])
+    np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
+    # A twentieth of it is not worth a warning.
+    few = own & (np.cumsum(own) <= 12)
+    assert not _find(world, lit, seen=~few, clipped=few).lower_bound.any()
+
+
+def test_the_unseen_back_of_a_lamp_shines_with_it(world: World, lit: np.ndarray):
+    own = world.texels.object_index() == LAMP
+    half = own & (np.cumsum(own) <= 128)
+    lit[own & ~half] = 0
+    found = _find(world, lit, seen=~(own & ~half))
+    assert found.emissive[own].all()
+    # Its radiance is that of what was seen.
+    np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
+
+
+def test_an_object_that_nobody_saw_is_no_lamp(world: World, lit: np.ndarray):
+    own = world.texels.object_index() == LAMP
+    found = _find(world, lit, seen=~own)
+    assert not found.is_lamp[LAMP]
+    assert not found.emissive.any()
