@@ -85,7 +85,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         ("--meters-per-unit M", "metres", "default: as the format says"),
         ("--texel-size M", "metres", "default: the frames' median pixel footprint"),
         ("--quantile P", "quantile", "(default: 0.5)"),
-        ("--max-texels N", "texels", "(default: 4000000)"),
+        ("--max-texels N", "texels", "(default: 1000000)"),
         ("--standard-error E", "relative", "(default: 0.03)"),
         ("--rays N", "rays per texel", "default: 2048"),
         ("--environment HDR", "latitude-longitude", "default: black"),

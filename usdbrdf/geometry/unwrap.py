@@ -62,10 +62,11 @@ def _refuse_huge(scene: Scene, texel_size: float) -> None:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.bincount(scene.face_object, np.linalg.norm(cross, axis=1) / 2)
     for obj, square_metres in zip(scene.objects, area, strict=True):
-        if square_metres / texel_size**2 > MAX_SIDE**2:
+        side = int(np.ceil(np.sqrt(square_metres) / texel_size))
+        if side > MAX_SIDE:
             raise InputRefused(
-                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need more than {MAX_SIDE} x "
-                f"{MAX_SIDE} texels. Choose a larger --texel-size than {texel_size:g} m. "
+                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need {side} x {side} texels "
+                f"(limit {MAX_SIDE}). Choose a larger --texel-size than {texel_size:g} m. "
                 "[texturing.size]"
             )
 
