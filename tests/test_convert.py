@@ -17,6 +17,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 import usdbrdf
 from tests.scenes import MadeCapture, edited, look_at, make_capture, ring_of_poses, write_ply
 from usdbrdf.cli import main
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
@@ -24,7 +25,16 @@ from usdbrdf.job.progress import set_quiet
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.frames_from_stage import frames_from_stage
 from usdbrdf.stage.looks import VARIANT_SET
-from usdbrdf.stage.read import open_edited, open_measured, read_aovs, read_fit, read_shading
+from usdbrdf.stage.read import (
+    open_edited,
+    open_measured,
+    open_weaker,
+    read_aovs,
+    read_fit,
+    read_shading,
+    scene_from_stage,
+)
+from usdbrdf.steps.step import hash_of_files
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),
@@ -452,3 +462,83 @@ def test_files_in_allowed_folders_are_inputs_too(tmp_path):
         write_ply(mesh, made.points * np.float32(1.001), made.triangles, made.face_object)
         again = usdbrdf.ingest(made.folder, asset, options)
     assert again.reason == "inputs changed: outside-0"
+
+
+# Inputs that are moved or changed
+
+
+@pytest.fixture
+def moving(tmp_path):
+    """A capture and an asset that has all it needs to be textured."""
+    made = make_capture(tmp_path / "scan", subdivisions=1)
+    with usdbrdf.working_on(tmp_path / "made/room") as asset:
+        usdbrdf.ingest(made.folder, asset, OPTIONS.ingest)
+    return made.folder, asset.folder
+
+
+@pytest.mark.parametrize("moved", ["capture", "asset"])
+def test_what_was_moved_is_found_again(tmp_path, moving, moved):
+    capture, folder = moving
+    (tmp_path / "far/away").mkdir(parents=True)
+    if moved == "capture":
+        capture = capture.rename(tmp_path / "far/away/scan")
+    else:
+        folder = folder.rename(tmp_path / "far/away/room")
+    with usdbrdf.working_on(folder) as asset:
+        with pytest.raises(InputRefused, match=r"0000\.exr: .+missing.+convert.+capture again"):
+            usdbrdf.texture(asset, OPTIONS.texture)
+        assert usdbrdf.ingest(capture, asset, OPTIONS.ingest).reran
+        assert usdbrdf.texture(asset, OPTIONS.texture).reran
+        assert not usdbrdf.ingest(capture, asset, OPTIONS.ingest).reran
+
+
+def test_what_moves_together_stays_done(tmp_path, moving):
+    (tmp_path / "elsewhere").mkdir()
+    capture, folder = (path.relative_to(tmp_path) for path in moving)
+    for top in ("scan", "made"):
+        (tmp_path / top).rename(tmp_path / "elsewhere" / top)
+    with usdbrdf.working_on(tmp_path / "elsewhere" / folder) as asset:
+        assert not usdbrdf.ingest(tmp_path / "elsewhere" / capture, asset, OPTIONS.ingest).reran
+
+
+def test_frames_that_changed_places_are_other_inputs(tmp_path):
+    files = [tmp_path / camera / "0001.exr" for camera in ("cam0", "cam1")]
+    for i, file in enumerate(files):
+        file.parent.mkdir()
+        file.write_bytes(bytes([i]))
+    before = hash_of_files(files)
+    assert hash_of_files(files) == before
+    assert hash_of_files(reversed(files)) != before
+
+
+def test_a_changed_usd_stage_is_textured_again(tmp_path):
+    made = make_capture(tmp_path / "scan", subdivisions=1)
+    (tmp_path / "geometry").mkdir()
+    top, below = tmp_path / "geometry/top.usda", tmp_path / "geometry/below.usda"
+    as_usd(made, below)
+    layer = Sdf.Layer.CreateNew(str(top))
+    layer.subLayerPaths = ["./below.usda"]
+    layer.defaultPrim = "haus"
+    layer.Save()
+    with usdbrdf.working_on(tmp_path / "room") as asset:
+        usdbrdf.ingest(made.folder, asset, usdbrdf.IngestOptions(mesh=top))
+        assert usdbrdf.texture(asset, OPTIONS.texture).reran
+        assert not usdbrdf.texture(asset, OPTIONS.texture).reran
+        below.write_text(below.read_text() + "# changed\n")
+        again = usdbrdf.texture(asset, OPTIONS.texture)
+    assert again.reason == "inputs changed: geometry"
+
+
+def test_the_crease_angle_holds_for_a_usd_stage_without_normals(tmp_path):
+    made = make_capture(tmp_path / "scan", subdivisions=1)
+    as_usd(made, tmp_path / "haus.usda")
+    normals = {}
+    with usdbrdf.working_on(tmp_path / "room") as asset:
+        for angle in (0.0, 180.0):
+            options = usdbrdf.IngestOptions(mesh=tmp_path / "haus.usda", crease_angle_deg=angle)
+            usdbrdf.ingest(made.folder, asset, options)
+            scene = scene_from_stage(open_weaker(asset, "texturing"))
+            box = next(item for item in scene.objects if item.label == "box")
+            normals[angle] = scene.corner_normals[box.faces]
+    assert (np.abs(normals[0.0]).max(axis=2) > 0.999).all()
+    assert (np.abs(normals[180.0]).max(axis=2) < 0.999).any()

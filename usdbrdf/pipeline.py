@@ -7,7 +7,7 @@ step, look, override in edits.usda, and go on.
     ingest   files        -> scan.usdc       geometry, one prim per object, cameras as captured
     texture  frames       -> texturing.usda  L_d, the lit diffuse radiance: median of what was seen
     shade    L_d          -> shading.usda    irradiance S by ray tracing, albedo = pi L_d / S
-    fit      target frame -> material.usda   roughness and specular of each object
+    fit      frames       -> material.usda   roughness and specular of each object
 """
 
 from __future__ import annotations

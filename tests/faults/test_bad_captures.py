@@ -177,8 +177,8 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.pose",
         ["9 of 12", "frames/0000.exr", "transform_matrix"],
     ),
-    "infinity in a pose": (
-        _text(lambda text: re.sub(r"(_matrix\":\s*\[\s*\[)[^,]*", r"\1 1e999", text, count=1)),
+    "infinity outside a pose": (
+        _text(lambda text: re.sub(r"(\"fl_x\":)[^,]*", r"\1 1e999", text, count=1)),
         "document.nonfinite",
         ["transforms.json:", "1e999"],
     ),
@@ -264,6 +264,11 @@ DROPPED: dict[str, tuple[Recipe, str, list[str]]] = {
         ["frames/0003.exr", "1 of 12"],
     ),
     "pose with null": (_frame(3, transform_matrix=[[None] * 4] * 4), "capture.pose", ["0003"]),
+    "infinity in a pose": (
+        _text(lambda text: re.sub(r"(_matrix\":\s*\[\s*\[)[^,]*", r"\1 1e999", text, count=1)),
+        "capture.pose",
+        ["frames/0000.exr", "1 of 12", "finite"],
+    ),
     "frame without file": (
         lambda c: c.image(5).unlink(),
         "capture.file",

@@ -99,3 +99,18 @@ def test_what_is_not_json_is_our_bug(tmp_path, value):
     with pytest.raises(UsdBrdfError, match=r"\[document\.write\]$"):
         write_json(tmp_path / "x", {"a": value})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_that_are_not_finite_where_the_caller_judges_them(tmp_path):
+    path = tmp_path / "document.json"
+    path.write_text('{"frames": [{"pose": [[NaN, 1e999, -Infinity]]}], "w": 1.0}')
+    found = read_json(path, nonfinite_below=("pose",))
+    assert not np.isfinite(found["frames"][0]["pose"]).any()
+    with pytest.raises(InputRefused, match=r"document\.nonfinite"):
+        read_json(path)
+    path.write_text('{"frames": [{"pose": [NaN]}],\n "w": NaN}')
+    with pytest.raises(InputRefused, match=r"document\.nonfinite"):
+        read_json(path, nonfinite_below=("pose",))
+    path.write_text('{"pose": [NaN, 99999999999999999999999]}')
+    with pytest.raises(InputRefused, match=r"document\.nonfinite"):
+        read_json(path, nonfinite_below=("pose",))

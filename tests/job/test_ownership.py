@@ -8,7 +8,12 @@ import os
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure, OwnershipConflict
-from usdbrdf.job.ownership import edited_files, prepare_asset_folder, require_disk_space
+from usdbrdf.job.ownership import (
+    edited_files,
+    make_parents,
+    prepare_asset_folder,
+    removed_if_unused,
+)
 
 
 def test_new_and_empty_folders_become_ours(tmp_path):
@@ -80,7 +85,18 @@ def test_edited_files_are_listed(tmp_path, toy):
     assert edited_files(asset) == ["layers/toy.usda", "textures/box1.lit.exr"]
 
 
-def test_disk_space(tmp_path):
-    require_disk_space(tmp_path, 1)
-    with pytest.raises(EnvironmentFailure, match=r"MiB are free.+\[environment.disk\]"):
-        require_disk_space(tmp_path, 1 << 60)
+def fail_in(asset):
+    new = make_parents(asset)
+    prepare_asset_folder(asset)
+    with pytest.raises(KeyError), removed_if_unused(new):
+        raise KeyError
+
+
+def test_what_was_not_there_before_a_failure_is_not_there_after_it(tmp_path):
+    (tmp_path / "empty").mkdir()
+    fail_in(tmp_path / "empty")
+    fail_in(tmp_path / "new/room")
+    assert [path.name for path in tmp_path.rglob("*")] == ["empty"]
+    prepare_asset_folder(tmp_path / "empty")
+    fail_in(tmp_path / "empty")
+    assert (tmp_path / "empty/.usdbrdf/job.json").is_file()

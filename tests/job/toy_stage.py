@@ -1,6 +1,6 @@
 """A stage with tiles, a running state, textures, layers and a once-only file; run as a script.
 
-python toy_stage.py ASSET [seed] [--force] [--fewer]
+python toy_stage.py ASSET [seed] [--fewer]
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def toy_work(run: StageRun, seed: int, textures: int) -> dict[str, object]:
     return {"total": total.tolist(), "textures": textures}
 
 
-def run_toy(asset: Path, seed: int = 1, *, textures: int = 3, force: bool = False) -> StageResult:
+def run_toy(asset: Path, seed: int = 1, *, textures: int = 3) -> StageResult:
     with folder_lock(prepare_asset_folder(asset)):
         return run_stage(
             asset,
@@ -52,14 +52,7 @@ def run_toy(asset: Path, seed: int = 1, *, textures: int = 3, force: bool = Fals
             parameters={"seed": seed, "textures": textures},
             inputs={"scan": "ab" * 32},
             work=lambda run: toy_work(run, seed, textures),
-            verify=lambda staged: read_all(staged),
-            force=force,
         )
-
-
-def read_all(staged: Path) -> None:
-    for path in staged.rglob("*.*"):
-        path.read_bytes()
 
 
 if __name__ == "__main__":
@@ -69,6 +62,5 @@ if __name__ == "__main__":
         Path(sys.argv[1]),
         *numbers,
         textures=2 if "--fewer" in options else 3,
-        force="--force" in options,
     )
     print(result.reran, result.reason)

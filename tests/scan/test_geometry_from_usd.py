@@ -35,7 +35,7 @@ def _stage(path, **metadata):
 def without_child(monkeypatch):
     """A new interpreter takes a second; what is read does not depend on where."""
 
-    def call(function, arrays, parameters, timeout_s, label):
+    def call(function, arrays, parameters, timeout_s, label, *, memory_limit_bytes):
         return foreign.read_in_child(arrays, parameters)
 
     monkeypatch.setattr(foreign, "run_child", call)

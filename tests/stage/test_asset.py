@@ -42,6 +42,5 @@ def test_the_places_of_the_files(tmp_path):
     assert asset.layer("scan") == layers / "scan.usdc"
     assert asset.layer("material") == layers / "material.usda"
     assert asset.uv_layer == layers / "texturing_uv.usdc"
-    assert asset.state_folder == tmp_path / "room" / ".usdbrdf"
     assert asset.texture("chair", "lit") == "textures/chair.lit.exr"
     assert path_in_asset(path_in_layer("textures/chair.lit.exr")) == "textures/chair.lit.exr"

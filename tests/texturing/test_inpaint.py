@@ -66,6 +66,23 @@ def test_a_scene_that_nobody_saw_is_black(pair: World):
     np.testing.assert_array_equal(filled, 0)
 
 
+@pytest.mark.parametrize("unit", [2.0**-40, 2.0**30])
+def test_the_fill_does_not_depend_on_the_unit(pair: World, unit: float):
+    rng = np.random.default_rng(12345)
+    values = rng.lognormal(0, 2, (len(pair.texels), 3)).astype(np.float32)
+    values[rng.random(len(values)) < 0.2] = 0
+    known = rng.random(len(values)) < 0.5
+    filled = inpaint(pair.texels, values, known)
+    other = inpaint(pair.texels, values * np.float32(unit), known)
+    np.testing.assert_allclose(other / np.float32(unit), filled, rtol=1e-4)
+
+
+def test_black_alone_fills_black(pair: World):
+    known = np.arange(len(pair.texels)) % 2 == 0
+    filled = inpaint(pair.texels, np.zeros((len(known), 3), np.float32), known)
+    np.testing.assert_array_equal(filled, 0)
+
+
 def test_the_same_facing_counts_for_nearness():
     # One object of two sheets 2 cm apart, back to back; only a stripe of each is seen. The hole in
     # the upper one is nearer to the lower one's stripe in space, but not in space and facing.

@@ -132,3 +132,18 @@ def test_the_texel_size_is_the_pixel_on_the_surface(room: Room):
     # 10^4 m^2 in at most 10^4 texels, of which an atlas uses 70 %: sqrt(1 / 0.7) m.
     limited = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels=10**4)
     assert limited == pytest.approx(np.sqrt(1 / 0.7), rel=0.05)
+
+
+@pytest.mark.parametrize("max_texels", [10**4, 20_011, 77_777, 10**6, 123_456])
+def test_rounding_the_texel_size_keeps_the_texels_below_the_limit(room: Room, max_texels: int):
+    floor = world_of([quad((-50, -50, 0), (100, 0, 0), (0, 100, 0))])
+    frames = replace(
+        room.frames,
+        image_paths=(Path("none"),),
+        world_from_camera=look_at(np.array([0, -1e-6, 2.0]), np.zeros(3))[None],
+        intrinsics=np.array([[800.0, 800, 40, 30]]),
+        resolution=np.array([[80, 60]], np.int32),
+    )
+    size = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels)
+    assert 0.8 * max_texels < 100**2 / size**2 / 0.7 <= max_texels
+    assert float(f"{size:.2g}") == size

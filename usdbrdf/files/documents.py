@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +28,27 @@ class _KeyTwice(ValueError):
     """An object names one key two times."""
 
 
-def read_json(path: Path, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
+def read_json(
+    path: Path,
+    *,
+    nonfinite_below: Collection[str] = (),
+    max_bytes: int = MAX_BYTES,
+    max_depth: int = MAX_DEPTH,
+) -> Any:
     """Parse a JSON document strictly; InputRefused names the file and, where known, the line.
 
     ``json`` alone would take NaN, turn 1e999 into infinity and keep the last of two equal keys.
+
+    nonfinite_below  keys whose values may hold NaN and infinities, for the caller to judge
     """
     text = _read_text(path, max_bytes)
     try:
-        document = json.loads(
-            text,
-            object_pairs_hook=_object_without_key_twice,
-            parse_constant=_finite,
-            parse_float=_finite,
-            parse_int=_integer,
-        )
+        try:
+            document = _parsed(text, _finite)
+        except _BadNumber:
+            document = _parsed(text, float)
+            if _any_nonfinite(document, nonfinite_below):
+                raise
     except _BadNumber as error:
         line = next(line for line, token in _tokens(text) if _is_bad_number(token))
         raise InputRefused(
@@ -99,6 +106,24 @@ def _read_text(path: Path, max_bytes: int) -> str:
         raise InputRefused(
             f"{path}: byte {error.start} is not UTF-8. Save the document as UTF-8. [document.json]"
         ) from error
+
+
+def _parsed(text: str, number: Callable[[str], float]) -> Any:
+    return json.loads(
+        text,
+        object_pairs_hook=_object_without_key_twice,
+        parse_constant=number,
+        parse_float=number,
+        parse_int=_integer,
+    )
+
+
+def _any_nonfinite(node: Any, exempt: Collection[str]) -> bool:
+    if isinstance(node, dict):
+        return any(_any_nonfinite(node[key], exempt) for key in node if key not in exempt)
+    if isinstance(node, list):
+        return any(_any_nonfinite(child, exempt) for child in node)
+    return isinstance(node, float) and not math.isfinite(node)
 
 
 def _object_without_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

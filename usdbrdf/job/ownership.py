@@ -16,7 +16,6 @@ from usdbrdf.job.stamp import known_hashes
 
 STATE_FOLDER = ".usdbrdf"
 JOB_SCHEMA = 1
-_DISK_MARGIN = 1.2  # estimates are estimates
 
 
 def prepare_asset_folder(asset: Path) -> Path:
@@ -42,8 +41,9 @@ def prepare_asset_folder(asset: Path) -> Path:
 
 def make_parents(asset: Path) -> list[Path]:
     """Make the folders above the output folder; returns those that were not there, deepest first,
-    beginning with the output folder itself (empty if that exists)."""
-    new = list(takewhile(lambda folder: not os.path.lexists(folder), (asset, *asset.parents)))
+    beginning with the output folder's ``.usdbrdf`` (empty if that exists)."""
+    all_folders = (asset / STATE_FOLDER, asset, *asset.parents)
+    new = list(takewhile(lambda folder: not os.path.lexists(folder), all_folders))
     with environment_failures(str(asset)):
         asset.parent.mkdir(parents=True, exist_ok=True)
     return new
@@ -56,7 +56,7 @@ def removed_if_unused(new: Sequence[Path]) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if new and [entry.name for entry in new[0].glob("*")] == [STATE_FOLDER]:
+        if new and [entry.name for entry in new[0].parent.iterdir()] == [STATE_FOLDER]:
             shutil.rmtree(new[0], ignore_errors=True)
             for parent in new[1:]:
                 with suppress(OSError):  # somebody else's by now
@@ -76,18 +76,6 @@ def edited_files(asset: Path) -> list[str]:
         if file.is_file() and sha256_of(file) not in hashes:
             edited.append(relative)
     return sorted(edited)
-
-
-def require_disk_space(folder: Path, needed_bytes: int) -> None:
-    """EnvironmentFailure unless 1.2 times ``needed_bytes`` are free where ``folder`` is."""
-    with environment_failures(str(folder)):
-        free = shutil.disk_usage(folder).free
-    wanted = int(_DISK_MARGIN * needed_bytes)
-    if free < wanted:
-        raise EnvironmentFailure(
-            f"{folder}: {free >> 20} MiB are free and about {wanted >> 20} MiB are needed. Free "
-            "some or name another folder. [environment.disk]"
-        )
 
 
 def _refuse_unwritable(asset: Path) -> None:

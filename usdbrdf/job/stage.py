@@ -121,8 +121,6 @@ def run_stage(
     parameters: Mapping[str, Any],
     inputs: Mapping[str, str],
     work: Callable[[StageRun], dict[str, Any]],
-    verify: Callable[[Path], None] | None = None,
-    force: bool = False,
 ) -> StageResult:
     """Bring one stage of an asset up to date.
 
@@ -130,9 +128,6 @@ def run_stage(
     parameters   all options that its outputs depend on (JSON)
     inputs       label -> SHA-256 of all that it reads
     work         writes to ``StageRun.output`` places and returns a summary (JSON)
-    verify       called with the folder of staged outputs, laid out as in the asset, before any of
-                 them is published; raises to refuse them
-    force        run again, without the checkpoints, even if it is done
 
     A run that was interrupted and resumed gives the same bytes as one that was not, provided that
     ``work`` depends on nothing but parameters, inputs and checkpoints.
@@ -143,32 +138,30 @@ def run_stage(
         reason = why_rerun(asset, order, wanted)
         journal = read_stamp(journal_path(asset, name))
         interrupted = journal is not None and journal.fingerprint == wanted.fingerprint
-        if reason is None and not force:
+        if reason is None:
             if interrupted:
                 journal_path(asset, name).unlink()
             shutil.rmtree(folder, ignore_errors=True)
             done = read_stamp(stamp_path(asset, order, name))
             return StageResult(summary=done.summary if done else {}, reran=False, reason="done")
-        _sweep(asset, name, keep=None if force else folder)
-        if journal and interrupted and not force and can_publish(asset, folder / "staged", journal):
+        _sweep(asset, name, keep=folder)
+        if journal and interrupted and can_publish(asset, folder / "staged", journal):
             publish_stage(asset, folder, journal, order)
             return StageResult(summary=journal.summary, reran=True, reason="publish interrupted")
         run = StageRun(asset, name, folder)
         summary = json.loads(json_text(work(run)))
-        finished = replace(wanted, summary=summary, **_staged(run, verify))
+        finished = replace(wanted, summary=summary, **_staged(run))
         finished = replace(finished, earlier=_earlier(asset, order, finished))
         fault_point(f"stage:{name}:before_publish")
         write_stamp(journal_path(asset, name), finished)
         publish_stage(asset, folder, finished, order)
-        return StageResult(summary=summary, reran=True, reason=reason or "forced")
+        return StageResult(summary=summary, reran=True, reason=reason)
 
 
-def _staged(run: StageRun, verify: Callable[[Path], None] | None) -> dict[str, Any]:
+def _staged(run: StageRun) -> dict[str, Any]:
     for relative in (*run.outputs, *run.once):
         if not (run.staged / relative).is_file():
             raise UsdBrdfError(f"stage {run.name} did not write {relative}. [stage.output]")
-    if verify is not None:
-        verify(run.staged)
     hashes = {relative: sha256_of(run.staged / relative) for relative in run.outputs}
     return {"outputs": hashes, "once": sorted(run.once)}
 
@@ -191,7 +184,7 @@ def _earlier(asset: Path, order: int, finished: Stamp) -> dict[str, list[str]]:
     return {relative: sorted(hashes) for relative, hashes in earlier.items()}
 
 
-def _sweep(asset: Path, name: str, keep: Path | None) -> None:
+def _sweep(asset: Path, name: str, keep: Path) -> None:
     """Delete this stage's work for other parameters, and what killed processes left half."""
     ours = re.compile(re.escape(name) + r"-[0-9a-f]{12}")
     state = asset / ".usdbrdf"

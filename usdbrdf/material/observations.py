@@ -29,8 +29,10 @@ _FOLLOWED = 3000
 _KEPT = 320
 _VIEWS = 12
 _MIN_VIEWS = 3
-# Bounds the table of followed texels times frames (12 bytes each).
+# Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
+# whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
 _MAX_CELLS = 12_000_000
+_FEWEST = 40
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
 _PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
@@ -65,17 +67,27 @@ class Follower:
     def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
         self._lit = lit
-        self._index = _texels_to_follow(texels, usable, frames, seed)
+        self._index, rows = _texels_to_follow(texels, usable, frames, seed)
         self._texels = texels.take(self._index)
         self._owner = texels.object_index()[self._index]
         # Offsets of the proxy's half vectors, the same for all texels so that views compare.
         self._jitter = _PROXY_ALPHA * (2 * patch_shifts(_PROXY_RAYS, 3, seed) - 1)
-        self._radiance: list[Float] = []
-        self._proxy: list[Float] = []
-        self._noise: list[float] = []
+        # Row of a frame in the tables; what was not seen there is zero.
+        self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
+        self._row = {int(frame): row for row, frame in enumerate(self._frame)}
+        self._added = 0
+        cells = (rows, len(self._index))
+        self._seen = np.zeros(cells, np.bool_)
+        self._radiance = np.zeros((*cells, 3), np.float32)
+        self._light = np.zeros(cells, np.float32)
+        self._noise = np.zeros(rows, np.float32)
 
     def add(self, view: View, clipped: Bool, noise_floor: float) -> None:
         """Sample the followed texels in the next frame."""
+        row = self._row.get(self._added)
+        self._added += 1
+        if row is None or not len(self._index):
+            return
         height, width = view.valid.shape
         surfaces = first_surfaces(
             self._lit.rays, self._lit.scene.face_object, view.world_from_camera, view.intrinsics,
@@ -85,38 +97,42 @@ class Follower:
             self._texels, self._owner, surfaces, view.radiance, view.valid, clipped,
             view.world_from_camera, view.intrinsics,
         )  # fmt: skip
-        radiance[kind != SAMPLE] = np.nan
-        proxy = np.full(len(kind), np.nan, np.float32)
         seen = np.flatnonzero(kind == SAMPLE)
-        proxy[seen] = self._mirrored_light(seen, view.world_from_camera[:3, 3])
-        self._radiance.append(radiance)
-        self._proxy.append(proxy)
-        self._noise.append(noise_floor)
+        self._seen[row, seen] = True
+        self._radiance[row, seen] = radiance[seen]
+        self._light[row, seen] = self._mirrored_light(seen, view.world_from_camera[:3, 3])
+        self._noise[row] = noise_floor
 
     def chosen(self, texels: Texels, seed: int) -> Observations:
         """The texels and views to fit, after the last frame."""
-        radiance, proxy = np.stack(self._radiance), np.stack(self._proxy)
-        known = np.isfinite(proxy)
-        light = np.where(known, proxy, 0)
-        views = known.sum(axis=0)
-        mean = light.sum(axis=0) / np.maximum(views, 1)
-        contrast = np.where(known, np.abs(proxy - mean), 0).max(axis=0)
-        level = np.where(known[..., None], radiance, 0).sum(axis=(0, 2)) / np.maximum(3 * views, 1)
-        score = np.where(views >= _MIN_VIEWS, contrast / (level + level.mean() + 1e-9), -1)
+        score = self._scores()
         pairs = []
         random = np.random.default_rng([seed, 1])
         for own in (texels.of_object(i) for i in range(len(texels.resolution))):
             low, high = np.searchsorted(self._index, [own.start, own.stop])
             for column in _informative(score[low:high], random) + low:
-                for frame in _views_of(known[:, column], light[:, column]):
-                    pairs.append((column, frame))
-        column, frame = np.array(pairs, np.int64).reshape(-1, 2).T
+                for row in _views_of(self._seen[:, column], self._light[:, column]):
+                    pairs.append((column, row))
+        column, row = np.array(pairs, np.int64).reshape(-1, 2).T
         return Observations(
             texel=self._index[column].astype(np.int32),
-            frame=frame.astype(np.int32),
-            radiance=radiance[frame, column],
-            noise=np.asarray(self._noise, np.float32)[frame],
+            frame=self._frame[row].astype(np.int32),
+            radiance=self._radiance[row, column],
+            noise=self._noise[row],
         )
+
+    def _scores(self) -> Double:
+        """How much the mirrored light changes between the views of each followed texel, over its
+        radiance; -1 where too few frames see it."""
+        if not len(self._index):
+            return np.zeros(0)
+        views = self._seen.sum(axis=0)
+        mean = self._light.sum(axis=0) / np.maximum(views, 1)
+        contrast = np.zeros(len(mean))
+        for seen, light in zip(self._seen, self._light, strict=True):
+            np.maximum(contrast, np.abs(light - mean), out=contrast, where=seen)
+        level = self._radiance.sum(axis=(0, 2)) / np.maximum(3 * views, 1)
+        return np.where(views >= _MIN_VIEWS, contrast / (level + level.mean() + 1e-9), -1)
 
     def _mirrored_light(self, which: npt.NDArray[np.int64], eye: Double) -> Float:
         """Mean L_d about the mirror direction, (len(which),): what a highlight would show."""
@@ -138,20 +154,30 @@ class Follower:
 
 def _texels_to_follow(
     texels: Texels, usable: Bool, frames: int, seed: int
-) -> npt.NDArray[np.int64]:
-    """Ascending indices of at most _FOLLOWED usable texels of each object, picked at random."""
+) -> tuple[npt.NDArray[np.int64], int]:
+    """Ascending indices of usable texels of each object, picked at random, and the number of frames
+    to follow them through."""
     random = np.random.default_rng([seed, 0])
-    objects = len(texels.resolution)
-    limit = min(_FOLLOWED, max(_KEPT, _MAX_CELLS // max(frames * objects, 1)))
-    picked = []
-    for own in (texels.of_object(i) for i in range(objects)):
-        candidates = own.start + np.flatnonzero(usable[own])
-        take = min(limit, len(candidates))
-        picked.append(np.sort(random.choice(candidates, take, replace=False)))
-    return np.concatenate(picked)
+    own = [texels.of_object(i) for i in range(len(texels.resolution))]
+    candidates = [part.start + np.flatnonzero(usable[part]) for part in own]
+    limit, rows = _table_size(frames, sum(len(some) > 0 for some in candidates))
+    picked = [
+        np.sort(random.choice(some, min(limit, len(some)), replace=False)) for some in candidates
+    ]
+    return np.concatenate([np.zeros(0, np.int64), *picked]), rows
 
 
-def _informative(score: Float, random: np.random.Generator) -> npt.NDArray[np.int64]:
+def _table_size(frames: int, objects: int) -> tuple[int, int]:
+    """(texels to follow per object, frames to follow them through): their product over all objects
+    is at most _MAX_CELLS, whatever is asked for."""
+    texels = min(_FOLLOWED, _MAX_CELLS // max(frames * objects, 1))
+    if texels >= _FEWEST:
+        return texels, frames
+    rows = min(frames, max(_MIN_VIEWS, _MAX_CELLS // (_FEWEST * objects)))
+    return min(_FEWEST, _MAX_CELLS // (rows * objects)), rows
+
+
+def _informative(score: Double, random: np.random.Generator) -> npt.NDArray[np.int64]:
     """Half of the kept texels from the best fifth by score, half from all that have a score."""
     good = np.flatnonzero(score >= 0)
     if len(good) <= _KEPT:

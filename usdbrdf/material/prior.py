@@ -6,7 +6,7 @@ psi 0.5 is an index of refraction of 1.5.
 
 from __future__ import annotations
 
-_NEUTRAL = (0.5, 0.5)
+NEUTRAL = (0.5, 0.5)
 _OF_WORD: dict[str, tuple[float, float]] = {
     # Matte paint and plaster.
     "ceiling": (0.8, 0.2), "wall": (0.6, 0.3), "column": (0.6, 0.3),
@@ -31,4 +31,4 @@ def class_prior(class_name: str, label: str) -> tuple[float, float]:
         for word in reversed(words):
             if word in _OF_WORD:
                 return _OF_WORD[word]
-    return _NEUTRAL
+    return NEUTRAL

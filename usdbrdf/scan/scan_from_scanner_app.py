@@ -75,7 +75,8 @@ def _records(folder: Path, options: IngestOptions, findings: Findings) -> list[F
         if not photograph.is_file():
             findings.count("poses_without_photograph", 1)
             continue
-        record = _record(read_json(document), document, photograph, findings)
+        pose = read_json(document, nonfinite_below=("cameraPoseARFrame",))
+        record = _record(pose, document, photograph, findings)
         if record is not None:
             records.append(record)
     if not records and not findings.dropped:
@@ -98,7 +99,7 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
         raise InputRefused(f"{path}: not a pose of this app. Export again. [capture.format]")
     pose = _numbers(document, "cameraPoseARFrame", 16)
     if pose is None:
-        findings.drop(name, "it has no cameraPoseARFrame of 16 numbers", "capture.pose")
+        findings.drop(name, "it has no cameraPoseARFrame of 16 finite numbers", "capture.pose")
         return None
     camera = _numbers(document, "intrinsics", 9)
     if camera is None or not (camera[0] > 0 and camera[4] > 0):
@@ -142,7 +143,7 @@ def _numbers(document: Mapping[str, Any], key: str, count: int) -> list[float] |
         return None
     if any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
         return None
-    return [float(v) for v in values]
+    return [float(v) for v in values] if np.isfinite(values).all() else None
 
 
 def _mesh(folder: Path, options: IngestOptions) -> Path:

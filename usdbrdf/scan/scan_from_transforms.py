@@ -109,7 +109,8 @@ class _Capture:
 
 
 def _document(source: Path) -> Mapping[str, Any]:
-    document = read_json(source)
+    # A camera that could not be placed costs its frame, not the capture.
+    document = read_json(source, nonfinite_below=("transform_matrix",))
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputRefused(
@@ -132,7 +133,7 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         return None
     pose = _pose(frame.get("transform_matrix"))
     if pose is None:
-        findings.drop(name, "it has no transform_matrix of 4 x 4 numbers", "capture.pose")
+        findings.drop(name, "it has no transform_matrix of 4 x 4 finite numbers", "capture.pose")
         return None
     width, height = capture.positive(frame, "w"), capture.positive(frame, "h")
     if width is None or height is None:

@@ -9,7 +9,8 @@ eq. 10). Two estimators:
             techniques for Monte Carlo rendering", 1995). Sobol points, shifted once per patch of
             8 x 8 texels: neighbouring texels trace nearly parallel rays, which Embree likes.
 
-Both are unbiased for the piecewise bilinear L_d that they are given.
+Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
+``mis``: points that happen to agree stop early. Tests bound this by 1e-3 of S.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Sampling:
     """
 
     estimator: Literal["mis", "cosine"] = "mis"
-    standard_error: float = 0.02
-    max_rays: int = 1024
+    standard_error: float = 0.03
+    max_rays: int = 2048
     seed: int = 0
 
 

@@ -50,10 +50,6 @@ class Asset:
         """Texture coordinates: too big for text, hence a binary sublayer of texturing.usda."""
         return self.folder / "layers" / "texturing_uv.usdc"
 
-    @property
-    def state_folder(self) -> Path:
-        return self.folder / ".usdbrdf"
-
     def layer(self, role: str) -> Path:
         """Path of a stage's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}

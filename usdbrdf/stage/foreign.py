@@ -20,6 +20,7 @@ from usdbrdf.stage.triangulate import Triangulation, triangulate
 
 # A stage of tens of millions of triangles opens in seconds; what takes longer hangs.
 _TIMEOUT_S = 600.0
+_MEMORY_BYTES = 64 << 30  # of addresses; a small crafted file may ask for any number of points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,7 @@ def meshes_from_usd(
         {"path": str(path.resolve()), "allow": [str(folder.resolve()) for folder in allow]},
         _TIMEOUT_S,
         f"{path}: reading USD",
+        memory_limit_bytes=_MEMORY_BYTES,
     )
     points, triangles = found["points"], found["triangles"]
     normals = found["corner_normals"]

@@ -21,6 +21,7 @@ _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
 _MAX_LAYERS = 1000
 _MAX_BYTES = 4 << 30
 _TIMEOUT_S = 600.0
+_MEMORY_BYTES = 64 << 30  # of addresses
 
 
 def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
@@ -32,6 +33,7 @@ def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
         {"path": str(path.resolve()), "allow": [str(folder.resolve()) for folder in allow]},
         _TIMEOUT_S,
         f"{path}: reading USD",
+        memory_limit_bytes=_MEMORY_BYTES,
     )
     return tuple(Path(layer) for layer in found["layers"].tolist())
 

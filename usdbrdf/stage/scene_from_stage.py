@@ -11,6 +11,7 @@ from pxr import Usd, UsdGeom
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.scene import Float, Int, Scene, SceneObject
+from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.triangulate import Triangulation, triangulate
 
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
@@ -24,10 +25,10 @@ class _Mesh:
     corner_uv: Float | None
 
 
-def scene_from_stage(stage: Usd.Stage, *, crease_angle_deg: float = 40.0) -> Scene:
+def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
 
-    crease_angle_deg  for meshes without normals of their own
+    Meshes without normals of their own get them by the crease angle that ingest was given.
     """
     prims = [prim for prim in stage.Traverse() if is_object(prim)]
     if not prims:
@@ -35,6 +36,7 @@ def scene_from_stage(stage: Usd.Stage, *, crease_angle_deg: float = 40.0) -> Sce
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
             "Run ingest again. [stage.objects]"
         )
+    crease_angle_deg = _crease_angle_deg(stage)
     meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
     num_faces = [len(mesh.triangles) for mesh in meshes]
     first_face = np.cumsum([0, *num_faces])
@@ -89,6 +91,15 @@ def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
         left_handed=mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded,
         holes=np.asarray(holes, np.int32) if holes else None,
     )
+
+
+def _crease_angle_deg(stage: Usd.Stage) -> float:
+    """As the scan's layer records it; the default of ingest where no layer does."""
+    for layer in stage.GetLayerStack():
+        parameters = layer.customLayerData.get("usdbrdf", {}).get("parameters", {})
+        if "crease_angle_deg" in parameters:
+            return float(parameters["crease_angle_deg"])
+    return IngestOptions().crease_angle_deg
 
 
 def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:

@@ -1,20 +1,28 @@
-"""What the later steps read back from the texturing step: scene, texels, and maps on them."""
+"""Maps on the texels: how a step writes them, and what later steps read back."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pxr import Usd
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.images import read_exr
+from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.scene import Scene, SceneObject
 from usdbrdf.geometry.texels import Texels, texels_from_atlas
+from usdbrdf.job.progress import say
+from usdbrdf.job.stage import StageRun
+from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import aov_path, scene_from_stage
+from usdbrdf.stage.records import Aov
 
 Float = npt.NDArray[np.float32]
+
+# Half floats end at 65504. A map that must lose nothing is stored as floats from here on.
+_HALF_UNTIL = 60_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,3 +77,42 @@ def _read_map(stage: Usd.Stage, obj: SceneObject, aov: str) -> Float:
             "again. [asset.incomplete]"
         )
     return read_exr(path)
+
+
+class TexelMap(NamedTuple):
+    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``; exact: stored as floats
+    rather than clamped."""
+
+    values: Float
+    scale: float
+    unit: str
+    exact: bool = False
+
+
+@dataclass
+class MapWriter:
+    """Writes the maps of a step, and counts the values that were too large for them."""
+
+    run: StageRun
+    asset: Asset
+    texels: Texels
+    clamped: int = 0
+
+    def write(self, index: int, obj: SceneObject, maps: dict[str, TexelMap]) -> tuple[Aov, ...]:
+        """One object's pictures."""
+        aovs = []
+        for name, chosen in maps.items():
+            file = self.asset.texture(obj.identifier, name)
+            picture = self.texels.image(index, chosen.values)
+            half = not (chosen.exact and float(np.abs(picture).max()) > _HALF_UNTIL)
+            self.clamped += write_exr(self.run.output(file), picture, half=half)
+            aovs.append(Aov(name=name, file=file, scale=chosen.scale, unit=chosen.unit))
+        return tuple(aovs)
+
+    def warn(self) -> None:
+        """Say once what was lost, if anything."""
+        if self.clamped:
+            say(
+                f"warning: {self.clamped:,} values of the maps exceed 65504 and were clamped. The "
+                "unit of the radiance may be wrong. [image.clamped]"
+            )

@@ -21,7 +21,7 @@ from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import fit_views
 from usdbrdf.material.lit_scene import LitScene, View
 from usdbrdf.material.observations import Follower, Observations
-from usdbrdf.material.prior import class_prior
+from usdbrdf.material.prior import NEUTRAL, class_prior
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
 from usdbrdf.scan.frame_reading import read_frame
 from usdbrdf.scan.scan import Frames
@@ -43,6 +43,8 @@ Bool = npt.NDArray[np.bool_]
 # Below this evidence the frames do not tell one material from another (on captures with known
 # materials no such fit could be trusted), and the class prior is written instead.
 MIN_EVIDENCE = 0.1
+# And roughnesses that far apart must not fit alike.
+MAX_PHI_RANGE = 0.4
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
@@ -106,21 +108,20 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
             step.provenance,
             objects,
         )
-        return {
-            "objects": {
-                item.identifier: {
-                    "phi": round(item.phi, 4),
-                    "psi": round(item.psi, 4),
-                    "status": item.status,
-                    "evidence": round(item.evidence, 4) if math.isfinite(item.evidence) else 0.0,
-                    "target_frame": item.target_frame,
-                    "highlight_pixels": int(survey.mirrored[i]),
-                }
-                for i, item in enumerate(objects)
-            }
-        }
+        return {"objects": {item.identifier: _said(item) for item in objects}}
 
     return step.run(work)
+
+
+def _said(item: FittedObject) -> dict[str, Any]:
+    """What the summary says of an object."""
+    return {
+        "phi": round(item.phi, 4),
+        "psi": round(item.psi, 4),
+        "status": item.status,
+        "evidence": round(item.evidence, 4) if math.isfinite(item.evidence) else 0.0,
+        "target_frame": item.target_frame,
+    }
 
 
 def _lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
@@ -200,8 +201,8 @@ def _fit_arrays(
     index: int,
     options: FitOptions,
 ) -> dict[str, npt.NDArray[Any]]:
-    """phi, psi, cost, evidence (NaN where the object could not be fitted), the number of samples,
-    and the target frame (-1 where many frames were used)."""
+    """phi, psi, cost, evidence, lowest and highest phi that fit as well (NaN where the object could
+    not be fitted), the number of samples, and the target frame (-1: many frames)."""
     found, used, target = None, 0, -1
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
@@ -215,9 +216,10 @@ def _fit_arrays(
         view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
         residual: Residual = "paper" if options.method == "paper" else "scaled"
         found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
-    numbers = np.full(4, np.nan)
+    numbers = np.full(6, np.nan)
     if found is not None:
-        numbers[:] = found.phi, found.psi, found.cost, found.evidence
+        numbers[:4] = found.phi, found.psi, found.cost, found.evidence
+        numbers[4:] = found.phi_low, found.phi_high
     return {"numbers": numbers, "used": np.array(used), "target": np.array(target)}
 
 
@@ -236,16 +238,16 @@ def _record(
     seen: bool,
 ) -> FittedObject:
     obj = lit.scene.objects[index]
-    phi, psi, cost, evidence = (float(number) for number in found["numbers"])
+    phi, psi, cost, evidence, low, high = (float(number) for number in found["numbers"])
     fitted = math.isfinite(phi)
     target = int(found["target"])
-    if fitted and evidence >= MIN_EVIDENCE:
+    if fitted and evidence >= MIN_EVIDENCE and high - low <= MAX_PHI_RANGE:
         status = "measured"
     elif fitted and options.method == "paper":
         status = "failed"
     else:
         status = "prior" if seen else "unseen"
-        phi, psi = class_prior(obj.class_name, obj.label)
+        phi, psi = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
     return FittedObject(
         prim_path=obj.prim_path,
         identifier=obj.identifier,

@@ -13,6 +13,7 @@ from usdbrdf.scan.adapters import read_scan
 from usdbrdf.scan.geometry_from_usd import USD_SUFFIXES
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.capture_camera import relative_path
 from usdbrdf.stage.foreign_paths import layers_of_usd
 from usdbrdf.stage.header import StageHeader
 from usdbrdf.stage.root_layer import check_root, write_edits, write_pending_layer, write_root
@@ -41,7 +42,11 @@ def ingest(
         asset=asset,
         name="ingest",
         role="scan",
-        parameters={"adapter": adapter or "recognised", **parameters},
+        parameters={
+            "adapter": adapter or "recognised",
+            "places": _places(capture, options, asset),
+            **parameters,
+        },
         inputs=_inputs(capture, options, asset.folder),
     )
 
@@ -72,6 +77,19 @@ def ingest(
     return step.run(work)
 
 
+def _places(capture: Path, options: IngestOptions, asset: Asset) -> dict[str, str]:
+    """Where the inputs lie, seen from scan.usdc, which names photographs and USD geometry by such
+    paths: what is moved must be read anew."""
+    layers = asset.layer("scan").parent
+    places = {"capture": capture, "mesh": options.mesh}
+    places |= {f"outside-{i}": folder for i, folder in enumerate(options.allow_outside)}
+    return {
+        name: relative_path(place.resolve(), layers)
+        for name, place in places.items()
+        if place is not None
+    }
+
+
 def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str]:
     """Hashes of all that ingest may read: the capture's folder and those that its documents may
     point into, without the asset if that lies in one, and files named by options."""
@@ -95,4 +113,4 @@ def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str
 def _hash_of_folder(folder: Path, asset: Path) -> str:
     own = asset.resolve()
     files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
-    return hash_of_files(files, folder)
+    return hash_of_files(sorted(files), folder)

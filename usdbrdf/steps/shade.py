@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.errors import UsageError
-from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.geometry.texels import Texels
@@ -25,10 +24,11 @@ from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 from usdbrdf.shading.lights import lights_from_radiance
 from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import open_weaker
+from usdbrdf.stage.read import frames_from_stage, open_weaker
 from usdbrdf.stage.records import Aov, ShadedObject
 from usdbrdf.stage.shading_layer import write_shading_layer
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.steps.atlas import Atlas, MapWriter, TexelMap, atlas_from_stage
+from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
 from usdbrdf.steps.texture import CLIPPED, MEASURED
@@ -53,7 +53,7 @@ class ShadeOptions:
     """sampling; denoise "none" or "oidn" (lightmap filter, extra ``denoise``); environment, a
     latitude-longitude HDR picture for rays that leave the scene, None for black."""
 
-    sampling: Sampling = field(default_factory=lambda: Sampling(standard_error=0.03, max_rays=2048))
+    sampling: Sampling = field(default_factory=Sampling)
     denoise: Literal["none", "oidn"] = "none"
     environment: Path | None = None
 
@@ -85,20 +85,30 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
         lit = atlas.map("lit")
         coverage = atlas.map("coverage")[:, 0]
         environment = environment_from_file(options.environment, step.header.up_axis)
-        traced = _trace(run, atlas, lit, environment, options.sampling)
+        rays = RayScene(atlas.scene.points, atlas.scene.triangles)
+        traced = _trace(run, atlas, rays, lit, environment, options.sampling)
         irradiance = traced.mean
         if options.denoise == "oidn":
             irradiance = _denoised(atlas.texels, traced.mean)
-        return _write(run, step, atlas, lit, coverage, traced, irradiance)
+        shaded = _shaded(atlas, lit, coverage, traced, irradiance)
+        summary = _write(run, step, atlas, lit, shaded)
+        view = overview(atlas.scene, rays, frames_from_stage(stage))
+        view.write(run.output("previews/albedo.png"), atlas.texels, shaded.albedo, exposure=1)
+        view.write(run.output("previews/irradiance.png"), atlas.texels, irradiance)
+        return summary
 
     return step.run(work)
 
 
 def _trace(
-    run: StageRun, atlas: Atlas, lit: Float, environment: Environment, sampling: Sampling
+    run: StageRun,
+    atlas: Atlas,
+    rays: RayScene,
+    lit: Float,
+    environment: Environment,
+    sampling: Sampling,
 ) -> Irradiance:
     scene, texels = atlas.scene, atlas.texels
-    rays = RayScene(scene.points, scene.triangles)
     radiance = surface_texture(texels, scene.face_object, lit)
     lights = lights_from_radiance(scene, texels, lit)
     size = float(np.linalg.norm(np.ptp(scene.points, axis=0)))
@@ -148,59 +158,62 @@ def _denoised(texels: Texels, irradiance: Float) -> Float:
     )
 
 
-def _write(
-    run: StageRun,
-    step: Step,
-    atlas: Atlas,
-    lit: Float,
-    coverage: Float,
-    traced: Irradiance,
-    irradiance: Float,
-) -> dict[str, Any]:
-    texels, scene = atlas.texels, atlas.scene
+@dataclass(frozen=True, kw_only=True)
+class _Shaded:
+    """What is known of all texels: traced S and its (T,) relative error; S as it is used; the
+    emitters; albedo (T, 3) and the share of it that was over 1."""
+
+    traced: Irradiance
+    relative_error: Float
+    irradiance: Float
+    emitters: Emitters
+    albedo: Float
+    over_one: float
+
+
+def _shaded(
+    atlas: Atlas, lit: Float, coverage: Float, traced: Irradiance, irradiance: Float
+) -> _Shaded:
     seen, clipped = coverage == MEASURED, coverage == CLIPPED
-    emitters = find_emitters(texels, lit, irradiance, seen, clipped)
-    albedo, raw_over_one = _albedo(texels, lit, irradiance, seen, emitters)
+    emitters = find_emitters(atlas.texels, lit, irradiance, seen, clipped)
+    albedo, over_one = _albedo(atlas.texels, lit, irradiance, seen, emitters)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / np.maximum(
         traced.mean.mean(axis=1), 1e-12
     )
-    per_pi = 1 / np.pi
-    maps: dict[str, tuple[Float, float, str]] = {
-        "irradiance": (irradiance, per_pi, "W/m^2"),
-        "stderr": (traced.standard_error, per_pi, "W/m^2"),
-        "albedo": (albedo, 1.0, "1"),
+    return _Shaded(
+        traced=traced,
+        relative_error=relative,
+        irradiance=irradiance,
+        emitters=emitters,
+        albedo=albedo,
+        over_one=over_one,
+    )
+
+
+def _maps(shaded: _Shaded) -> dict[str, TexelMap]:
+    """The maps that every object has."""
+    traced = shaded.traced
+    maps = {
+        "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
+        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2"),
+        "albedo": TexelMap(shaded.albedo, 1.0, "1"),
     }
-    if irradiance is not traced.mean:
-        maps["irradiance_raw"] = (traced.mean, per_pi, "W/m^2")
+    if shaded.irradiance is not traced.mean:
+        maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
+    return maps
+
+
+def _write(run: StageRun, step: Step, atlas: Atlas, lit: Float, shaded: _Shaded) -> dict[str, Any]:
+    """Maps, layer and summary."""
+    traced, emissive = shaded.traced, shaded.emitters.emissive
+    writer = MapWriter(run, step.asset, atlas.texels)
+    maps = _maps(shaded)
+    emission = TexelMap(np.where(emissive[:, None], lit, 0), 1.0, "W/(m^2 sr)", exact=True)
     objects = []
-    for i, obj in enumerate(scene.objects):
-        own = texels.of_object(i)
-        emits = bool(emitters.emissive[own].any())
-        chosen = dict(maps)
-        if emits:
-            emission = np.where(emitters.emissive[:, None], lit, 0)
-            chosen["emission"] = (emission, 1.0, "W/(m^2 sr)")
-        aovs = []
-        for name, (values, scale, unit) in chosen.items():
-            file = step.asset.texture(obj.identifier, name)
-            write_exr(run.output(file), texels.image(i, values))
-            aovs.append(Aov(name=name, file=file, scale=scale, unit=unit))
-        area = np.maximum(texels.area[own], 1e-12)
-        objects.append(
-            ShadedObject(
-                prim_path=obj.prim_path,
-                identifier=obj.identifier,
-                aovs=tuple(aovs),
-                emitter=bool(emitters.is_lamp[i]),
-                radiance=_colour(emitters.radiance[i]),
-                radiance_is_lower_bound=bool(emitters.lower_bound[i]),
-                area_fraction=float(np.average(emitters.emissive[own], weights=area)),
-                mean_albedo=_colour(np.average(albedo[own], axis=0, weights=area)),
-                rays_per_texel=float(traced.rays[own].mean()),
-                standard_error=float(np.median(relative[own])),
-                escaped_fraction=float(np.average(traced.escaped[own], weights=area)),
-            )
-        )
+    for i, obj in enumerate(atlas.scene.objects):
+        emits = emissive[atlas.texels.of_object(i)].any()
+        aovs = writer.write(i, obj, {**maps, "emission": emission} if emits else maps)
+        objects.append(_record(atlas, shaded, i, aovs))
     write_shading_layer(
         run.output(f"layers/{step.asset.layer('shading').name}"),
         step.asset,
@@ -208,16 +221,34 @@ def _write(
         step.provenance,
         objects,
     )
-    _warn(scene.objects, emitters, traced, raw_over_one)
+    writer.warn()
+    _warn(atlas.scene.objects, shaded.emitters, traced, shaded.over_one)
     return {
         "rays_per_texel": float(traced.rays.mean()),
-        "standard_error": float(np.median(relative)),
+        "standard_error": float(np.median(shaded.relative_error)),
         "escaped_fraction": float(traced.escaped.mean()),
-        "emitters": [
-            obj.identifier for obj, e in zip(scene.objects, objects, strict=True) if e.emitter
-        ],
-        "albedo_over_one": raw_over_one,
+        "emitters": [item.identifier for item in objects if item.emitter],
+        "albedo_over_one": shaded.over_one,
     }
+
+
+def _record(atlas: Atlas, shaded: _Shaded, i: int, aovs: tuple[Aov, ...]) -> ShadedObject:
+    obj, own = atlas.scene.objects[i], atlas.texels.of_object(i)
+    emitters, traced = shaded.emitters, shaded.traced
+    area = np.maximum(atlas.texels.area[own], 1e-12)
+    return ShadedObject(
+        prim_path=obj.prim_path,
+        identifier=obj.identifier,
+        aovs=aovs,
+        emitter=bool(emitters.is_lamp[i]),
+        radiance=_colour(emitters.radiance[i]),
+        radiance_is_lower_bound=bool(emitters.lower_bound[i]),
+        area_fraction=float(np.average(emitters.emissive[own], weights=area)),
+        mean_albedo=_colour(np.average(shaded.albedo[own], axis=0, weights=area)),
+        rays_per_texel=float(traced.rays[own].mean()),
+        standard_error=float(np.median(shaded.relative_error[own])),
+        escaped_fraction=float(np.average(traced.escaped[own], weights=area)),
+    )
 
 
 def _albedo(

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pxr import Ar
+
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.job.stage import StageResult, StageRun, run_stage
 from usdbrdf.job.stamp import code_version
 from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.compose import open_weaker
 from usdbrdf.stage.header import Provenance, StageHeader, read_header
 
 
@@ -64,24 +67,45 @@ def weaker_layers(asset: Asset, role: str) -> dict[str, str]:
                 "Run `usdbrdf convert`, or the steps ingest, texture, shade, fit in this order. "
                 "[asset.incomplete]"
             )
-    return {file.name: sha256_of(file) for file in files}
+    hashes = {file.name: sha256_of(file) for file in files}
+    geometry = _foreign_layers(asset)
+    return {**hashes, "geometry": hash_of_files(geometry)} if geometry else hashes
 
 
 def hash_of_maps(asset: Asset, *aovs: str) -> str:
     """One SHA-256 over all objects' maps of these AOVs."""
     endings = tuple(f".{aov}.exr" for aov in aovs)
     folder = asset.folder / "textures"
-    return hash_of_files([file for file in folder.glob("*.exr") if file.name.endswith(endings)])
+    return hash_of_files(sorted(f for f in folder.glob("*.exr") if f.name.endswith(endings)))
 
 
 def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
     """One SHA-256 over names (relative to ``root``, if given) and contents of many files, wherever
-    they lie and in whatever order they come."""
+    they lie, in the order in which they come."""
     names = list(files)
+    for name in names:
+        if not name.is_file():
+            raise InputRefused(
+                f"{name}: this file, which was there at ingest, is missing. Run `usdbrdf convert` "
+                "with the capture again, from where it lies now. [input.missing]"
+            )
     with environment_failures("reading the inputs"), ThreadPoolExecutor() as pool:
         digests = list(pool.map(sha256_of, names))
     lines = [
         f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
         for name, digest in zip(names, digests, strict=True)
     ]
-    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _foreign_layers(asset: Asset) -> list[Path]:
+    """The files of the USD geometry that scan.usdc refers to, if that is where its meshes are."""
+    scan = asset.layer("scan").resolve()
+    stage = open_weaker(asset, "texturing")  # layers are valid only as long as it is held
+    # What lies in a package has the package's path, followed by its own in brackets.
+    files = {
+        Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
+        for layer in stage.GetUsedLayers()
+        if not layer.anonymous
+    }
+    return sorted(file for file in files if file.resolve() != scan)

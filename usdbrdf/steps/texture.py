@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.errors import UsageError
-from usdbrdf.files.images import write_exr
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels, texels_from_atlas
@@ -21,6 +20,8 @@ from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_weaker, scene_from_stage
 from usdbrdf.stage.records import Aov, TexturedObject
 from usdbrdf.stage.texturing_layer import write_texturing_layer
+from usdbrdf.steps.atlas import MapWriter, TexelMap
+from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.inpaint import inpaint
@@ -32,6 +33,8 @@ Bool = npt.NDArray[np.bool_]
 
 # In the coverage map.
 MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
+# A larger share of unmeasured texels is worth a warning.
+_MOSTLY = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +81,11 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         texels = texels_from_atlas(scene, charts["resolution"])
         say(f"texture: {len(texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames")
         observed = _observe(run, texels, scene, rays, frames, options.quantile)
-        return _write(run, step, scene, texels, observed, size, options.quantile)
+        found = _found(texels, observed, options.quantile)
+        summary = _write(run, step, scene, texels, found, size, options.quantile)
+        view = overview(scene, rays, frames)
+        view.write(run.output("previews/lit.png"), texels, found.maps["lit"].values)
+        return summary
 
     return step.run(work)
 
@@ -108,53 +115,69 @@ def _observe(
     return observed
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """measured, clipped (T,) bool: a photograph measured the texel; all that see it clipped."""
+
+    measured: Bool
+    clipped: Bool
+    maps: dict[str, TexelMap]
+
+
+def _found(texels: Texels, observed: Observation, quantile: float) -> _Found:
+    """The maps of all objects; refuses a capture that shows nothing of the mesh."""
+    measured = observed.quantiles.count > 0
+    clipped = ~measured & (observed.clipped > 0)
+    _check_seen(measured, clipped)
+    median = psquare.quantile(observed.quantiles, quantile)
+    lit = _with_lower_bounds(texels, median, measured, clipped, observed.lower_bound)
+    mean = inpaint(texels, observed.quantiles.mean, measured)
+    coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
+    spread = np.nan_to_num(psquare.spread(observed.quantiles, quantile))
+    samples = observed.quantiles.count.astype(np.float32)
+    maps = {
+        "lit": TexelMap(lit, 1.0, "W/(m^2 sr)", exact=True),
+        "mean": TexelMap(mean, 1.0, "W/(m^2 sr)"),
+        "spread": TexelMap(spread, 1.0, "W/(m^2 sr)"),
+        "samples": TexelMap(samples, 1 / 32, "1"),
+        "coverage": TexelMap(coverage, 1.0, "1"),
+    }
+    return _Found(measured=measured, clipped=clipped, maps=maps)
+
+
+def _check_seen(measured: Bool, clipped: Bool) -> None:
+    if not (measured | clipped).any():
+        raise InputRefused(
+            "no frame sees any surface from its front: the faces are wound away from the cameras, "
+            "or the poses are wrong. Turn the mesh's faces or correct the poses. "
+            "[texturing.unseen]"
+        )
+    unmeasured = 1 - float(measured.mean())
+    if unmeasured > _MOSTLY:
+        say(
+            f"warning: {100 * unmeasured:.1f} % of the texels were measured by no frame and are "
+            "filled in. Check the winding of the faces, the poses and the exposures. "
+            "[texturing.unseen]"
+        )
+
+
 def _write(
     run: StageRun,
     step: Step,
     scene: Scene,
     texels: Texels,
-    observed: Observation,
+    found: _Found,
     texel_size: float,
     quantile: float,
 ) -> dict[str, Any]:
-    assert scene.corner_uv is not None
-    measured = observed.quantiles.count > 0
-    clipped = ~measured & (observed.clipped > 0)
-    median = psquare.quantile(observed.quantiles, quantile)
-    lit = _with_lower_bounds(texels, median, measured, clipped, observed.lower_bound)
-    coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
-    spread = np.nan_to_num(psquare.spread(observed.quantiles, quantile))
-    maps: dict[str, tuple[Float, float, str]] = {
-        "lit": (lit, 1.0, "W/(m^2 sr)"),
-        "mean": (inpaint(texels, observed.quantiles.mean, measured), 1.0, "W/(m^2 sr)"),
-        "spread": (spread, 1.0, "W/(m^2 sr)"),
-        "samples": (observed.quantiles.count.astype(np.float32), 1 / 32, "1"),
-        "coverage": (coverage, 1.0, "1"),
-    }
+    """Maps, layers and summary."""
+    writer = MapWriter(run, step.asset, texels)
+    numbered = list(enumerate(scene.objects))
     objects = []
-    for i, obj in enumerate(
-        progress(scene.objects, total=len(scene.objects), label="texture: writing", unit="objects")
-    ):
-        aovs = []
-        for name, (values, scale, unit) in maps.items():
-            file = step.asset.texture(obj.identifier, name)
-            write_exr(run.output(file), texels.image(i, values))
-            aovs.append(Aov(name=name, file=file, scale=scale, unit=unit))
-        own = texels.of_object(i)
-        objects.append(
-            TexturedObject(
-                prim_path=obj.prim_path,
-                identifier=obj.identifier,
-                corner_uv=scene.corner_uv[obj.faces],
-                aovs=tuple(aovs),
-                texel_size=texel_size,
-                seen_fraction=float(measured[own].mean()),
-                clipped_fraction=float(clipped[own].mean()),
-                resolution=(int(texels.resolution[i, 0]), int(texels.resolution[i, 1])),
-                seen=bool((measured | clipped)[own].any()),
-                quantile=quantile,
-            )
-        )
+    for i, obj in progress(numbered, total=len(numbered), label="texture: writing", unit="objects"):
+        aovs = writer.write(i, obj, found.maps)
+        objects.append(_record(scene, texels, found, i, aovs, texel_size, quantile))
+    writer.warn()
     write_texturing_layer(
         run.output(f"layers/{step.asset.layer('texturing').name}"),
         run.output(f"layers/{step.asset.uv_layer.name}"),
@@ -166,10 +189,35 @@ def _write(
     return {
         "texel_size": texel_size,
         "texels": len(texels),
-        "measured_fraction": float(measured.mean()),
-        "clipped_fraction": float(clipped.mean()),
+        "measured_fraction": float(found.measured.mean()),
+        "clipped_fraction": float(found.clipped.mean()),
         "unseen_objects": [item.identifier for item in objects if not item.seen],
     }
+
+
+def _record(
+    scene: Scene,
+    texels: Texels,
+    found: _Found,
+    i: int,
+    aovs: tuple[Aov, ...],
+    texel_size: float,
+    quantile: float,
+) -> TexturedObject:
+    assert scene.corner_uv is not None
+    obj, own = scene.objects[i], texels.of_object(i)
+    return TexturedObject(
+        prim_path=obj.prim_path,
+        identifier=obj.identifier,
+        corner_uv=scene.corner_uv[obj.faces],
+        aovs=aovs,
+        texel_size=texel_size,
+        seen_fraction=float(found.measured[own].mean()),
+        clipped_fraction=float(found.clipped[own].mean()),
+        resolution=(int(texels.resolution[i, 0]), int(texels.resolution[i, 1])),
+        seen=bool((found.measured | found.clipped)[own].any()),
+        quantile=quantile,
+    )
 
 
 def _with_lower_bounds(

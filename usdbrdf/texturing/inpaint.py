@@ -15,6 +15,8 @@ _NEIGHBOURS = 8
 # A normal that differs by 90 degrees counts as this share of the object's size in distance: the
 # unseen back of a box is filled from its own sides before the far end of its front.
 _NORMAL_WEIGHT = 0.25
+# Zero has no logarithm: it counts as this share of the median of all known positive values.
+_ZERO = 1e-6
 
 
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
@@ -22,11 +24,16 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
 
     Geometric mean of the 8 nearest known texels of the same object in position and normal. An
     object of which nothing is known takes the nearest known texels of the scene; a scene of which
-    nothing is known becomes zero.
+    nothing is known, or only black, becomes zero. Values in another unit give the same fill in that
+    unit.
     """
     filled = np.where(known[:, None], values, 0).astype(np.float32)
     if not known.any():
         return filled
+    positive = values[known][values[known] > 0]
+    if not len(positive):
+        return filled
+    floor = float(_ZERO * np.median(positive))
     orphans = []
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
@@ -38,10 +45,10 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
             continue
         position = texels.position[own]
         weight = _NORMAL_WEIGHT * float(np.linalg.norm(np.ptp(position, axis=0)))
-        filled[missing] = _nearest_mean(texels, values, source, missing, weight)
+        filled[missing] = _nearest_mean(texels, values, source, missing, weight, floor)
     if orphans:
         filled[np.concatenate(orphans)] = _nearest_mean(
-            texels, values, np.flatnonzero(known), np.concatenate(orphans), 0.0
+            texels, values, np.flatnonzero(known), np.concatenate(orphans), 0.0, floor
         )
     return filled
 
@@ -52,6 +59,7 @@ def _nearest_mean(
     source: npt.NDArray[np.int64],
     missing: npt.NDArray[np.int64],
     normal_weight: float,
+    floor: float,
 ) -> Float:
     def feature(index: npt.NDArray[np.int64]) -> Float:
         return np.concatenate(
@@ -62,5 +70,5 @@ def _nearest_mean(
     k = min(_NEIGHBOURS, len(source))
     _, nearest = tree.query(feature(missing), k=k, workers=-1)
     neighbours = values[source][nearest.reshape(len(missing), k)]
-    logarithm = np.log(np.maximum(neighbours, 1e-6))
+    logarithm = np.log(np.maximum(neighbours, floor))
     return np.asarray(np.exp(logarithm.mean(axis=1)), np.float32)

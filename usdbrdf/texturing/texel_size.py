@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from decimal import ROUND_CEILING, Context
+
 import numpy as np
 
 from usdbrdf.errors import InputRefused
@@ -13,11 +15,13 @@ from usdbrdf.scan.scan import Frames
 _RAYS_PER_FRAME = 600
 # An atlas is never full; this share of its area is charts.
 _PACKING = 0.7
+_DIGITS = 2
 
 
 def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_texels: int) -> float:
     """Median pixel footprint in metres, sqrt(area that one pixel covers), over all frames; larger
-    if the surface would otherwise need more than ``max_texels``. Two significant digits.
+    if the surface would otherwise need more than ``max_texels``. Two significant digits, rounded
+    up where ``max_texels`` decides.
 
     Raises InputRefused if no camera ray meets the mesh.
     """
@@ -45,5 +49,10 @@ def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_tex
     corners = scene.points[scene.triangles].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1).sum() / 2
-    size = max(float(np.median(footprint)), float(np.sqrt(area / (_PACKING * max_texels))))
-    return float(f"{size:.2g}")
+    size = float(f"{np.median(footprint):.{_DIGITS}g}")
+    least = float(np.sqrt(area / (_PACKING * max_texels)))
+    return size if size >= least else _rounded_up(least)
+
+
+def _rounded_up(size: float) -> float:
+    return float(Context(prec=_DIGITS, rounding=ROUND_CEILING).create_decimal_from_float(size))

@@ -1,0 +1,94 @@
+"""How many texels are followed through how many frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, quad, world_of
+from tests.scenes import look_at
+from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.material import observations
+from usdbrdf.material.lit_scene import LitScene, View
+from usdbrdf.material.observations import Follower
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.shading.lights import lights_from_radiance
+
+SIZE = 16
+LENS = np.array([16.0, 16.0, 8.0, 8.0])
+
+
+@pytest.fixture(scope="module")
+def floor() -> World:
+    return world_of([
+        quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), size=(24, 24)),
+        quad((3, -1, 0), (2, 0, 0), (0, 2, 0), size=(24, 24)),
+    ])  # fmt: skip
+
+
+def _lit(world: World) -> LitScene:
+    lit = np.full((len(world.texels), 3), 0.5, np.float32)
+    texture = world.texture(lit)
+    return LitScene(
+        scene=world.scene, rays=world.rays, radiance=texture,
+        lights=lights_from_radiance(world.scene, world.texels, lit), emission=texture,
+        environment=black_environment(), size=world.size,
+    )  # fmt: skip
+
+
+def _view(i: int) -> View:
+    pose = look_at(np.array([0.1 * i, -0.5, 2.0]), np.zeros(3))
+    hit = camera_rays(pose, LENS, pixel_centres(SIZE, SIZE))[1][:, 2] < 0
+    return View(
+        radiance=np.full((SIZE, SIZE, 3), 1 + i, np.float32), valid=hit.reshape(SIZE, SIZE),
+        world_from_camera=pose, intrinsics=LENS,
+    )  # fmt: skip
+
+
+def _followed(world: World, frames: int, usable: np.ndarray) -> tuple[Follower, object]:
+    follower = Follower(_lit(world), world.texels, usable, frames, 0)
+    for i in range(frames):
+        follower.add(_view(i), np.zeros((SIZE, SIZE), bool), 0.25 * i)
+    return follower, follower.chosen(world.texels, 0)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 12, 5000, 10**6, 10**12])
+@pytest.mark.parametrize("objects", [0, 1, 12, 5000, 10**6, 10**12])
+def test_the_table_is_bounded_whatever_is_asked_for(frames: int, objects: int):
+    texels, rows = observations._table_size(frames, objects)
+    assert texels * rows * objects <= observations._MAX_CELLS
+    assert 0 <= rows <= frames
+    if frames * objects <= 4000:
+        assert (texels, rows) == (observations._FOLLOWED, frames)
+    elif rows < frames and texels:
+        assert rows >= observations._MIN_VIEWS
+
+
+def test_all_frames_are_followed_where_there_is_room(floor: World):
+    follower, found = _followed(floor, 6, np.ones(len(floor.texels), bool))
+    assert follower._radiance.shape == (6, len(floor.texels), 3)
+    assert set(found.frame) == set(range(6))
+    np.testing.assert_array_equal(found.radiance, 1 + found.frame[:, None] * np.ones((1, 3)))
+    np.testing.assert_array_equal(found.noise, 0.25 * found.frame)
+
+
+def test_beyond_the_bound_frames_are_taken_evenly(floor: World, monkeypatch):
+    monkeypatch.setattr(observations, "_MAX_CELLS", 2 * 40 * 5)
+    follower, found = _followed(floor, 21, np.ones(len(floor.texels), bool))
+    assert follower._radiance.shape == (5, 2 * 40, 3)
+    assert set(found.frame) == {0, 5, 10, 15, 20}
+    np.testing.assert_array_equal(found.radiance[:, 0], 1 + found.frame)
+    np.testing.assert_array_equal(found.noise, 0.25 * found.frame)
+
+
+@pytest.mark.parametrize("frames", [0, 4])
+def test_nothing_to_follow_gives_no_observations(floor: World, frames: int):
+    _, found = _followed(floor, frames, np.zeros(len(floor.texels), bool))
+    assert len(found.texel) == len(found.frame) == len(found.noise) == 0
+    assert found.radiance.shape == (0, 3)
+
+
+def test_texels_that_no_frame_sees_give_no_observations(floor: World):
+    # The second square lies out of every picture.
+    _, found = _followed(floor, 4, floor.texels.object_index() == 1)
+    assert len(found.texel) == 0
