@@ -8,7 +8,7 @@ BSDF in Python runs only in Mitsuba's vectorised variants. On Debian or Ubuntu:
     export DRJIT_LIBLLVM_PATH=$(ls /usr/lib/*/libLLVM.so.19.1)
     python samples/make_study.py --check          # the BSDF against plain NumPy
     python samples/make_study.py                  # rewrites samples/study
-    python samples/make_study.py --samples 16 --output /tmp/draft
+    python samples/make_study.py --samples 16 --output out/draft
 
 ``study_scene`` holds the room, built of ``study_shapes``; ``study_brdf`` the BRDF;
 ``study_camera`` the camera and its sensor.

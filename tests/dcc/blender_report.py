@@ -3,7 +3,7 @@
     BLENDER_PYTHON blender_report.py ASSET.usda
 
 Runs in an interpreter that has the module ``bpy``, in a process of its own: bpy brings another
-build of USD. The line of JSON is the last that is printed.
+build of USD. One line of the output is the JSON.
 """
 
 import json

@@ -28,7 +28,8 @@ def blender_report(layer, tmp_path):
         timeout=120,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    # Blender may have a last word of its own.
+    return json.loads(next(x for x in done.stdout.splitlines() if x.startswith("{")))
 
 
 def report_of(built, tmp_path, look):
