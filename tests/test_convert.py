@@ -432,15 +432,21 @@ def test_a_usd_stage_stays_as_it_is_and_wears_our_materials(tmp_path, monkeypatc
     np.testing.assert_allclose(shading.radiance, made.radiance["lamp"], rtol=0.01)
 
 
-def test_layers_that_a_usd_stage_refers_to_are_inputs_too(tmp_path):
-    made = make_capture(tmp_path / "scan", subdivisions=1)
-    (tmp_path / "geometry").mkdir()
-    top, below = tmp_path / "geometry/top.usda", tmp_path / "geometry/below.usda"
+def layered_usd(made, folder):
+    """The capture's meshes in one layer that another one sublayers: (that one, the meshes')."""
+    folder.mkdir()
+    top, below = folder / "top.usda", folder / "below.usda"
     as_usd(made, below)
     layer = Sdf.Layer.CreateNew(str(top))
     layer.subLayerPaths = ["./below.usda"]
     layer.defaultPrim = "haus"
     layer.Save()
+    return top, below
+
+
+def test_layers_that_a_usd_stage_refers_to_are_inputs_too(tmp_path):
+    made = make_capture(tmp_path / "scan", subdivisions=1)
+    top, below = layered_usd(made, tmp_path / "geometry")
     options = usdbrdf.IngestOptions(mesh=top)
     with usdbrdf.working_on(tmp_path / "room") as asset:
         assert usdbrdf.ingest(made.folder, asset, options).reran
@@ -513,13 +519,7 @@ def test_frames_that_changed_places_are_other_inputs(tmp_path):
 
 def test_a_changed_usd_stage_is_textured_again(tmp_path):
     made = make_capture(tmp_path / "scan", subdivisions=1)
-    (tmp_path / "geometry").mkdir()
-    top, below = tmp_path / "geometry/top.usda", tmp_path / "geometry/below.usda"
-    as_usd(made, below)
-    layer = Sdf.Layer.CreateNew(str(top))
-    layer.subLayerPaths = ["./below.usda"]
-    layer.defaultPrim = "haus"
-    layer.Save()
+    top, below = layered_usd(made, tmp_path / "geometry")
     with usdbrdf.working_on(tmp_path / "room") as asset:
         usdbrdf.ingest(made.folder, asset, usdbrdf.IngestOptions(mesh=top))
         assert usdbrdf.texture(asset, OPTIONS.texture).reran

@@ -48,13 +48,13 @@ def fit_views(
     if not len(observed.texel):
         return None, 0
     kept, points = _points(lit, texels, observed, view_of, index)
-    observed = _take(observed, kept)
+    observed = observed.take(kept)
     group = np.unique(observed.texel, return_inverse=True)[1].astype(np.int64)
     several = np.bincount(group)[group] > 1 if len(group) else np.zeros(0, np.bool_)
     if np.count_nonzero(several) < MIN_OBSERVATIONS:
         return None, int(np.count_nonzero(several))
     points = points.take(np.flatnonzero(np.repeat(several, 4)))
-    observed = _take(observed, np.flatnonzero(several))
+    observed = observed.take(np.flatnonzero(several))
     group = np.unique(observed.texel, return_inverse=True)[1].astype(np.int64)
     # Views of a texel share their random numbers: what they have in common then cancels in their
     # differences, which are all that is fitted.
@@ -98,7 +98,3 @@ def _project(position: Float, view: View) -> npt.NDArray[np.float64]:
     fx, fy, cx, cy = view.intrinsics
     depth = -in_camera[:, 2]
     return np.stack([cx + fx * in_camera[:, 0] / depth, cy - fy * in_camera[:, 1] / depth], axis=-1)
-
-
-def _take(observed: Observations, index: npt.NDArray[np.int64]) -> Observations:
-    return Observations(**{name: values[index] for name, values in vars(observed).items()})

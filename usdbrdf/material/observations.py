@@ -54,8 +54,11 @@ class Observations:
     def of_texels(self, own: slice) -> Observations:
         """Those of one object's texels."""
         first, last = np.searchsorted(self.texel, [own.start, own.stop])
-        part = slice(int(first), int(last))
-        return Observations(**{name: values[part] for name, values in vars(self).items()})
+        return self.take(slice(int(first), int(last)))
+
+    def take(self, index: slice | npt.NDArray[np.int64]) -> Observations:
+        """Some of them."""
+        return Observations(**{name: values[index] for name, values in vars(self).items()})
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         return dict(vars(self))

@@ -143,11 +143,10 @@ def _lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
 
 @dataclass(frozen=True, kw_only=True)
 class _Survey:
-    """What one pass over the frames gathers: per object the target frame (-1: none) and its number
-    of highlight pixels; the observations of followed texels."""
+    """What one pass over the frames gathers: per object the target frame (-1: none); the
+    observations of followed texels."""
 
     target: Int
-    mirrored: Int
     observations: Observations
 
 
@@ -167,13 +166,12 @@ def _survey(
             counts.append(_count(lit, frames, i, pixels.valid))
             view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
             follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
-        target, mirrored = choose_target_frames(counts)
+        target, _ = choose_target_frames(counts)
         chosen = follower.chosen(atlas.texels, options.seed)
-        return {"target": target, "mirrored": mirrored, **chosen.arrays()}
+        return {"target": target, **chosen.arrays()}
 
     found = run.checkpoint("survey", gather)
-    target, mirrored = found.pop("target"), found.pop("mirrored")
-    return _Survey(target=target, mirrored=mirrored, observations=Observations(**found))
+    return _Survey(target=found.pop("target"), observations=Observations(**found))
 
 
 def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
