@@ -20,7 +20,10 @@ from usdbrdf.job.progress import set_quiet
 from usdbrdf.scan.adapters import Adapter
 
 COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
-COMMANDS = ("convert", "ingest", "texture", "shade", "fit", "validate", "adapters", "plugin-path")
+COMMANDS = (
+    *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare"),
+    *("validate", "adapters", "plugin-path"),
+)
 
 
 @pytest.fixture(scope="module")

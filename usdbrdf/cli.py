@@ -12,11 +12,17 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NoReturn
 
-from usdbrdf import fit, ingest, options, shade, texture, working_on
+from usdbrdf import compare, evaluate, fit, ingest, options, relight, shade, texture, working_on
 from usdbrdf.command_parser import command_parser
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.evaluate.command_options import evaluate_options
+from usdbrdf.evaluate.compare_assets import DOCUMENT as COMPARISON
+from usdbrdf.evaluate.compare_assets import comparison_line, figures
+from usdbrdf.evaluate.evaluate_views import DOCUMENT as EVALUATION
+from usdbrdf.evaluate.report import summary_line, truth_line
 from usdbrdf.job.progress import printable, say, set_quiet
 from usdbrdf.job.stage import StageResult
+from usdbrdf.relight.command_options import relight_options
 from usdbrdf.scan.adapters import Adapter, list_adapters
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.schema import plugin_path
@@ -114,6 +120,36 @@ def _step(name: str, chosen: Arguments) -> Callable[[Asset], StageResult]:
     return partial(fit, options=options.fit_options(chosen))
 
 
+def _evaluate(chosen: Arguments) -> int:
+    found = evaluate(chosen.asset, chosen.views, chosen.output, evaluate_options(chosen))
+    if chosen.json:
+        truth = {"truth": found["truth"]} if "truth" in found else {}
+        told = {"output": str(chosen.output), **found["summary"], **truth}
+        _print(json.dumps(told, indent=2))
+    say(summary_line(found["summary"]))
+    if "truth" in found:
+        say(truth_line(found["truth"]))
+    say(f"{chosen.output / EVALUATION}: written")
+    return 0
+
+
+def _compare(chosen: Arguments) -> int:
+    found = compare(chosen.first, chosen.second, chosen.output)
+    if chosen.json:
+        _print(json.dumps({"output": str(chosen.output), **figures(found)}, indent=2))
+    say(comparison_line(found))
+    say(f"{chosen.output / COMPARISON}: written")
+    return 0
+
+
+def _relight(chosen: Arguments) -> int:
+    summary = relight(chosen.asset, chosen.output, relight_options(chosen))
+    if chosen.json:
+        _print(json.dumps(summary, indent=2))
+    say(f"{chosen.output}: written")
+    return 0
+
+
 def _validate(chosen: Arguments) -> int:
     root = Asset.at(chosen.asset).root_layer
     if not root.is_file():
@@ -156,4 +192,11 @@ def _print(line: str) -> None:
         ) from error
 
 
-_COMMANDS = {"validate": _validate, "adapters": _adapters, "plugin-path": _plugin_path}
+_COMMANDS = {
+    "evaluate": _evaluate,
+    "compare": _compare,
+    "relight": _relight,
+    "validate": _validate,
+    "adapters": _adapters,
+    "plugin-path": _plugin_path,
+}

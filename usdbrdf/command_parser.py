@@ -8,7 +8,9 @@ from typing import Any, NoReturn
 
 from usdbrdf import options
 from usdbrdf.errors import UsageError
+from usdbrdf.evaluate.command_options import add_compare_options, add_evaluate_options
 from usdbrdf.job.stamp import code_version
+from usdbrdf.relight.command_options import add_relight_options
 
 EXIT_CODES = """exit codes:
   0 done   1 a defect of usdbrdf   2 wrong options   3 input refused (do not retry)
@@ -50,6 +52,16 @@ def command_parser() -> argparse.ArgumentParser:
 
     for name, (steps, text) in _STEP_COMMANDS.items():
         _add_step_arguments(command(name, text), steps.split())
+    views = command("evaluate", "render views and compare them with photographs")
+    options.add_talk_options(views)
+    options.add_light_options(views)
+    add_evaluate_options(views)
+    pair = command("compare", "compare two assets of one scene, lit differently")
+    options.add_talk_options(pair)
+    add_compare_options(pair)
+    relit = command("relight", "path trace the published asset in its own or in other light")
+    options.add_talk_options(relit)
+    add_relight_options(relit)
     check = command("validate", "check an asset with USD's own validators")
     check.add_argument("asset", type=Path, metavar="ASSET", help="asset folder")
     command("adapters", "list the capture formats that can be read")

@@ -23,9 +23,8 @@ _COSINE_RAYS = 10_000
 
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Options of every command that writes into an asset folder."""
+    add_talk_options(parser)
     add = parser.add_argument
-    add("-q", "--quiet", action="store_true", help="print errors only")
-    add("--json", action="store_true", help="print a summary as JSON to stdout, nothing else")
     add(
         "--wait",
         type=_number,
@@ -34,6 +33,14 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         help="wait up to this many seconds for a busy asset folder",
     )
     parser.set_defaults(hand_edits="refuse")
+
+
+def add_talk_options(parser: argparse.ArgumentParser) -> None:
+    """What is said while a command runs and at its end."""
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    parser.add_argument(
+        "--json", action="store_true", help="print a summary as JSON to stdout, nothing else"
+    )
 
 
 def add_edit_options(parser: argparse.ArgumentParser) -> None:
@@ -62,8 +69,13 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("ingest").add_argument
     add("--adapter", metavar="NAME", help="capture format; default: recognised by its content")
     add("--no-plugins", action="store_true", help="use our own adapters only")
-    add("--mesh", type=_file, metavar="FILE", help="mesh; default: the capture's own")
-    add("--objects", type=_file, metavar="FILE", help="object names; default: the capture's own")
+    add("--mesh", type=existing_file, metavar="FILE", help="mesh; default: the capture's own")
+    add(
+        "--objects",
+        type=existing_file,
+        metavar="FILE",
+        help="object names; default: the capture's own",
+    )
     add(
         "--crease-angle",
         type=_number,
@@ -121,11 +133,7 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="length of a scene unit in metres; default: as the format says",
     )
-    add(
-        "--up-axis",
-        choices=("Y", "Z"),
-        help="axis that points up; default: as the format says",
-    )
+    add("--up-axis", choices=("Y", "Z"), help="axis that points up; default: as the format says")
 
 
 def add_texture_options(parser: argparse.ArgumentParser) -> None:
@@ -205,11 +213,11 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_light_options(parser: argparse.ArgumentParser) -> None:
-    """What shade and fit share."""
+    """What all that traces light shares."""
     add = parser.add_argument_group("light transport").add_argument
     add(
         "--environment",
-        type=_file,
+        type=existing_file,
         metavar="HDR",
         help="latitude-longitude picture of the surroundings; default: black",
     )
@@ -284,7 +292,7 @@ def _number(text: str) -> float:
     return value
 
 
-def _file(text: str) -> Path:
+def existing_file(text: str) -> Path:
     # Said before any work is done; an input that is not there is refused as a capture would be.
     if not Path(text).is_file():
         raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")

@@ -54,7 +54,7 @@ def _assert_albedo(
     )  # fmt: skip
     found, wanted = [], []
     for phi in PHIS:
-        base, slope = non_diffuse(samples, phi)
+        base, slope = non_diffuse(samples, np.full(REPEAT, phi, np.float32))
         found.append([base, base + slope])
         wanted.append([
             directional_albedo(np.radians(degrees), phi, psi, steps=300, visible=visible) * radiance
@@ -145,7 +145,7 @@ def test_the_samples_of_a_point_depend_on_the_seed_alone():
             world.rays, points, world.texture(lit), world.lights(lit), black_environment(),
             Mixture(), world.size, seed,
         )  # fmt: skip
-        return non_diffuse(samples, 0.3)[1]
+        return non_diffuse(samples, np.full(len(samples.cos_out), 0.3, np.float32))[1]
 
     np.testing.assert_array_equal(run(0), run(0))
     assert (run(0) != run(1)).mean() > 0.9

@@ -96,6 +96,21 @@ def test_a_clipped_lamp_is_a_lower_bound(world: World, lit: np.ndarray):
     assert not _find(world, lit, seen=~few, clipped=few).lower_bound.any()
 
 
+def test_no_wall_shines_while_a_lamp_is_too_dark(world: World, lit: np.ndarray):
+    # The lamp is known as 8 at least and is brighter: S is half of what it should be, and a wall of
+    # albedo 0.75 looks like 1.5.
+    own = world.texels.object_index() == LAMP
+    lit[world.texels.object_index() == 2] *= 1.5
+    shading = np.full_like(lit, SHADING / 2)
+    assert find_emitters(world.texels, lit, shading, ~own, own).is_lamp[2]
+    found = find_emitters(world.texels, lit, shading, ~own, own, unknown_lamp=8)
+    np.testing.assert_array_equal(found.is_lamp, [False] * 6 + [True])
+    # A measured lamp as bright as that still counts.
+    lit[world.texels.object_index() == 2] = 9
+    found = find_emitters(world.texels, lit, shading, ~own, own, unknown_lamp=8)
+    np.testing.assert_array_equal(found.is_lamp, [False] * 2 + [True] + [False] * 3 + [True])
+
+
 def test_the_unseen_back_of_a_lamp_shines_with_it(world: World, lit: np.ndarray):
     own = world.texels.object_index() == LAMP
     half = own & (np.cumsum(own) <= 128)

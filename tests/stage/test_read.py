@@ -80,6 +80,26 @@ def test_records_come_back(built):
         assert same(read_fit(open_measured(built.asset), fitted.prim_path), fitted)
 
 
+def test_how_well_a_lamp_is_known(built):
+    lamp = next(item for item in built.shaded if item.emitter)
+    expected = {"measured": (False, None), "estimated": (False, 0.125), "lowerBound": (True, None)}
+    for status, (bound, error) in expected.items():
+        changed = {**lamp.__dict__, "radiance_status": status}
+        built.shaded = tuple(
+            type(lamp)(**changed) if item.emitter else item for item in built.shaded
+        )
+        built.write_layer("shading")
+        stage = open_weaker(built.asset, "material")
+        prim = stage.GetPrimAtPath(lamp.prim_path)
+        assert prim.GetAttribute("usdBrdf:emitter:lowerBound").Get() is bound
+        authored = prim.GetAttribute("usdBrdf:emitter:radianceError")
+        assert authored.HasAuthoredValue() is (error is not None)
+        read = read_shading(stage, lamp.prim_path)
+        assert (read.radiance_status, read.radiance_is_lower_bound) == (status, bound)
+        if error is not None:
+            assert read.radiance_error == error
+
+
 def test_before_a_stage_ran_there_is_nothing_to_read(built):
     stage = open_weaker(built.asset, "texturing")
     for read in (read_texturing, read_shading, read_fit):

@@ -51,10 +51,16 @@ def to_display_srgb8(pixels: Float, *, exposure_scale: float) -> npt.NDArray[np.
     """
     unknown = np.any(np.isnan(pixels), axis=2, keepdims=True)
     known = np.where(unknown, np.float32(0), pixels)
-    scaled = np.clip(known * np.float32(exposure_scale), 0, 1).astype(np.float32)
-    encoded = _converted(scaled, WORKING_SPACE, DISPLAY_SPACE)
-    bytes_ = (np.clip(encoded, 0, 1) * 255 + 0.5).astype(np.uint8)
+    encoded = to_display_srgb(known, exposure_scale=exposure_scale)
+    bytes_ = (encoded * 255 + 0.5).astype(np.uint8)
     return np.where(unknown, np.array(_UNKNOWN_SHOWN_AS, dtype=np.uint8), bytes_)
+
+
+def to_display_srgb(pixels: Float, *, exposure_scale: float) -> Float:
+    """sRGB values in [0, 1], (H, W, 3) float32, of linear Rec.709 radiance times the scale."""
+    scaled = np.clip(pixels * np.float32(exposure_scale), 0, 1).astype(np.float32)
+    encoded: Float = np.clip(_converted(scaled, WORKING_SPACE, DISPLAY_SPACE), 0, 1)
+    return encoded
 
 
 def _converted(pixels: Float, source: str, target: str) -> Float:

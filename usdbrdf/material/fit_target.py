@@ -24,7 +24,7 @@ Residual = Literal["paper", "scaled"]
 
 # A pixel sees an area: its rays start at 2 x 2 points of it. On small curved objects the normal
 # turns within a pixel; taken at its centre alone, the highlight looks rougher than it is.
-_SUB_PIXEL = 0.25
+_SUB_PIXEL = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
 # Fewer pixels than this say nothing about two parameters.
 MIN_PIXELS = 12
 

@@ -1,9 +1,8 @@
 """One object's roughness and specular from many views, its diffuse radiance left free per texel.
 
-A texel's diffuse radiance is the same in all frames that see it. Taking each texel's mean over its
-views off the samples, and off the lobe's two parts alike, removes it: what is left is how the
-radiance changes with the view, which only the lobe explains. The median texture, which holds the
-specular light that is seen from everywhere, then enters as incident light only.
+A texel's diffuse radiance is the same in all frames that see it: what changes with the view is the
+lobe, and the errors of the frames, which ``view_model`` tells from it. The median texture, which
+holds the specular light that is seen from everywhere, then enters as incident light only.
 """
 
 from __future__ import annotations
@@ -14,23 +13,42 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.geometry.texels import Texels
-from usdbrdf.material.grid_fit import GridFit, fit_grid, mean_of
+from usdbrdf.material.fit_lobe import Candidate, fit_lobe
 from usdbrdf.material.lit_scene import LitScene, View, sub_pixel_points
+from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.target_frames import SurfacePoints
+from usdbrdf.material.view_model import ViewSamples
 
 Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
+Long = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
-# A bilinear sample spreads over the pixels with a standard deviation of half a pixel per axis, and
-# so do four points half a pixel off, diagonally.
-_FOOTPRINT = 0.5
-# Relative error of a sample besides the frame's noise: poses, footprints, L_d as incident light.
-_MODEL_ERROR = 0.03
+# A sample spreads over the pixels, by this many of standard deviation: half a pixel for a camera's
+# own blur, 0.4 for bilinear reading, 0.3 for the pixel's area.
+_FOOTPRINT = 0.7
+# Pictures are often smoothed besides. On curved objects, whose highlights that widens, these are
+# tried as well, as long as so many of the samples keep the whole footprint on the object.
+_WIDER = (0.5, 1.0, 1.4, 2.0)
+_KEPT = 0.4
+# From this deviation of the normal over a footprint on, in radians, an object counts as curved.
+_CURVED = 0.01
+# Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
+_RING = np.pi / 4 * np.arange(8)
+_OFFSETS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
+    [np.cos(_RING), np.sin(_RING)], axis=-1
+)
 MIN_OBSERVATIONS = 48
-# Noise in the lobe itself draws psi towards 0: wide lobes get more rays than a picture would need.
-_MIXTURE = Mixture(per_lobe=8, lights=24, cosine=16)
+_MIN_VIEWS = 3
+# A frame in which the texel's mean is not this many times the noise floor is left out: there only
+# the brighter samples would be valid.
+_ABOVE_NOISE = 4.0
+_MIXTURE = Mixture(per_lobe=4, lights=12, cosine=8)
+# Frames' errors hang together over about this many pixels.
+_PATCH_PIXELS = 16.0
 
 
 def fit_views(
@@ -40,32 +58,117 @@ def fit_views(
     view_of: Callable[[int], View],
     index: int,
     seed: int,
-) -> tuple[GridFit | None, int]:
+) -> tuple[LobeEstimate | None, int]:
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
     view_of(frame) gives poses and pinholes; the images themselves are not needed any more.
     """
+    observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
         return None, 0
-    kept, points = _points(lit, texels, observed, view_of, index)
-    observed = observed.take(kept)
-    group = np.unique(observed.texel, return_inverse=True)[1].astype(np.int64)
-    several = np.bincount(group)[group] > 1 if len(group) else np.zeros(0, np.bool_)
-    if np.count_nonzero(several) < MIN_OBSERVATIONS:
-        return None, int(np.count_nonzero(several))
-    points = points.take(np.flatnonzero(np.repeat(several, 4)))
-    observed = observed.take(np.flatnonzero(several))
-    group = np.unique(observed.texel, return_inverse=True)[1].astype(np.int64)
+    observed, footprints = _footprints(lit, texels, observed, view_of, index)
+    if len(observed.texel) < MIN_OBSERVATIONS:
+        return None, len(observed.texel)
+    samples = _samples(lit, texels, observed, footprints[0], view_of)
     # Views of a texel share their random numbers: what they have in common then cancels in their
     # differences, which are all that is fitted.
-    stream = (4 * group[:, None] + np.arange(4)).ravel()
-    basis = lobe_basis(lit, points, len(group), seed, _MIXTURE, stream)
-    level = np.bincount(group, observed.radiance.mean(axis=1)) / np.bincount(group)
-    weight = 1 / ((_MODEL_ERROR * level[group]) ** 2 + observed.noise.astype(np.float64) ** 2)
-    root = np.sqrt(weight)[:, None]
-    return fit_grid(
-        observed.radiance, weight[:, None].astype(np.float64), basis, mean_of(group, root)
-    ), len(group)
+    points_of_texel = len(_OFFSETS) * samples.texel[:, None]
+    stream = (points_of_texel + np.arange(len(_OFFSETS))).ravel()
+    # Two bases with rays of their own: noise squared would draw psi towards 0, the product of two
+    # independent noises does not.
+    candidates = [
+        Candidate(
+            first=lobe_basis(lit, points, len(samples.texel), 2 * seed, _MIXTURE, stream),
+            second=lobe_basis(lit, points, len(samples.texel), 2 * seed + 1, _MIXTURE, stream),
+            blur=_deviation_of_normal(points),
+        )
+        for points in footprints
+    ]
+    return fit_lobe(samples, candidates), len(samples.texel)
+
+
+def _footprints(
+    lit: LitScene,
+    texels: Texels,
+    observed: Observations,
+    view_of: Callable[[int], View],
+    index: int,
+) -> tuple[Observations, list[SurfacePoints]]:
+    """The observations whose footprint lies on the object as a whole, of texels that several frames
+    see; and the footprints' points, for the usual width and, on curved objects, for others."""
+
+    def whole(some: Observations, width: float) -> tuple[Long, SurfacePoints]:
+        kept, points = _points(lit, texels, some, view_of, index, width * _OFFSETS)
+        enough = _several_views(some.texel[kept])
+        return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(_OFFSETS))))
+
+    kept, points = whole(observed, _FOOTPRINT)
+    observed = observed.take(kept)
+    if not len(kept) or _deviation_of_normal(points) < _CURVED:
+        return observed, [points]
+    for count in range(len(_WIDER), 0, -1):
+        widths = (_FOOTPRINT, *_WIDER[:count])
+        inner = np.arange(len(kept))
+        for width in widths:
+            inner = np.intersect1d(inner, whole(observed, width)[0])
+        inner = inner[_several_views(observed.texel[inner])]
+        if len(inner) >= max(_KEPT * len(kept), MIN_OBSERVATIONS):
+            observed = observed.take(inner)
+            return observed, [whole(observed, width)[1] for width in widths]
+    return observed, [points]
+
+
+def _samples(
+    lit: LitScene,
+    texels: Texels,
+    observed: Observations,
+    points: SurfacePoints,
+    view_of: Callable[[int], View],
+) -> ViewSamples:
+    position = texels.position[observed.texel]
+    # Views cut a pattern differently: its contrast within the footprint is an error of the sample.
+    shown = lit.radiance.at(points.face, points.u, points.v)
+    contrast = shown.reshape(len(position), len(_OFFSETS), 3).std(axis=1)
+    return ViewSamples(
+        texel=np.unique(observed.texel, return_inverse=True)[1].astype(np.int64),
+        frame=observed.frame.astype(np.int64),
+        position=position,
+        radiance=observed.radiance,
+        noise=np.hypot(observed.noise[:, None], contrast),
+        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, view_of),
+    )
+
+
+def _clear_of_noise(observed: Observations) -> Bool:
+    """Samples of texels that are, on the mean, well above the noise floor of the frame."""
+    if not len(observed.texel):
+        return np.zeros(0, np.bool_)
+    texel = np.unique(observed.texel, return_inverse=True)[1]
+    count = np.bincount(texel)
+    mean = [np.bincount(texel, channel) / count for channel in observed.radiance.T]
+    return np.asarray(np.min(mean, axis=0)[texel] > _ABOVE_NOISE * observed.noise, np.bool_)
+
+
+def _several_views(texel: Int) -> Bool:
+    number = np.unique(texel, return_inverse=True)[1]
+    return np.asarray(np.bincount(number)[number] >= _MIN_VIEWS, np.bool_)
+
+
+def _pixel_size(position: Float, frame: Int, view_of: Callable[[int], View]) -> float:
+    """Median size of a pixel on the surface, in metres."""
+    sizes = []
+    for number in np.unique(frame):
+        view = view_of(int(number))
+        distance = np.linalg.norm(position[frame == number] - view.world_from_camera[:3, 3], axis=1)
+        sizes.append(distance / view.intrinsics[0])
+    return float(np.median(np.concatenate(sizes)))
+
+
+def _deviation_of_normal(points: SurfacePoints) -> float:
+    """Median standard deviation of the normal, in radians per axis, over a sample's points."""
+    normal = points.normal.reshape(-1, len(_OFFSETS), 3)
+    spread = ((normal - normal.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
+    return float(np.sqrt(np.median(spread) / 2))
 
 
 def _points(
@@ -74,21 +177,22 @@ def _points(
     observed: Observations,
     view_of: Callable[[int], View],
     index: int,
-) -> tuple[npt.NDArray[np.int64], SurfacePoints]:
-    """The observations whose footprint lies on the object as a whole, and four surface points of
-    each, in order of the observations."""
+    offsets: Double,
+) -> tuple[Long, SurfacePoints]:
+    """The observations whose footprint lies on the object as a whole, and the surface points of
+    each, at ``offsets`` (K, 2) in pixels, in order of the observations."""
     kept, parts = [], []
     for frame in np.unique(observed.frame):
         which = np.flatnonzero(observed.frame == frame)
         view = view_of(int(frame))
         pixels = _project(texels.position[observed.texel[which]], view)
-        whole, points = sub_pixel_points(lit, view, pixels, index, _FOOTPRINT)
+        whole, points = sub_pixel_points(lit, view, pixels, index, offsets)
         kept.append(which[whole])
         parts.append(points)
     unordered = np.concatenate(kept)
     order = np.argsort(unordered, kind="stable")
-    four = (4 * order[:, None] + np.arange(4)).ravel()
-    return unordered[order], SurfacePoints.joined(parts).take(four)
+    each = (len(offsets) * order[:, None] + np.arange(len(offsets))).ravel()
+    return unordered[order], SurfacePoints.joined(parts).take(each)
 
 
 def _project(position: Float, view: View) -> npt.NDArray[np.float64]:

@@ -49,14 +49,13 @@ class View:
 
 
 def sub_pixel_points(
-    lit: LitScene, view: View, pixels: Double, index: int, offset: float
+    lit: LitScene, view: View, pixels: Double, index: int, offsets: Double
 ) -> tuple[Bool, SurfacePoints]:
-    """Four surface points, ``offset`` pixels diagonally off each of the pixel coordinates (P, 2).
+    """Surface points at ``offsets`` (K, 2) in pixels from each of the pixel coordinates (P, 2).
 
-    Returns which pixels have all four on object ``index``, (P,) bool, and their points in order.
+    Returns which pixels have all K on object ``index``, (P,) bool, and their points in order.
     """
-    corners = offset * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    inside = (pixels[:, None] + corners).reshape(-1, 2)
+    inside = (pixels[:, None] + offsets).reshape(-1, 2)
     points = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, inside)
-    whole = (lit.owner(points.face) == index).reshape(-1, 4).all(axis=1)
-    return whole, points.take(np.flatnonzero(np.repeat(whole, 4)))
+    whole = (lit.owner(points.face) == index).reshape(-1, len(offsets)).all(axis=1)
+    return whole, points.take(np.flatnonzero(np.repeat(whole, len(offsets))))

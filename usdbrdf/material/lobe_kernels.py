@@ -47,12 +47,12 @@ def draw_directions(
     directions: Float,
     chosen: Int,
 ) -> None:
-    """Directions of every technique in turn; ``chosen`` keeps the light triangle that a direction
-    was sent to (-1 for the others)."""
+    """Directions of every technique in turn, with lobe widths ``alphas`` (R, A); ``chosen`` keeps
+    the light triangle that a direction was sent to (-1 for the others)."""
     sequence, shift = draws
     per_lobe, num_lights = counts
     light_face, cumulative, _, corners, _ = lights
-    lobes = len(alphas) * per_lobe
+    lobes = alphas.shape[1] * per_lobe
     for r in prange(len(normal)):
         n = normal[r]
         wo = to_camera[r]
@@ -62,7 +62,7 @@ def draw_directions(
             u2 = (sequence[k, 1] + shift[r, 1]) % 1.0
             if k < lobes:
                 # The techniques take turns, so each sees an evenly spread part of the sequence.
-                hx, hy, hz = sample_half_vector(u1, u2, alphas[k % len(alphas)])
+                hx, hy, hz = sample_half_vector(u1, u2, alphas[r, k % alphas.shape[1]])
                 x = hx * tx + hy * bx + hz * n[0]
                 y = hx * ty + hy * by + hz * n[1]
                 z = hx * tz + hy * bz + hz * n[2]
@@ -110,7 +110,7 @@ def weigh(
     _, _, light_density, _, face_normals = lights
     image, z_up = environment
     cos_in, sin2_half, graze, _ = samples
-    num_cosine = directions.shape[1] - per_lobe * len(alphas) - num_lights
+    num_cosine = directions.shape[1] - per_lobe * alphas.shape[1] - num_lights
     for r in prange(len(normal)):
         n = normal[r]
         for k in range(directions.shape[1]):
@@ -130,8 +130,8 @@ def weigh(
                 continue
             s2, cos_wh = half_vector(n, w, to_camera[r])
             density = num_cosine * cosine / np.pi + num_lights * light
-            for a in alphas:
-                density += per_lobe * reflected_density(s2, cos_wh, a)
+            for a in range(alphas.shape[1]):
+                density += per_lobe * reflected_density(s2, cos_wh, alphas[r, a])
             cos_in[r, k] = cosine
             sin2_half[r, k] = s2
             graze[r, k] = grazing(cos_wh)
@@ -144,14 +144,16 @@ def weigh(
 
 @parallel_kernel
 def integrate(
-    samples: SampleArrays, weighted: Float, phi: float, base: Float, slope: Float
+    samples: SampleArrays, weighted: Float, phis: Float, base: Float, slope: Float
 ) -> None:
-    """base, slope (R, 3) += sums over the samples of light times G D x, 0.08 G D (1 - x)."""
+    """base, slope (R, 3) += sums over the samples of light times G D x, 0.08 G D (1 - x), each
+    point with its own roughness of ``phis`` (R,)."""
     cos_in, sin2_half, graze, cos_out = samples
-    alpha = alpha_of_phi(phi)
     for r in prange(len(cos_out)):
         if cos_out[r] <= 0:
             continue
+        phi = phis[r]
+        alpha = alpha_of_phi(phi)
         out = masking(cos_out[r], phi)
         for k in range(cos_in.shape[1]):
             if cos_in[r, k] <= 0:

@@ -55,15 +55,12 @@ class LobeSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class Mixture:
-    """How many of a point's samples each technique draws."""
+    """How many of a point's samples each technique draws: per lobe width, towards the lights, and
+    cosine-distributed."""
 
     per_lobe: int = 8
     lights: int = 8
     cosine: int = 4
-
-    @property
-    def total(self) -> int:
-        return self.per_lobe * len(LOBE_ALPHAS) + self.lights + self.cosine
 
 
 def trace_lobe_samples(
@@ -76,26 +73,33 @@ def trace_lobe_samples(
     scene_size: float,
     seed: int,
     stream: Long | None = None,
+    alphas: Double | None = None,
+    first: int = 0,
 ) -> LobeSamples:
     """Trace the mixture at R surface points; all of ``points`` must lie on the surface.
 
-    stream (R,): points of the same number share their random numbers; default: none do.
+    stream (R,)    points of the same number share their random numbers; default: none do
+    alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
+    first          the number of the first point's random numbers
     """
     if not len(lights.face):
         mixture = Mixture(
             per_lobe=mixture.per_lobe, lights=0, cosine=mixture.cosine + mixture.lights
         )
-    count, total = len(points.face), mixture.total
+    count = len(points.face)
+    if alphas is None:
+        alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
+    total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
     origin = lift_from_surface(points.position, points.normal, scene_size)
     sequence = sobol_points(int(np.ceil(np.log2(total))), 2)
-    shift = patch_shifts(count, 3, seed)
+    shift = patch_shifts(count, 3, seed, first)
     if stream is not None:
         shift = shift[stream]
     directions = np.zeros((count * total, 3), np.float32)
     chosen = np.full((count, total), -1, np.int32)
     counts = mixture.per_lobe, mixture.lights
     draw_directions(
-        points.normal, points.to_camera, origin, (sequence, shift), counts, LOBE_ALPHAS,
+        points.normal, points.to_camera, origin, (sequence, shift), counts, alphas,
         lights.arrays, directions.reshape(count, total, 3), chosen,
     )  # fmt: skip
     hits = rays.closest(np.repeat(origin, total, axis=0), directions)
@@ -109,7 +113,7 @@ def trace_lobe_samples(
     weigh(
         points.normal, points.to_camera, directions.reshape(count, total, 3), chosen,
         (hits.face.reshape(count, total), hits.distance.reshape(count, total)), counts,
-        LOBE_ALPHAS, lights.arrays, environment.arrays, samples.weighted, samples.arrays,
+        alphas, lights.arrays, environment.arrays, samples.weighted, samples.arrays,
     )  # fmt: skip
     return samples
 
@@ -133,14 +137,14 @@ def lobe_basis(
         return means
 
     def basis(phi: float) -> tuple[Float, Float]:
-        base, slope = non_diffuse(samples, phi)
+        base, slope = non_diffuse(samples, np.full(len(samples.cos_out), phi, np.float32))
         return mean(base), mean(slope)
 
     return basis
 
 
-def non_diffuse(samples: LobeSamples, phi: float) -> tuple[Float, Float]:
-    """I_nd = base + psi * slope of every point, (R, 3) float32 each, for one roughness."""
+def non_diffuse(samples: LobeSamples, phi: Float) -> tuple[Float, Float]:
+    """I_nd = base + psi * slope of every point, (R, 3) float32 each, for roughnesses (R,)."""
     base = np.zeros((len(samples.cos_out), 3), np.float32)
     slope = np.zeros_like(base)
     integrate(samples.arrays, samples.weighted, phi, base, slope)

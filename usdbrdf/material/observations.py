@@ -26,7 +26,7 @@ Bool = npt.NDArray[np.bool_]
 
 # Followed per object, kept per object, and views kept per texel.
 _FOLLOWED = 3000
-_KEPT = 320
+_KEPT = 200
 _VIEWS = 12
 _MIN_VIEWS = 3
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of

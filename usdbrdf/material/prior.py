@@ -6,6 +6,8 @@ psi 0.5 is an index of refraction of 1.5.
 
 from __future__ import annotations
 
+# How far objects of one class lie apart, as a standard deviation.
+PRIOR_ERROR = 0.25
 NEUTRAL = (0.5, 0.5)
 _OF_WORD: dict[str, tuple[float, float]] = {
     # Matte paint and plaster.
@@ -32,3 +34,14 @@ def class_prior(class_name: str, label: str) -> tuple[float, float]:
             if word in _OF_WORD:
                 return _OF_WORD[word]
     return NEUTRAL
+
+
+def with_prior(
+    value: float, error: float, prior: float, nothing_known: float
+) -> tuple[float, float]:
+    """(value, error) of a number in [0, 1] estimated as ``value`` with a standard deviation of
+    ``error``, together with its prior. An error of ``nothing_known`` leaves the prior alone."""
+    precision = max(1 / max(error, 1e-3) ** 2 - 1 / nothing_known**2, 0.0)
+    of_prior = 1 / PRIOR_ERROR**2
+    mean = (precision * value + of_prior * prior) / (precision + of_prior)
+    return mean, (precision + of_prior) ** -0.5

@@ -50,7 +50,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
     source = path / "transforms.json" if path.is_dir() else path
     capture = _Capture(source=source, document=_document(source), options=options)
     findings = Findings()
-    records = [r for f in capture.document["frames"] if (r := _record(capture, f, findings))]
+    records = _records(capture, findings)
     photographs = refuse_photographs(
         [r.image_path for r in records], assume_srgb=options.assume_srgb
     )
@@ -79,6 +79,16 @@ def read(path: Path, options: IngestOptions) -> Scan:
         meters_per_unit=1.0,
         up_axis="Z",
     )
+
+
+def frame_records(source: Path, options: IngestOptions, findings: Findings) -> list[FrameRecord]:
+    """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
+
+    Those without pose or file are in ``findings``; poses are not yet known to be rigid.
+    """
+    source = source.resolve()
+    capture = _Capture(source=source, document=_document(source), options=options)
+    return _records(capture, findings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +128,10 @@ def _document(source: Path) -> Mapping[str, Any]:
             "capture's own document. [capture.format]"
         )
     return document  # type: ignore[no-any-return]
+
+
+def _records(capture: _Capture, findings: Findings) -> list[FrameRecord]:
+    return [r for f in capture.document["frames"] if (r := _record(capture, f, findings))]
 
 
 def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:

@@ -14,14 +14,22 @@ from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
 from usdbrdf.stage.input_bindings import recorded_bindings
 from usdbrdf.stage.looks import SHADED, Shown, author_look_materials, author_looks
-from usdbrdf.stage.preview_surface import SURFACE, lobe, preview_surface_from_fit
+from usdbrdf.stage.preview_surface import (
+    SURFACE,
+    colour_from_texture,
+    lobe,
+    preview_surface_from_fit,
+)
 from usdbrdf.stage.records import FittedObject
 from usdbrdf.stage.schema import verify
 from usdbrdf.stage.scopes import Scopes
+from usdbrdf.stage.texturing_layer import aov_looks, author_aovs
 
 __all__ = ["FittedObject", "write_material_layer"]
 
 Types = Sdf.ValueTypeNames
+
+BASE_COLOR = "base_color"
 
 
 def write_material_layer(
@@ -40,7 +48,9 @@ def write_material_layer(
         _author_facts(over(layer, item.prim_path), item)
         if _known(item):
             _author_lobe(layer, scopes.path("materials", item.identifier), item)
+        _author_base_color(layer, scopes.path("materials", item.identifier), item)
     looks = {
+        **aov_looks(layer, scopes, objects),
         "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
         "specular": author_look_materials(layer, scopes, "specular", _greys(objects, "psi")),
     }
@@ -56,17 +66,37 @@ def _author_lobe(layer: Sdf.Layer, material: str, item: FittedObject) -> None:
     attribute(shader, "inputs:useSpecularWorkflow", Types.Int, 0)
 
 
+def _author_base_color(layer: Sdf.Layer, material: str, item: FittedObject) -> None:
+    """The refined colour instead of the albedo, on what reflects."""
+    for aov in item.aovs:
+        if aov.name == BASE_COLOR and any(item.mean_color):
+            colour_from_texture(
+                layer, material, "diffuseColor", "BaseColorTexture", aov.file,
+                fallback=item.mean_color,
+            )  # fmt: skip
+
+
 def _author_facts(prim: Sdf.PrimSpec, item: FittedObject) -> None:
     apply_schema(prim, "UsdBrdfMaterialFitAPI")
     prefix = "usdBrdf:fit"
-    numbers = {"phi": item.phi, "psi": item.psi, "cost": item.cost, "evidence": item.evidence}
+    numbers = {
+        "phi": item.phi,
+        "psi": item.psi,
+        "phiError": item.phi_error,
+        "psiError": item.psi_error,
+        "cost": item.cost,
+        "evidence": item.evidence,
+    }
     for name, value in numbers.items():
         if math.isfinite(value):
             attribute(prim, f"{prefix}:{name}", Types.Float, float(value), uniform=True)
     attribute(prim, f"{prefix}:status", Types.Token, item.status, uniform=True)
+    for name, confidence in (("phi", item.phi_confidence), ("psi", item.psi_confidence)):
+        attribute(prim, f"{prefix}:{name}Confidence", Types.Token, confidence, uniform=True)
     attribute(prim, f"{prefix}:targetFrame", Types.Int, int(item.target_frame), uniform=True)
     attribute(prim, f"{prefix}:numPixels", Types.Int, int(item.num_pixels), uniform=True)
     attribute(prim, f"{prefix}:method", Types.Token, item.method, uniform=True)
+    author_aovs(prim, item.aovs)
 
 
 def _known(item: FittedObject) -> bool:

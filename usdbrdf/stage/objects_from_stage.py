@@ -77,7 +77,8 @@ def read_shading(stage: Usd.Stage, prim_path: str) -> ShadedObject | None:
         aovs=read_aovs(stage, prim_path),
         emitter=emitter,
         radiance=_colour(prim, "emitter:radiance"),
-        radiance_is_lower_bound=bool(_value(prim, "emitter:lowerBound")),
+        radiance_status=str(_value(prim, "emitter:radianceStatus") or "measured"),
+        radiance_error=_number(prim, "emitter:radianceError"),
         area_fraction=_number(prim, "emitter:areaFraction") if emitter else 0.0,
         mean_albedo=_colour(prim, "shading:meanAlbedo"),
         rays_per_texel=_number(prim, "shading:raysPerTexel"),
@@ -102,6 +103,10 @@ def read_fit(stage: Usd.Stage, prim_path: str) -> FittedObject | None:
         target_frame=int(_value(prim, "fit:targetFrame")),
         num_pixels=int(_value(prim, "fit:numPixels")),
         method=str(_value(prim, "fit:method")),
+        phi_error=_number(prim, "fit:phiError"),
+        psi_error=_number(prim, "fit:psiError"),
+        phi_confidence=str(_value(prim, "fit:phiConfidence")),
+        psi_confidence=str(_value(prim, "fit:psiConfidence")),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,9 @@ class ShadedObject:
 
     aovs                     "albedo" for a reflector, "emission" for an emitter, and others
     radiance                 mean radiance of the emitting texels; zeros for a reflector
-    radiance_is_lower_bound  the emitter was clipped in every photograph
+    radiance_status          "measured"; clipped in every photograph: "estimated" from the light
+                             that it casts, or "lowerBound" where that does not tell either
+    radiance_error           relative standard error of an estimated radiance, else NaN
     area_fraction            share of the surface that emits
     mean_albedo              area-weighted, linear; zeros for an emitter
     rays_per_texel           mean number of rays
@@ -71,12 +74,17 @@ class ShadedObject:
     aovs: tuple[Aov, ...]
     emitter: bool
     radiance: Colour
-    radiance_is_lower_bound: bool
+    radiance_status: str
+    radiance_error: float
     area_fraction: float
     mean_albedo: Colour
     rays_per_texel: float
     standard_error: float
     escaped_fraction: float
+
+    @property
+    def radiance_is_lower_bound(self) -> bool:
+        return self.radiance_status == "lowerBound"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +92,15 @@ class FittedObject:
     """Result of the fitting stage for one object; NaN where a number is not known.
 
     phi, psi      the paper's roughness and specular parameters, 0 to 1
+    phi_error, psi_error            standard deviations
+    phi_confidence, psi_confidence  "high", "low" or "none"
     cost          loss at the minimum
     evidence      1 - loss(phi, psi) / loss(no specular lobe)
     status        "measured", "prior", "unseen" or "failed"
     target_frame  index of the photograph from 0; -1 for none
     num_pixels    how many the fit used
+    aovs          "diffuse" and "base_color", if the fit refined them
+    mean_color    area-weighted base colour, linear
     """
 
     prim_path: str
@@ -101,3 +113,9 @@ class FittedObject:
     target_frame: int
     num_pixels: int
     method: str
+    phi_error: float = math.nan
+    psi_error: float = math.nan
+    phi_confidence: str = "none"
+    psi_confidence: str = "none"
+    aovs: tuple[Aov, ...] = ()
+    mean_color: Colour = (0.0, 0.0, 0.0)

@@ -100,6 +100,11 @@ def _author_facts(prim: Sdf.PrimSpec, item: ShadedObject) -> None:
         lower_bound, area = bool(item.radiance_is_lower_bound), float(item.area_fraction)
         attribute(prim, f"{prefix}:radiance", Types.Color3f, _colour(item.radiance), uniform=True)
         attribute(prim, f"{prefix}:lowerBound", Types.Bool, lower_bound, uniform=True)
+        status = item.radiance_status
+        attribute(prim, f"{prefix}:radianceStatus", Types.Token, status, uniform=True)
+        if status == "estimated":
+            error = float(item.radiance_error)
+            attribute(prim, f"{prefix}:radianceError", Types.Float, error, uniform=True)
         attribute(prim, f"{prefix}:areaFraction", Types.Float, area, uniform=True)
     author_aovs(prim, item.aovs)
 

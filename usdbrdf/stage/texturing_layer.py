@@ -14,7 +14,7 @@ from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
 from usdbrdf.stage.input_bindings import recorded_bindings
 from usdbrdf.stage.looks import LIT, author_look_materials, author_looks
-from usdbrdf.stage.records import Aov, Float, ShadedObject, TexturedObject
+from usdbrdf.stage.records import Aov, FittedObject, Float, ShadedObject, TexturedObject
 from usdbrdf.stage.schema import verify
 from usdbrdf.stage.scopes import Scopes
 
@@ -81,7 +81,7 @@ def author_aovs(prim: Sdf.PrimSpec, aovs: Sequence[Aov]) -> None:
 def aov_looks(
     layer: Sdf.Layer,
     scopes: Scopes,
-    objects: Sequence[TexturedObject] | Sequence[ShadedObject],
+    objects: Sequence[TexturedObject] | Sequence[ShadedObject] | Sequence[FittedObject],
     *,
     hidden: frozenset[str] = frozenset(),
 ) -> dict[str, dict[str, str]]:

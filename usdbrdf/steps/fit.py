@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.errors import UsageError
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stage import StageResult, StageRun
@@ -23,15 +21,17 @@ from usdbrdf.material.lit_scene import LitScene, View
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.prior import NEUTRAL, class_prior
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
+from usdbrdf.material.verdict import verdict_on_frame, verdict_on_views
 from usdbrdf.scan.frame_reading import read_frame
 from usdbrdf.scan.scan import Frames
-from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.lights import lights_from_radiance
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.material_layer import write_material_layer
 from usdbrdf.stage.read import frames_from_stage, open_weaker
 from usdbrdf.stage.records import FittedObject
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.steps.atlas import Atlas, MapWriter, atlas_from_stage
+from usdbrdf.steps.lit import lit_scene
+from usdbrdf.steps.preview import overview
+from usdbrdf.steps.refine import Lobes, refined_maps
 from usdbrdf.steps.step import Step, hash_of_files, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
 from usdbrdf.steps.texture import FILLED, MEASURED
@@ -40,11 +40,6 @@ Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
-# Below this evidence the frames do not tell one material from another (on captures with known
-# materials no such fit could be trusted), and the class prior is written instead.
-MIN_EVIDENCE = 0.1
-# And roughnesses that far apart must not fit alike.
-MAX_PHI_RANGE = 0.4
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
@@ -54,10 +49,10 @@ Method = Literal["views", "scaled", "paper"]
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """method "views": many views of the same texels, L_d free per texel; "scaled": the target frame
-    alone, L_d times a free factor per channel (what "views" falls back to for an object that too
-    few frames show); "paper": the target frame, the paper's residual, its minimum always kept.
-    max_pixels: of the target frame. Without evidence the first two write the class prior."""
+    """method "views": many views of the same texels, L_d free per texel, and L_d refined with what
+    was found; "scaled": the target frame alone, L_d times a free factor per channel; "paper": the
+    target frame, the paper's residual, its minimum always kept. max_pixels: of the target frame.
+    Without evidence the first two write the class prior."""
 
     method: Method = "views"
     max_pixels: int = 1500
@@ -82,7 +77,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         inputs={
             **layers,
             **environment_hash(options.environment),
-            "maps": hash_of_maps(asset, "lit", "coverage", "emission"),
+            "maps": hash_of_maps(asset, "lit", "coverage", "irradiance", "emission"),
             "frames": hash_of_files(frames.image_paths),
         },
     )
@@ -90,7 +85,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
     def work(run: StageRun) -> dict[str, Any]:
         atlas = atlas_from_stage(stage)
         environment = environment_from_file(options.environment, step.header.up_axis)
-        lit = _lit_scene(atlas, environment)
+        lit = lit_scene(atlas, environment)
         survey = _survey(run, atlas, lit, frames, options)
         seen = atlas.map("coverage")[:, 0] != FILLED
         objects = []
@@ -101,6 +96,8 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
                 f"object-{i}", partial(_fit_arrays, lit, atlas.texels, frames, survey, i, options)
             )
             objects.append(_record(lit, i, found, options, bool(seen[own].any())))
+        if options.method == "views":
+            objects = _refined(run, asset, atlas, lit, frames, objects, options)
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
             asset,
@@ -113,32 +110,47 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
     return step.run(work)
 
 
+def _refined(
+    run: StageRun,
+    asset: Asset,
+    atlas: Atlas,
+    lit: LitScene,
+    frames: Frames,
+    objects: list[FittedObject],
+    options: FitOptions,
+) -> list[FittedObject]:
+    """The objects with maps of L_d and base colour that are free of their specular light."""
+    lobes = Lobes(
+        phi=np.array([item.phi for item in objects], np.float32),
+        psi=np.array([item.psi for item in objects], np.float32),
+    )
+    maps = refined_maps(run, atlas, lit, frames, lobes, options.seed)
+    writer = MapWriter(run, asset, atlas.texels)
+    refined = []
+    for i, (obj, item) in enumerate(zip(atlas.scene.objects, objects, strict=True)):
+        own = atlas.texels.of_object(i)
+        area = np.maximum(atlas.texels.area[own], 1e-12)
+        r, g, b = np.average(maps["base_color"].values[own], axis=0, weights=area)
+        aovs = writer.write(i, obj, maps)
+        refined.append(replace(item, aovs=aovs, mean_color=(float(r), float(g), float(b))))
+    view = overview(atlas.scene, lit.rays, frames)
+    view.write(
+        run.output("previews/base_color.png"), atlas.texels, maps["base_color"].values, exposure=1
+    )
+    return refined
+
+
 def _said(item: FittedObject) -> dict[str, Any]:
     """What the summary says of an object."""
     return {
         "phi": round(item.phi, 4),
         "psi": round(item.psi, 4),
+        "phi_error": round(item.phi_error, 4) if math.isfinite(item.phi_error) else None,
+        "psi_error": round(item.psi_error, 4) if math.isfinite(item.psi_error) else None,
         "status": item.status,
         "evidence": round(item.evidence, 4) if math.isfinite(item.evidence) else 0.0,
         "target_frame": item.target_frame,
     }
-
-
-def _lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
-    scene, texels = atlas.scene, atlas.texels
-    lit = atlas.map("lit")
-    emissive = (atlas.map_where_present("emission", 3) > 0).any(axis=1, keepdims=True)
-    return LitScene(
-        scene=scene,
-        rays=RayScene(scene.points, scene.triangles),
-        radiance=surface_texture(texels, scene.face_object, lit),
-        lights=lights_from_radiance(scene, texels, lit),
-        emission=surface_texture(
-            texels, scene.face_object, np.repeat(emissive.astype(np.float32), 3, axis=1)
-        ),
-        environment=environment,
-        size=float(np.linalg.norm(np.ptp(scene.points, axis=0))),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,25 +211,29 @@ def _fit_arrays(
     index: int,
     options: FitOptions,
 ) -> dict[str, npt.NDArray[Any]]:
-    """phi, psi, cost, evidence, lowest and highest phi that fit as well (NaN where the object could
-    not be fitted), the number of samples, and the target frame (-1: many frames)."""
-    found, used, target = None, 0, -1
+    """phi, psi, their errors, cost and evidence (NaN where the object could not be fitted), the
+    number of samples, and the target frame (-1: many frames)."""
+    numbers, used, target = np.full(6, np.nan), 0, -1
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
-        found, used = fit_views(
+        lobe, used = fit_views(
             lit, texels, own, lambda frame: _view(frames, frame, *nothing), index, options.seed
         )
-    if found is None and survey.target[index] >= 0 and not _is_lamp(lit, index):
+        if lobe is not None:
+            numbers[:] = (
+                lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.cost, lobe.evidence
+            )  # fmt: skip
+    elif survey.target[index] >= 0 and not _is_lamp(lit, index):
         target = int(survey.target[index])
         pixels = read_frame(frames, target)
         view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
         residual: Residual = "paper" if options.method == "paper" else "scaled"
         found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
-    numbers = np.full(6, np.nan)
-    if found is not None:
-        numbers[:4] = found.phi, found.psi, found.cost, found.evidence
-        numbers[4:] = found.phi_low, found.phi_high
+        if found is not None:
+            # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
+            error = (found.phi_high - found.phi_low) / math.sqrt(12)
+            numbers[:] = found.phi, found.psi, error, np.nan, found.cost, found.evidence
     return {"numbers": numbers, "used": np.array(used), "target": np.array(target)}
 
 
@@ -236,25 +252,20 @@ def _record(
     seen: bool,
 ) -> FittedObject:
     obj = lit.scene.objects[index]
-    phi, psi, cost, evidence, low, high = (float(number) for number in found["numbers"])
-    fitted = math.isfinite(phi)
-    target = int(found["target"])
-    if fitted and evidence >= MIN_EVIDENCE and high - low <= MAX_PHI_RANGE:
-        status = "measured"
-    elif fitted and options.method == "paper":
-        status = "failed"
+    phi, psi, phi_error, psi_error, cost, evidence = (float(x) for x in found["numbers"])
+    prior = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
+    if options.method == "views":
+        verdict = verdict_on_views((phi, phi_error), (psi, psi_error), evidence, prior, seen)
     else:
-        status = "prior" if seen else "unseen"
-        phi, psi = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
+        keep = options.method == "paper"
+        verdict = verdict_on_frame((phi, phi_error), psi, evidence, prior, seen, keep)
     return FittedObject(
         prim_path=obj.prim_path,
         identifier=obj.identifier,
-        phi=phi,
-        psi=psi,
         cost=cost,
         evidence=evidence,
-        status=status,
-        target_frame=target if fitted else -1,
+        target_frame=int(found["target"]) if math.isfinite(phi) else -1,
         num_pixels=int(found["used"]),
-        method="scaled" if fitted and options.method == "views" and target >= 0 else options.method,
+        method=options.method,
+        **vars(verdict),
     )

@@ -54,7 +54,7 @@ def overview(scene: Scene, rays: RayScene, frames: Frames) -> Overview:
     scale = min(1.0, _MAX_WIDTH / width)
     size = max(1, round(scale * width)), max(1, round(scale * height))
     return Overview(
-        scene=scene, hits=_hits(rays, frames, chosen, *size), width=size[0], height=size[1]
+        scene=scene, hits=camera_hits(rays, frames, chosen, *size), width=size[0], height=size[1]
     )
 
 
@@ -68,11 +68,11 @@ def overview_frame(scene: Scene, rays: RayScene, frames: Frames) -> int:
 def _objects_in_view(scene: Scene, rays: RayScene, frames: Frames, i: int) -> int:
     width, height = (int(n) for n in frames.resolution[i])
     scale = min(1.0, float(np.sqrt(_RAYS / (width * height))))
-    hits = _hits(rays, frames, i, max(1, round(scale * width)), max(1, round(scale * height)))
+    hits = camera_hits(rays, frames, i, max(1, round(scale * width)), max(1, round(scale * height)))
     return len(np.unique(scene.face_object[hits.face[hits.face >= 0]]))
 
 
-def _hits(rays: RayScene, frames: Frames, i: int, width: int, height: int) -> Hits:
+def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int) -> Hits:
     """First surfaces behind the frame's pixels, were it ``width`` x ``height`` pixels."""
     x, y = (width, height) / frames.resolution[i]
     lens = frames.intrinsics[i] * (x, y, x, y)

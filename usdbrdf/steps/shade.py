@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,39 +12,29 @@ import numpy.typing as npt
 
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.surface_radiance import surface_texture
-from usdbrdf.geometry.texels import Texels
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult, StageRun
-from usdbrdf.shading.albedo import albedo_from_irradiance
-from usdbrdf.shading.denoise import denoise_lightmap, require_oidn
+from usdbrdf.shading.denoise import require_oidn
 from usdbrdf.shading.emitters import Emitters, find_emitters
-from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.lights import lights_from_radiance
+from usdbrdf.shading.irradiance import Irradiance, Sampling
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_weaker
 from usdbrdf.stage.records import Aov, ShadedObject
 from usdbrdf.stage.shading_layer import write_shading_layer
+from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, MapWriter, TexelMap, atlas_from_stage
+from usdbrdf.steps.clipped import ClippedLight, estimate_clipped_light
 from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
 from usdbrdf.steps.texture import CLIPPED, MEASURED
-from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.steps.trace import denoised_irradiance, trace_irradiance
 
 Float = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 
-# Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
-# bounds the memory of the ray buffers.
-_TILE = 1 << 15
 # More Sobol points than this fill the memory, and improve nothing.
 _MAX_RAYS = 1 << 20
-# Albedo of a surface that nobody saw.
-NEUTRAL = 0.5
-# S below this share of the scene's median is darkness in which an albedo means nothing.
-_DARK = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,16 +71,19 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
 
     def work(run: StageRun) -> dict[str, Any]:
         atlas = atlas_from_stage(stage)
-        lit = atlas.map("lit")
         coverage = atlas.map("coverage")[:, 0]
+        seen, clipped = coverage == MEASURED, coverage == CLIPPED
         environment = environment_from_file(options.environment, step.header.up_axis)
         rays = RayScene(atlas.scene.points, atlas.scene.triangles)
-        traced = _trace(run, atlas, rays, lit, environment, options.sampling)
+        light = estimate_clipped_light(
+            run, atlas, rays, atlas.map("lit"), seen, clipped, environment, options.sampling.seed
+        )
+        traced = trace_irradiance(run, atlas, rays, light.lit, environment, options.sampling)
         irradiance = traced.mean
         if options.denoise == "oidn":
-            irradiance = _denoised(atlas.texels, traced.mean)
-        shaded = _shaded(atlas, lit, coverage, traced, irradiance)
-        summary = _write(run, step, atlas, lit, shaded)
+            irradiance = denoised_irradiance(atlas.texels, traced.mean)
+        shaded = _shaded(atlas, light, seen, clipped, traced, irradiance)
+        summary = _write(run, step, atlas, shaded)
         view = overview(atlas.scene, rays, frames_from_stage(stage))
         view.write(run.output("previews/albedo.png"), atlas.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), atlas.texels, irradiance)
@@ -100,69 +92,12 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
     return step.run(work)
 
 
-def _trace(
-    run: StageRun,
-    atlas: Atlas,
-    rays: RayScene,
-    lit: Float,
-    environment: Environment,
-    sampling: Sampling,
-) -> Irradiance:
-    scene, texels = atlas.scene, atlas.texels
-    radiance = surface_texture(texels, scene.face_object, lit)
-    lights = lights_from_radiance(scene, texels, lit)
-    size = float(np.linalg.norm(np.ptp(scene.points, axis=0)))
-    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
-    # surfaces lit from outside the scan.
-    dark = np.pi * lit.mean(axis=1)
-    order, patch = patches_of_texels(texels)
-    tiles = list(_tiles(patch))
-    say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
-
-    def tile(first: int, last: int) -> dict[str, npt.NDArray[Any]]:
-        index = order[first:last]
-        found = irradiance_at(
-            rays, radiance, lights, environment, texels.position[index], texels.normal[index],
-            patch[first:last], sampling, size, dark[index],
-        )  # fmt: skip
-        return dict(vars(found))
-
-    parts: dict[str, list[npt.NDArray[Any]]] = {}
-    for number, (first, last) in enumerate(
-        progress(tiles, total=len(tiles), label="shade", unit="tiles")
-    ):
-        done = run.checkpoint(f"tile-{number}", partial(tile, first, last))
-        for name, values in done.items():
-            parts.setdefault(name, []).append(values)
-    back = np.argsort(order)
-    return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
-
-
-def _tiles(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
-    """Ranges of about _TILE texels that do not cut a patch."""
-    starts = np.flatnonzero(np.diff(patch, prepend=-1))
-    first = 0
-    while first < len(patch):
-        after = np.searchsorted(starts, first + _TILE)
-        last = int(starts[after]) if after < len(starts) else len(patch)
-        yield first, last
-        first = last
-
-
-def _denoised(texels: Texels, irradiance: Float) -> Float:
-    return np.concatenate(
-        [
-            texels.from_image(i, denoise_lightmap(texels.image(i, irradiance)))
-            for i in range(len(texels.resolution))
-        ]
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Shaded:
-    """What is known of all texels: traced S and its (T,) relative error; S as it is used; the
-    emitters; albedo (T, 3) and the share of it that was over 1."""
+    """What is known of all texels: the light; traced S and its (T,) relative error; S as it is
+    used; the emitters; albedo (T, 3) and the share of it that was over 1."""
 
+    light: ClippedLight
     traced: Irradiance
     relative_error: Float
     irradiance: Float
@@ -172,15 +107,22 @@ class _Shaded:
 
 
 def _shaded(
-    atlas: Atlas, lit: Float, coverage: Float, traced: Irradiance, irradiance: Float
+    atlas: Atlas,
+    light: ClippedLight,
+    seen: Bool,
+    clipped: Bool,
+    traced: Irradiance,
+    irradiance: Float,
 ) -> _Shaded:
-    seen, clipped = coverage == MEASURED, coverage == CLIPPED
-    emitters = find_emitters(atlas.texels, lit, irradiance, seen, clipped)
-    albedo, over_one = _albedo(atlas.texels, lit, irradiance, seen, emitters)
+    emitters = find_emitters(
+        atlas.texels, light.lit, irradiance, seen, light.may_shine(clipped), light.least_of_lamps()
+    )
+    albedo, over_one = albedo_map(atlas.texels, light.lit, irradiance, seen, emitters.emissive)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / np.maximum(
         traced.mean.mean(axis=1), 1e-12
     )
     return _Shaded(
+        light=light,
         traced=traced,
         relative_error=relative,
         irradiance=irradiance,
@@ -203,12 +145,13 @@ def _maps(shaded: _Shaded) -> dict[str, TexelMap]:
     return maps
 
 
-def _write(run: StageRun, step: Step, atlas: Atlas, lit: Float, shaded: _Shaded) -> dict[str, Any]:
+def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str, Any]:
     """Maps, layer and summary."""
     traced, emissive = shaded.traced, shaded.emitters.emissive
+    shines = np.where(emissive[:, None], shaded.light.lit, 0)
     writer = MapWriter(run, step.asset, atlas.texels)
     maps = _maps(shaded)
-    emission = TexelMap(np.where(emissive[:, None], lit, 0), 1.0, "W/(m^2 sr)", exact=True)
+    emission = TexelMap(shines, 1.0, "W/(m^2 sr)", exact=True)
     objects = []
     for i, obj in enumerate(atlas.scene.objects):
         emits = emissive[atlas.texels.of_object(i)].any()
@@ -222,12 +165,17 @@ def _write(run: StageRun, step: Step, atlas: Atlas, lit: Float, shaded: _Shaded)
         objects,
     )
     writer.warn()
-    _warn(atlas.scene.objects, shaded.emitters, traced, shaded.over_one)
+    _warn(atlas.scene.objects, shaded)
     return {
         "rays_per_texel": float(traced.rays.mean()),
         "standard_error": float(np.median(shaded.relative_error)),
         "escaped_fraction": float(traced.escaped.mean()),
         "emitters": [item.identifier for item in objects if item.emitter],
+        "estimated_emitters": {
+            item.identifier: item.radiance_error
+            for item in objects
+            if item.emitter and item.radiance_status == "estimated"
+        },
         "albedo_over_one": shaded.over_one,
     }
 
@@ -242,7 +190,8 @@ def _record(atlas: Atlas, shaded: _Shaded, i: int, aovs: tuple[Aov, ...]) -> Sha
         aovs=aovs,
         emitter=bool(emitters.is_lamp[i]),
         radiance=_colour(emitters.radiance[i]),
-        radiance_is_lower_bound=bool(emitters.lower_bound[i]),
+        radiance_status=_status(shaded, i),
+        radiance_error=shaded.light.error_of_object(i) if emitters.lower_bound[i] else math.nan,
         area_fraction=float(np.average(emitters.emissive[own], weights=area)),
         mean_albedo=_colour(np.average(shaded.albedo[own], axis=0, weights=area)),
         rays_per_texel=float(traced.rays[own].mean()),
@@ -251,31 +200,30 @@ def _record(atlas: Atlas, shaded: _Shaded, i: int, aovs: tuple[Aov, ...]) -> Sha
     )
 
 
-def _albedo(
-    texels: Texels, lit: Float, irradiance: Float, seen: Bool, emitters: Emitters
-) -> tuple[Float, float]:
-    """(albedo (T, 3) in [0, 1] for the stage, share of the seen, non-emissive texels over 1)."""
-    floor = _DARK * float(np.median(irradiance.mean(axis=1)))
-    albedo, lit_enough = albedo_from_irradiance(lit, irradiance, max(floor, 1e-9))
-    reflects = seen & ~emitters.emissive
-    over = (albedo > 1).any(axis=1) & reflects & lit_enough
-    albedo = inpaint(texels, np.clip(albedo, 0, 1), reflects & lit_enough)
-    for i in range(len(texels.resolution)):
-        own = texels.of_object(i)
-        if not seen[own].any():
-            albedo[own] = NEUTRAL
-    albedo[emitters.emissive] = 0
-    return albedo, float(over.sum() / max(reflects.sum(), 1))
+def _status(shaded: _Shaded, i: int) -> str:
+    """How the radiance of what shines on object i is known."""
+    if not shaded.emitters.lower_bound[i]:
+        return "measured"
+    return "lowerBound" if math.isnan(shaded.light.error_of_object(i)) else "estimated"
 
 
-def _warn(objects: Any, emitters: Emitters, traced: Irradiance, over_one: float) -> None:
+def _warn(objects: Any, shaded: _Shaded) -> None:
+    emitters, traced, over_one = shaded.emitters, shaded.traced, shaded.over_one
     if not emitters.emissive.any():
         say("warning: no emitter was found, so a relit stage will be dark. [shading.no-light]")
-    for obj, bound in zip(objects, emitters.lower_bound, strict=True):
-        if bound:
+    for i, obj in enumerate(objects):
+        status = _status(shaded, i)
+        if status == "lowerBound":
             say(
                 f"warning: {obj.identifier}: saturated in every frame, its radiance is only a "
                 "lower bound. Capture a shorter exposure. [shading.clipped]"
+            )
+        elif status == "estimated":
+            radiance = ", ".join(f"{value:.3g}" for value in emitters.radiance[i])
+            say(
+                f"warning: {obj.identifier}: saturated in every frame; from the light that it "
+                f"casts its radiance is {radiance}, +-{100 * shaded.light.error_of_object(i):.0f} "
+                "%. Capture a shorter exposure to measure it. [shading.estimated]"
             )
     if over_one > 0.05:
         say(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +26,8 @@ from usdbrdf.texturing.samples_from_frame import (
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+# (frame, texels) -> what to take off their radiance, (len(texels), 3).
+Specular = Callable[[int, Int], Float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +79,11 @@ def radiance_from_frames(
     observed: Observation,
     quantile: float,
     start: int = 0,
+    specular: Specular | None = None,
 ) -> Iterator[int]:
     """Add frames start.. to ``observed``, in order; yields each frame's index once it is in.
+
+    specular  the light that a frame's samples hold besides the diffuse
 
     The next frame is read and decoded while this one is projected.
     """
@@ -97,7 +102,10 @@ def radiance_from_frames(
                 pixels.clipped, pose, lens,
             )  # fmt: skip
             sampled = np.flatnonzero(kind == SAMPLE).astype(np.int32)
-            psquare.update(observed.quantiles, sampled, radiance[sampled], quantile)
+            values = radiance[sampled]
+            if specular is not None:
+                values = values - specular(i, sampled)
+            psquare.update(observed.quantiles, sampled, values, quantile)
             saturated = kind == CLIPPED
             observed.clipped[saturated] += 1
             limit = np.float32(frames.saturation_radiance[i])

@@ -1,0 +1,159 @@
+"""Lamps of known radiance from the light that they cast, and how well that is said to be known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from usdbrdf.shading.clipped_emitters import LAMP_PRIOR, estimate_clipped_emitters
+from usdbrdf.shading.lamp_evidence import Evidence
+
+ROOM = np.array([4.0, 3.0, 2.5])
+LAMPS = np.array([[1.0, 1.0, 2.0], [3.2, 2.2, 1.6]])
+MULTIPLIER = np.array([[6.0, 5.0, 4.0], [2.0, 2.5, 3.0]])
+# What every surface mirrors of the surroundings, in the middle of what the estimator expects.
+AMBIENT = 0.015
+
+
+def _evidence(
+    seed: int = 0,
+    noise: float = 0.0,
+    agreeing: float = 0.0,
+    texture: float = 0.0,
+    outliers: float = 0.0,
+    lamps: np.ndarray = LAMPS,
+) -> Evidence:
+    """A box room with 60 texels on each wall, lit by small lamps and evenly by everything else.
+
+    noise: of log L_d per texel; agreeing: over half a metre; texture: of half of the texels, a
+    darker pattern; outliers: the share of the texels that highlights make three times as bright.
+    """
+    rng = np.random.default_rng(seed)
+    position, normal = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            points = rng.uniform(0, ROOM, (60, 3))
+            points[:, axis] = side * ROOM[axis]
+            position.append(points)
+            normal.append(np.broadcast_to((1 - 2 * side) * np.eye(3)[axis], (60, 3)))
+    position, normal = np.concatenate(position), np.concatenate(normal)
+    wall = np.repeat(np.arange(6, dtype=np.int32), 60)
+    cast = []
+    for lamp in lamps:
+        way = lamp - position
+        distance = np.linalg.norm(way, axis=1)
+        cast.append(0.3 * (way * normal).sum(axis=1) / distance**3)
+    lamp_irradiance = np.repeat(np.array(cast)[..., None], 3, axis=2)
+    irradiance = np.repeat(0.6 + 0.1 * position[:, 2:], 3, axis=1)
+    albedo = rng.uniform(0.2, 0.8, (6, 3))[wall]
+    reflected = albedo * (
+        irradiance + np.einsum("kc,knc->nc", MULTIPLIER[: len(lamps)], lamp_irradiance)
+    )
+    log_error = noise * rng.standard_normal(len(wall))
+    log_error -= texture * (rng.random(len(wall)) < 0.5)
+    distance = np.linalg.norm(position[:, None] - position, axis=-1)
+    covariance = np.where(wall[:, None] == wall, np.exp(-distance / 0.5), 0)
+    root = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(wall)))
+    log_error += agreeing * (root @ rng.standard_normal(len(wall)))
+    log_error += np.log(3) * (rng.random(len(wall)) < outliers)
+    radiance = (reflected + AMBIENT * irradiance) / np.pi * np.exp(log_error)[:, None]
+    return Evidence(
+        radiance=radiance.astype(np.float32),
+        irradiance=irradiance.astype(np.float32),
+        lamp_irradiance=lamp_irradiance.astype(np.float32),
+        position=position.astype(np.float32),
+        segment=wall,
+        object=wall,
+        prior=np.array([LAMP_PRIOR] * len(lamps)),
+    )
+
+
+def test_exact_light_gives_the_exact_lamps():
+    found = estimate_clipped_emitters(_evidence())
+    np.testing.assert_allclose(found.multiplier, MULTIPLIER, rtol=0.005)
+    assert found.determined.all()
+    assert found.standard_error.max() < 0.06
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"noise": 0.1},
+        {"agreeing": 0.1, "noise": 0.02},
+        {"texture": 0.5, "noise": 0.02},
+        {"outliers": 0.05, "noise": 0.05},
+    ],
+    ids=lambda fault: next(iter(fault)),
+)
+def test_the_stated_error_is_honest(fault: dict[str, float]):
+    scores, errors = [], []
+    for seed in range(4):
+        found = estimate_clipped_emitters(_evidence(seed, **fault))
+        # The channels share their texels' errors: one of them counts.
+        error = found.standard_error[:, 1]
+        scores.append(np.log(found.multiplier / MULTIPLIER)[:, 1] / error)
+        errors.append(error)
+        assert found.determined.all()
+    # 8 scores of at most unit variance: a root mean square over 1.8 has p < 1e-3.
+    assert np.sqrt(np.mean(np.square(scores))) < 1.8
+    # And it is not honest by saying nothing.
+    assert np.median(errors) < 0.25
+
+
+def test_outliers_do_not_pull():
+    clean = estimate_clipped_emitters(_evidence(3, noise=0.03))
+    spoilt = estimate_clipped_emitters(_evidence(3, noise=0.03, outliers=0.05))
+    np.testing.assert_allclose(spoilt.multiplier, clean.multiplier, rtol=0.08)
+
+
+def test_light_that_falls_like_the_other_light_tells_nothing():
+    evidence = _evidence(1, noise=0.03, lamps=LAMPS[:1])
+    even = 0.7 * evidence.irradiance[None]
+    found = estimate_clipped_emitters(replace(evidence, lamp_irradiance=even))
+    assert not found.determined.any()
+    assert (found.standard_error > 0.5).all()
+
+
+def test_lamps_at_one_place_are_not_told_apart():
+    evidence = _evidence(2, noise=0.03, lamps=LAMPS[[0, 0]])
+    found = estimate_clipped_emitters(evidence)
+    assert not found.determined.any()
+    # Their sum is known all the same.
+    np.testing.assert_allclose(found.multiplier.sum(axis=0), MULTIPLIER.sum(axis=0), rtol=0.15)
+
+
+def test_a_lamp_darker_than_its_bound_is_not_believed():
+    evidence = _evidence(4, noise=0.03)
+    bounds = evidence.lamp_irradiance * np.array([20, 1])[:, None, None]
+    found = estimate_clipped_emitters(replace(evidence, lamp_irradiance=bounds))
+    np.testing.assert_array_equal(found.determined, [False, True])
+    assert found.multiplier[0].max() >= 1
+
+
+def test_one_channel_may_lie_below_the_bound():
+    # Where red clips at 4, blue need not: the bound is one number for all three.
+    evidence = _evidence(5, noise=0.03)
+    bounds = evidence.lamp_irradiance * np.array([5, 1])[:, None, None]
+    found = estimate_clipped_emitters(replace(evidence, lamp_irradiance=bounds))
+    assert found.determined.all()
+    np.testing.assert_allclose(found.multiplier[0], MULTIPLIER[0] / 5, rtol=0.15)
+
+
+def test_without_texels_nothing_is_known():
+    evidence = _evidence()
+    few = np.arange(3)
+    found = estimate_clipped_emitters(
+        replace(
+            evidence,
+            radiance=evidence.radiance[few],
+            irradiance=evidence.irradiance[few],
+            lamp_irradiance=evidence.lamp_irradiance[:, few],
+            position=evidence.position[few],
+            segment=evidence.segment[few],
+            object=evidence.object[few],
+        )
+    )
+    assert not found.determined.any()
+    np.testing.assert_array_equal(found.multiplier, 1)

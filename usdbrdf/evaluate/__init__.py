@@ -1,0 +1,1 @@
+"""From an asset to figures and pictures: against photographs, known truth, another asset."""

@@ -1,0 +1,109 @@
+"""What a camera would see of the asset by the paper's image model (eq. 1, 2), and by its baseline.
+
+baseline   I = L_d                          the lit texture, the same from everywhere
+full       I = diffuse + I_nd(phi, psi)     one specular bounce of the lit texture
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.geometry.surface_radiance import SurfaceTexture
+from usdbrdf.material.lit_scene import LitScene
+from usdbrdf.material.predict import non_diffuse_radiance
+from usdbrdf.material.target_frames import SurfacePoints, visible_points
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+# Surface points of a picture at once: what bounds the memory.
+_POINTS_AT_ONCE = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewedAsset:
+    """What is seen: the scene with its light; L_d, and L_d without specular light, on the surface;
+    the lobe of each object, (num_objects,), NaN for none."""
+
+    lit: LitScene
+    measured: SurfaceTexture
+    diffuse: SurfaceTexture
+    phi: Float
+    psi: Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderedView:
+    """baseline, full (H, W, 3) radiance, pixels averaged over their sub-pixels; surface (H, W):
+    all of the pixel shows the asset; lamp (H, W): some of it shows an emitter."""
+
+    baseline: Float
+    full: Float
+    surface: Bool
+    lamp: Bool
+
+
+def render_view(
+    seen: ViewedAsset,
+    world_from_camera: Double,
+    intrinsics: Double,
+    size: tuple[int, int],
+    *,
+    per_side: int,
+    rays: int,
+    seed: int,
+) -> RenderedView:
+    """One picture of ``size`` (width, height), box-filtered over ``per_side``^2 points per pixel.
+
+    rays  traced per pixel for I_nd, shared among its points
+    """
+    width, height = size
+    per_pixel = per_side**2
+    rows = max(1, _POINTS_AT_ONCE // (width * per_pixel))
+    bands = []
+    for top in range(0, height, rows):
+        pixels = _sub_pixels(width, top, min(top + rows, height), per_side)
+        points = visible_points(
+            seen.lit.rays, seen.lit.scene, world_from_camera, intrinsics, pixels
+        )
+        values = _points_radiance(seen, points, max(1, rays // per_pixel), seed + top)
+        bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
+    picture = np.concatenate(bands).astype(np.float32)
+    return RenderedView(
+        baseline=picture[..., :3],
+        full=picture[..., 3:6],
+        surface=picture[..., 6] > 1 - 0.5 / per_pixel,
+        lamp=picture[..., 7] > 0,
+    )
+
+
+def _sub_pixels(width: int, top: int, bottom: int, per_side: int) -> Double:
+    """(R, 2) points of rows top to bottom, pixel by pixel, ``per_side``^2 in each."""
+    offset = (np.arange(per_side) + 0.5) / per_side
+    rows, columns, down, right = np.meshgrid(
+        np.arange(top, bottom), np.arange(width), offset, offset, indexing="ij"
+    )
+    return np.stack([columns + right, rows + down], axis=-1).reshape(-1, 2)
+
+
+def _points_radiance(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int) -> Float:
+    """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
+    hit = points.face >= 0
+    place = points.face, points.u, points.v
+    lamp = hit & (seen.lit.emission.at(*place)[:, 0] > 0.5)
+    values = np.zeros((len(hit), 8), np.float32)
+    values[:, :3] = seen.measured.at(*place)
+    values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
+    values[:, 6], values[:, 7] = hit, lamp
+    owner = seen.lit.owner(points.face)
+    known = np.isfinite(seen.phi) & np.isfinite(seen.psi)
+    reflects = np.flatnonzero(hit & ~lamp & known[owner])
+    owner = owner[reflects]
+    values[reflects, 3:6] += non_diffuse_radiance(
+        seen.lit, points.take(reflects), seen.phi[owner], seen.psi[owner], rays, seed
+    )
+    return values

@@ -1,0 +1,58 @@
+"""The asset as it lies on disk -> what cameras see of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.evaluate.render_view import ViewedAsset
+from usdbrdf.geometry.surface_radiance import surface_texture
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.header import read_header
+from usdbrdf.stage.read import aov_path, open_measured, read_fit
+from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.steps.lit import lit_scene
+from usdbrdf.steps.surroundings import environment_from_file
+
+
+def measured_atlas(folder: Path) -> tuple[Asset, Atlas]:
+    """The maps of an asset that all steps have been through, without the artist's layer."""
+    asset = Asset.at(folder)
+    if not asset.root_layer.is_file():
+        raise InputRefused(f"{folder}: there is no asset in this folder. [asset.missing]")
+    return asset, atlas_from_stage(open_measured(asset))
+
+
+def has_map(atlas: Atlas, aov: str) -> bool:
+    """Whether any object has the map."""
+    return any(aov_path(atlas.stage, obj.prim_path, aov) for obj in atlas.scene.objects)
+
+
+def map_or(atlas: Atlas, aov: str, otherwise: str) -> str:
+    """The name of the first map where the asset has it, else of the second."""
+    return aov if has_map(atlas, aov) else otherwise
+
+
+def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> ViewedAsset:
+    """Its light, its diffuse radiance (``diffuse``, else ``lit``), its lobes as the fit left them.
+
+    environment  latitude-longitude picture of the surroundings, None: black
+    """
+    fits = [read_fit(atlas.stage, obj.prim_path) for obj in atlas.scene.objects]
+    if any(fit is None for fit in fits):
+        raise InputRefused(
+            f"{asset.folder}: its objects have no roughness and specular yet. Run `usdbrdf fit` "
+            "first. [asset.incomplete]"
+        )
+    up_axis = read_header(asset.layer("scan")).up_axis
+    texels, face_object = atlas.texels, atlas.scene.face_object
+    diffuse = atlas.map_where_present(map_or(atlas, "diffuse", "lit"), 3)
+    return ViewedAsset(
+        lit=lit_scene(atlas, environment_from_file(environment, up_axis)),
+        measured=surface_texture(texels, face_object, atlas.map("lit")),
+        diffuse=surface_texture(texels, face_object, diffuse),
+        phi=np.array([fit.phi for fit in fits if fit], np.float32),
+        psi=np.array([fit.psi for fit in fits if fit], np.float32),
+    )

@@ -1,0 +1,118 @@
+"""The lobe that explains many views best: two levels of roughness, specular in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.material.lobe_posterior import LobeEstimate, lobe_from_costs
+from usdbrdf.material.view_model import ViewModel, ViewSamples
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Basis = Callable[[float], tuple[Float, Float]]
+
+# Roughnesses that are tried, and how many more between the best one and each neighbour of it.
+_LEVEL_1 = (
+    0.0, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9,
+    1.0,
+)  # fmt: skip
+_LEVEL_2 = 3
+# Steps of expectation maximisation, each after a search of level 1; and how many more with another
+# candidate than the first.
+_UPDATES, _MORE = 4, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """What the lobe would look like with one footprint of the samples.
+
+    first, second  phi -> (base, slope) of I_nd = base + psi slope, (P, 3) each, with independent
+                   noise
+    blur           standard deviation of the normal over a footprint, in radians
+    """
+
+    first: Basis
+    second: Basis
+    blur: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """c0, c1, c2 of cost(psi) = c0 - 2 psi c1 + psi^2 c2 at each roughness, (K, 3)."""
+
+    phis: Sequence[float]
+    terms: Double
+
+    @property
+    def least(self) -> tuple[float, int, float]:
+        """The least cost, with the index of its roughness and its psi in [0, 1]."""
+        square = np.maximum(self.terms[:, 2], 1e-12)
+        psi = np.clip(self.terms[:, 1] / square, 0, 1)
+        cost = self.terms[:, 0] - 2 * psi * self.terms[:, 1] + psi**2 * square
+        best = int(cost.argmin())
+        return float(cost[best]), best, float(psi[best])
+
+
+def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstimate:
+    """The lobe, and the footprint, that explain the samples best.
+
+    The errors' variances are found with the first candidate. With them fixed all candidates are
+    compared, and the best one is fitted.
+    """
+    model = ViewModel(samples)
+    tables = [_Table(candidate) for candidate in candidates]
+    best = 0
+    for _ in range(_UPDATES):
+        _improve(model, samples, tables[0])
+    if len(tables) > 1:
+        costs = [_search(model, samples.radiance, table, _LEVEL_1).least[0] for table in tables]
+        best = int(np.argmin(costs))
+    if best > 0:
+        for _ in range(_MORE):
+            _improve(model, samples, tables[best])
+    coarse = _search(model, samples.radiance, tables[best], _LEVEL_1)
+    fine = _search(model, samples.radiance, tables[best], _with_level_2(coarse.least[1]))
+    whole = model.reduced(samples.radiance)
+    return lobe_from_costs(
+        np.array(fine.phis),
+        fine.terms,
+        model.product(whole, whole),
+        model.degrees_of_freedom,
+        candidates[best].blur,
+    )
+
+
+class _Table:
+    """A candidate's two bases, evaluated once per roughness."""
+
+    def __init__(self, candidate: Candidate) -> None:
+        self.at = cache(lambda phi: (candidate.first(phi), candidate.second(phi)))
+
+
+def _improve(model: ViewModel, samples: ViewSamples, table: _Table) -> None:
+    _, best, psi = _search(model, samples.radiance, table, _LEVEL_1).least
+    (b1, a1), (b2, a2) = table.at(_LEVEL_1[best])
+    model.update((b1 + b2 + psi * (a1 + a2)) / 2)
+
+
+def _search(model: ViewModel, radiance: Float, table: _Table, phis: Sequence[float]) -> _Search:
+    terms = np.zeros((len(phis), 3))
+    for k, phi in enumerate(phis):
+        rest = [model.reduced(radiance - base) for base, _ in table.at(phi)]
+        slopes = [model.reduced(slope) for _, slope in table.at(phi)]
+        crossed = model.product(slopes[0], rest[1]) + model.product(slopes[1], rest[0])
+        terms[k] = model.product(*rest), crossed / 2, model.product(*slopes)
+    return _Search(phis=phis, terms=terms)
+
+
+def _with_level_2(best: int) -> list[float]:
+    """Level 1, and more roughnesses on both sides of its ``best``."""
+    ends = [_LEVEL_1[k] for k in range(max(best - 1, 0), min(best + 2, len(_LEVEL_1)))]
+    between = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
+    return sorted({*_LEVEL_1, *(float(phi) for part in between for phi in part)})

@@ -1,0 +1,89 @@
+"""From a cost over roughness and specular to their values, and how sure they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Double = npt.NDArray[np.float64]
+
+_PSI_GRID = np.linspace(0, 1, 201)
+# Differences of the cost by this share of the whole are not told apart, however many the samples:
+# on captures with known materials, errors of the model explained 0.2 to 3 % of the cost of objects
+# that show no lobe.
+_MODEL_DISCREPANCY = 0.01
+# Standard deviation of a number in [0, 1] of which nothing is known.
+NOTHING_KNOWN = 1 / np.sqrt(12)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LobeEstimate:
+    """phi, psi in [0, 1], where the cost is least; their standard deviations, which near
+    NOTHING_KNOWN say just that; cost per degree of freedom; evidence = 1 - cost / cost without any
+    specular light."""
+
+    phi: float
+    psi: float
+    phi_error: float
+    psi_error: float
+    cost: float
+    evidence: float
+
+
+def lobe_from_costs(
+    phis: Double, terms: Double, without: float, freedom: int, blur: float
+) -> LobeEstimate:
+    """The best lobe and its errors.
+
+    phis     (K,) ascending, from 0 to 1
+    terms    (K, 3): cost(phi, psi) = c0 - 2 psi c1 + psi^2 c2
+    without  cost without specular light
+    freedom  degrees of freedom, for the unit of the cost
+    blur     standard deviation, in radians, of the surface normal over the footprint of a sample: a
+             lobe narrower than that is not seen as such
+    """
+    square = np.maximum(terms[:, 2], 1e-12 * max(abs(without), 1.0))
+    psi = np.clip(terms[:, 1] / square, 0, 1)
+    profile = terms[:, 0] - 2 * psi * terms[:, 1] + psi**2 * square
+    phi = _vertex(phis, profile)
+    least = float(profile.min())
+    surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
+    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0))
+    density = np.exp(-0.5 * (surface - surface.min()) / temper)
+    density *= np.gradient(phis)[:, None]
+    density /= density.sum()
+    phi_error = _deviation(density.sum(axis=1), phis, phi)
+    best_psi = float(np.interp(phi, phis, psi))
+    psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
+    # How much pictures are smoothed is known badly: what twice the footprint would add to phi.
+    footprint = math.hypot(phi, 2 * blur) - phi
+    return LobeEstimate(
+        phi=phi,
+        psi=best_psi,
+        phi_error=min(float(np.hypot(phi_error, footprint)), NOTHING_KNOWN),
+        psi_error=min(
+            float(np.hypot(psi_error, best_psi * footprint / max(phi, 0.01))), NOTHING_KNOWN
+        ),
+        cost=least / max(freedom, 1),
+        evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
+    )
+
+
+def _vertex(phis: Double, profile: Double) -> float:
+    """The minimiser of the parabola through the least value and its neighbours."""
+    k = int(profile.argmin())
+    if k in (0, len(profile) - 1):
+        return float(phis[k])
+    x = phis[k - 1 : k + 2]
+    a, b, _ = np.polyfit(x - x[1], profile[k - 1 : k + 2] - profile[k], 2)
+    if a <= 0:
+        return float(x[1])
+    return float(np.clip(x[1] - b / (2 * a), x[0], x[2]))
+
+
+def _deviation(density: Double, values: Double, about: float) -> float:
+    """Root mean square distance from ``about``."""
+    return float(np.sqrt((density * (values - about) ** 2).sum()))

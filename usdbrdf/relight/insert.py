@@ -1,0 +1,202 @@
+"""Placing models in the scene: by numbers, by a matrix, or by letting them fall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.errors import UsageError
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.relight.surfaces import Double, Int, Surface, constant_map
+
+_UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Insert:
+    """A model and what to do with it. Lengths in units of the asset's stage.
+
+    at          (3,) where the model's origin comes to lie; None: the stage's origin
+    drop        (2,) or (3,) the horizontal coordinates over which it falls, and from what height
+    matrix      (4, 4) world from model, column vectors, instead of all of these
+    scale       factor on the model's size
+    rotate_deg  about the up axis, counter-clockwise seen from above
+    up          the model's up axis, "Y" or "Z"; None: as its format says
+    roughness, ior, metallic, color   of the material, instead of the model's own
+    """
+
+    model: Path
+    at: tuple[float, ...] | None = None
+    drop: tuple[float, ...] | None = None
+    matrix: Double | None = None
+    scale: float = 1.0
+    rotate_deg: float = 0.0
+    up: str | None = None
+    roughness: float | None = None
+    ior: float | None = None
+    metallic: float | None = None
+    color: tuple[float, ...] | None = None
+
+    @property
+    def falls_from_eye_height(self) -> bool:
+        return self.drop is not None and len(self.drop) == 2
+
+
+def turned_up(model_up: str, scene_up: str) -> Double:
+    """(4, 4) rotation about x that brings one up axis to the other."""
+    turn = np.eye(4)
+    if model_up != scene_up:
+        sign = 1.0 if scene_up == "Z" else -1.0
+        turn[1:3, 1:3] = [[0.0, -sign], [sign, 0.0]]
+    return turn
+
+
+def rotation_about(up_axis: str, degrees: float) -> Double:
+    """(4, 4) counter-clockwise seen from the tip of the axis."""
+    x, y, z = _UP[up_axis]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]])
+    angle = np.radians(degrees)
+    turn = np.eye(4)
+    turn[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return turn
+
+
+def placed(
+    surfaces: Sequence[Surface],
+    insert: Insert,
+    *,
+    up_axis: str,
+    metres_per_unit: float,
+    scene: Sequence[Surface],
+    eye_height: float,
+) -> tuple[Surface, ...]:
+    """The model's surfaces (metres, up axis as the scene's) where the insert wants them.
+
+    scene       what a falling model comes to rest on
+    eye_height  metres along the up axis, from which it falls unless a height is given
+    """
+    if insert.matrix is not None:
+        return tuple(
+            surface.moved(_in_metres(insert.matrix, metres_per_unit)) for surface in surfaces
+        )
+    turn = rotation_about(up_axis, insert.rotate_deg) @ np.diag([*(insert.scale,) * 3, 1.0])
+    moved = tuple(surface.moved(turn) for surface in surfaces)
+    if insert.drop is None:
+        offset = np.array(insert.at or (0.0, 0.0, 0.0)) * metres_per_unit
+        return tuple(surface.moved(_translation(offset)) for surface in moved)
+    return _dropped(moved, insert, up_axis, metres_per_unit, scene, eye_height)
+
+
+def with_material(surface: Surface, insert: Insert) -> Surface:
+    """The surface with what the insert says about its material."""
+    material = surface.material
+    metallic = insert.metallic or 0.0
+    if insert.color is not None:
+        surface = replace(surface, corner_colour=None)
+        material = replace(material, diffuse=constant_map(*insert.color))
+    if insert.roughness is not None:
+        material = replace(material, roughness=constant_map(insert.roughness)[..., :1])
+    if insert.ior is not None or insert.metallic is not None:
+        ior = 1.5 if insert.ior is None else insert.ior
+        dielectric = np.float32(((1 - ior) / (1 + ior)) ** 2)
+        f0 = dielectric + np.float32(metallic) * (material.diffuse - dielectric)
+        diffuse = material.diffuse * np.float32(1 - metallic)
+        material = replace(material, f0=np.asarray(f0, np.float32), diffuse=diffuse)
+    return replace(surface, material=material)
+
+
+def _in_metres(matrix: Double, metres_per_unit: float) -> Double:
+    scaled = np.array(matrix, np.float64)
+    scaled[:3, 3] *= metres_per_unit
+    return scaled
+
+
+def _translation(offset: Double) -> Double:
+    matrix = np.eye(4)
+    matrix[:3, 3] = offset
+    return matrix
+
+
+def _dropped(
+    model: tuple[Surface, ...],
+    insert: Insert,
+    up_axis: str,
+    metres_per_unit: float,
+    scene: Sequence[Surface],
+    eye_height: float,
+) -> tuple[Surface, ...]:
+    """The model over the wanted place, at the height at which it first touches the scene."""
+    assert insert.drop is not None
+    wanted = np.array(insert.drop) * metres_per_unit
+    vertical = int(np.argmax(_UP[up_axis]))
+    level = [axis for axis in range(3) if axis != vertical]
+    bounds = np.array([surface.bounds for surface in model])
+    middle = (bounds[:, 0].min(axis=0) + bounds[:, 1].max(axis=0)) / 2
+    offset = np.zeros(3)
+    # In a y-up world the horizontal coordinates are x and z.
+    offset[level] = wanted[:2] - middle[level]
+    over = tuple(surface.moved(_translation(offset)) for surface in model)
+    start = wanted[2] if len(wanted) == 3 else eye_height
+    rest = _resting_height(_soup(over), _soup(scene), vertical, start)
+    if rest is None:
+        raise UsageError(
+            f"--insert {insert.model}: nothing lies below drop="
+            f"{','.join(f'{value:g}' for value in insert.drop)} to come to rest on. Choose another "
+            "place, or a height as third number. [relight.drop]"
+        )
+    offset = np.zeros(3)
+    offset[vertical] = rest
+    return tuple(surface.moved(_translation(offset)) for surface in over)
+
+
+def _resting_height(
+    model: tuple[Double, Int], scene: tuple[Double, Int], vertical: int, start: float
+) -> float | None:
+    """What to add to the model's heights so that it touches the scene from above.
+
+    Both ways: the model's points fall on the scene's triangles, and the scene's points below
+    ``start`` rise to the model's. Where an edge alone meets an edge, nothing is noticed.
+    """
+    points, triangles = model
+    down, up = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    down[vertical], up[vertical] = -1, 1
+    lifts = []
+
+    used = points[np.unique(triangles)]
+    origins = used.astype(np.float32)
+    origins[:, vertical] = start
+    hits = _soup_rays(scene).closest(origins, np.tile(down, (len(origins), 1)))
+    fell = hits.face >= 0
+    lifts.append((start - hits.distance[fell]) - used[fell, vertical])
+
+    low, high = used.min(axis=0), used.max(axis=0)
+    below = scene[0][np.unique(scene[1])]
+    level = [axis for axis in range(3) if axis != vertical]
+    under = (below[:, level] >= low[level]).all(axis=1) & (below[:, level] <= high[level]).all(
+        axis=1
+    )
+    under &= below[:, vertical] < start
+    below = below[under]
+    if len(below):
+        origins = below.astype(np.float32)
+        base = low[vertical] - 1.0
+        origins[:, vertical] = base
+        hits = _soup_rays(model).closest(origins, np.tile(up, (len(origins), 1)))
+        met = hits.face >= 0
+        lifts.append(below[met, vertical] - (base + hits.distance[met]))
+    heights = np.concatenate(lifts)
+    return float(heights.max()) if len(heights) else None
+
+
+def _soup(surfaces: Sequence[Surface]) -> tuple[Double, Int]:
+    starts = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
+    points = np.concatenate([surface.points for surface in surfaces])
+    triangles = [s.triangles + starts[i] for i, s in enumerate(surfaces)]
+    return points, np.concatenate(triangles).astype(np.int32)
+
+
+def _soup_rays(soup: tuple[Double, Int]) -> RayScene:
+    return RayScene(soup[0].astype(np.float32), soup[1])

@@ -1,0 +1,112 @@
+"""The lobe that was fitted (docs/equations.md) as a BSDF of Mitsuba's vectorised variants."""
+
+from __future__ import annotations
+
+from typing import Any
+
+NAME = "usdbrdf_lobe"
+_registered: set[str] = set()
+
+
+def register(mi: Any) -> None:
+    """Make the plugin ``usdbrdf_lobe`` known to the variant that is set.
+
+    It takes the textures ``diffuse`` and ``f0`` (colours) and ``phi``, the roughness parameter of
+    the lobe: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h), with
+    D: GGX, alpha = max(0.001, phi); G1(x) = 1 / (x + sqrt(x^2 + y^2 - x^2 y^2)),
+    y = (phi / 2 + 1 / 2)^2, whose product holds 1 / (4 cos cos); F = f0 + (1 - f0) (1 - wo.h)^5.
+    The back is black. B. Haefner et al. 2021, eq. 2 to 6.
+    """
+    if mi.variant() not in _registered:
+        mi.register_bsdf(NAME, _plugin_class(mi))
+        _registered.add(mi.variant())
+
+
+def _plugin_class(mi: Any) -> Any:
+    # The base class exists only once a variant is set, so the class is made here.
+    import drjit as dr
+
+    class Lobe(mi.BSDF):  # type: ignore[misc]
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            self.diffuse = props.get_texture("diffuse")
+            self.f0 = props.get_texture("f0")
+            self.phi = props.get_texture("phi")
+            glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            matte = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [glossy, matte]
+            self.m_flags = glossy | matte
+
+        def _parameters(self, si: Any, active: Any) -> tuple[Any, Any, Any]:
+            phi = self.phi.eval_1(si, active)
+            return self.diffuse.eval(si, active), self.f0.eval(si, active), phi
+
+        def _glossy_share(self, si: Any, diffuse: Any, f0: Any) -> Any:
+            # Depends on wi alone, so that pdf agrees with sample.
+            edge = dr.clip(1 - mi.Frame3f.cos_theta(si.wi), 0, 1) ** 5
+            glossy = dr.mean(f0) + (1 - dr.mean(f0)) * edge
+            return dr.clip(glossy / (glossy + 0.5 * dr.mean(diffuse)), 0.1, 0.9)
+
+        def _value_and_density(self, si: Any, wo: Any, parameters: Any) -> tuple[Any, Any]:
+            diffuse, f0, phi = parameters
+            cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            front = (cos_i > 0) & (cos_o > 0)
+            h = dr.normalize(si.wi + wo)
+            cos_h, wo_h = mi.Frame3f.cos_theta(h), dr.clip(dr.dot(wo, h), 0, 1)
+            a2 = dr.square(dr.maximum(phi, 0.001))
+            distribution = a2 / (dr.pi * dr.square(1 + (a2 - 1) * dr.square(cos_h)))
+            y2 = dr.square(dr.square(0.5 * phi + 0.5))
+            shadowing = 1.0
+            for x in (cos_i, cos_o):
+                x2 = dr.square(x)
+                shadowing /= x + dr.safe_sqrt(x2 + y2 - x2 * y2)
+            fresnel = f0 + (1 - f0) * (1 - wo_h) ** 5
+            value = (diffuse / dr.pi + shadowing * distribution * fresnel) * cos_o
+            share = self._glossy_share(si, diffuse, f0)
+            lobe = distribution * cos_h / (4 * dr.maximum(wo_h, 1e-8))
+            density = share * lobe + (1 - share) * cos_o / dr.pi
+            return dr.select(front, value, 0), dr.select(front, density, 0)
+
+        def sample(self, ctx: Any, si: Any, one: Any, two: Any, active: Any = True) -> Any:
+            parameters = diffuse, f0, phi = self._parameters(si, active)
+            glossy = one < self._glossy_share(si, diffuse, f0)
+            tan2 = dr.square(dr.maximum(phi, 0.001)) * two.x / dr.maximum(1 - two.x, 1e-7)
+            cos_h = dr.rsqrt(1 + tan2)
+            sin_h = dr.safe_sqrt(1 - dr.square(cos_h))
+            sin_p, cos_p = dr.sincos(2 * dr.pi * two.y)
+            h = mi.Vector3f(sin_h * cos_p, sin_h * sin_p, cos_h)
+            mirrored = 2 * dr.dot(si.wi, h) * h - si.wi
+            bs = mi.BSDFSample3f()
+            bs.wo = dr.select(glossy, mirrored, mi.warp.square_to_cosine_hemisphere(two))
+            value, bs.pdf = self._value_and_density(si, bs.wo, parameters)
+            bs.eta = 1.0
+            bs.sampled_type = dr.select(
+                glossy,
+                mi.UInt32(+mi.BSDFFlags.GlossyReflection),
+                mi.UInt32(+mi.BSDFFlags.DiffuseReflection),
+            )
+            bs.sampled_component = dr.select(glossy, mi.UInt32(0), mi.UInt32(1))
+            usable = active & (bs.pdf > 0)
+            return bs, dr.select(usable, value / dr.maximum(bs.pdf, 1e-20), 0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            value, density = self._value_and_density(si, wo, self._parameters(si, active))
+            return dr.select(active, value, 0), dr.select(active, density, 0)
+
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            return self.diffuse.eval(si, active)
+
+        def traverse(self, callback: Any) -> None:
+            for name in ("diffuse", "f0", "phi"):
+                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return f"{NAME}[]"
+
+    return lambda props: Lobe(props)

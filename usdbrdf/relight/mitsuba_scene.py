@@ -1,0 +1,168 @@
+"""Surfaces and lights -> a scene of Mitsuba 3."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.relight.mitsuba_materials import bsdf, radiance_texture
+from usdbrdf.relight.surfaces import (
+    DistantLight,
+    Double,
+    Float,
+    Light,
+    RelitScene,
+    ShapeLight,
+    SkyLight,
+    Surface,
+)
+
+# A disc in the sky stands this many scene radii away: its direction then varies by a thousandth.
+_SKY_RADII = 1000.0
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def mitsuba_scene(mi: Any, scene: RelitScene, *, bounces: int) -> Any:
+    """A loaded scene whose integrator follows ``bounces`` reflections; black where nothing is."""
+    low, high = _bounds(scene)
+    centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    parts: dict[str, Any] = {
+        "type": "scene",
+        # Of the vertices of a path the first is what the camera sees.
+        "integrator": {"type": "path", "max_depth": bounces + 1, "rr_depth": 5},
+    }
+    for i, surface in enumerate(scene.surfaces):
+        parts[f"surface_{i}"] = _mesh(mi, surface)
+    for i, light in enumerate(scene.lights):
+        parts[f"light_{i}"] = _light(mi, light, centre, radius)
+    return mi.load_dict(parts, optimize=False)
+
+
+def _bounds(scene: RelitScene) -> tuple[Double, Double]:
+    bounds = [surface.bounds for surface in scene.surfaces]
+    bounds += [
+        np.stack([light.world_from_here[:3, 3]] * 2)
+        for light in scene.lights
+        if isinstance(light, ShapeLight)
+    ]
+    both = np.array(bounds or [np.zeros((2, 3))])
+    return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
+
+
+def _mesh(mi: Any, surface: Surface) -> Any:
+    """Every triangle corner is a vertex: normals and uv differ from face to face."""
+    corners = surface.points[surface.triangles].reshape(-1, 3)
+    count = len(surface.triangles)
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf(mi, surface))
+    if surface.material.emits:
+        weight = _power(surface)
+        emission = radiance_texture(mi, surface.material.emission)
+        area = {"type": "area", "radiance": emission, "sampling_weight": weight}
+        props["emitter"] = mi.load_dict(area)
+    mesh = mi.Mesh(
+        "surface",
+        3 * count,
+        count,
+        props=props,
+        has_vertex_normals=True,
+        has_vertex_texcoords=surface.corner_uv is not None,
+    )
+    if surface.corner_colour is not None:
+        mesh.add_attribute("vertex_colour", 3, _flat(surface.corner_colour))
+    buffers = mi.traverse(mesh)
+    buffers["vertex_positions"] = _flat(corners)
+    buffers["vertex_normals"] = _flat(surface.corner_normals)
+    if surface.corner_uv is not None:
+        buffers["vertex_texcoords"] = _flat(surface.corner_uv)
+    buffers["faces"] = np.arange(3 * count, dtype=np.uint32)
+    buffers.update()
+    return mesh
+
+
+def _flat(values: Any) -> Float:
+    return np.ascontiguousarray(values, np.float32).ravel()
+
+
+def _power(surface: Surface) -> float:
+    """Luminance that leaves the surface, up to pi; a map counts with the mean of its texels."""
+    corner = surface.points[surface.triangles]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = float(np.linalg.norm(across, axis=1).sum()) / 2
+    return max(area * _mean_luminance(surface.material.emission), 1e-12)
+
+
+def _mean_luminance(image: Float) -> float:
+    return float(image.reshape(-1, 3).mean(axis=0) @ _LUMINANCE)
+
+
+def _light(mi: Any, light: Light, centre: Double, radius: float) -> dict[str, Any]:
+    if isinstance(light, ShapeLight):
+        return _shape_light(mi, light)
+    if isinstance(light, SkyLight):
+        return _sky_light(mi, light, radius)
+    return _distant_light(mi, light, centre, radius)
+
+
+def _shape_light(mi: Any, light: ShapeLight) -> dict[str, Any]:
+    to_world = light.world_from_here
+    edges = np.linalg.norm(to_world[:3, :3], axis=0)
+    area = {"rectangle": 4.0, "disk": math.pi, "sphere": 4 * math.pi}[light.kind]
+    if light.kind == "sphere":  # Mitsuba's takes no rotation and no uneven scale
+        to_world = np.diag([*(np.cbrt(edges.prod()),) * 3, 1.0])
+        to_world[:3, 3] = light.world_from_here[:3, 3]
+    weight = max(area * edges[0] * edges[1] * _mean_luminance(light.emission), 1e-12)
+    return {
+        "type": light.kind,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+        "emitter": {
+            "type": "area",
+            "radiance": radiance_texture(mi, light.emission),
+            "sampling_weight": float(weight),
+        },
+    }
+
+
+def _sky_light(mi: Any, light: SkyLight, radius: float) -> dict[str, Any]:
+    power = 4 * math.pi * radius**2 * _mean_luminance(light.image)
+    weight = {"sampling_weight": max(power, 1e-12)}
+    if light.image.shape[:2] == (1, 1):
+        return {"type": "constant", "radiance": radiance_texture(mi, light.image), **weight}
+    pose = np.eye(4)
+    pose[:3, :3] = light.world_from_here
+    bitmap = mi.Bitmap(np.ascontiguousarray(light.image, np.float32))
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pose), **weight}
+
+
+def _distant_light(mi: Any, light: DistantLight, centre: Double, radius: float) -> dict[str, Any]:
+    irradiance = np.asarray(light.irradiance, np.float64)
+    weight = max(float(irradiance @ _LUMINANCE) * radius**2, 1e-12)
+    towards = [float(value) for value in light.towards]
+    size = math.pi * math.sin(light.half_angle) ** 2
+    if size < 1e-9:
+        return {
+            "type": "directional",
+            "direction": towards,
+            "irradiance": {"type": "rgb", "value": irradiance.tolist()},
+            "sampling_weight": weight,
+        }
+    distance = _SKY_RADII * radius
+    origin = centre - distance * light.towards
+    up = np.eye(3)[int(np.argmin(np.abs(light.towards)))]
+    frame = mi.ScalarTransform4f().look_at(
+        origin=origin.tolist(), target=centre.tolist(), up=up.tolist()
+    )
+    scale = distance * math.tan(light.half_angle)
+    return {
+        "type": "disk",
+        "to_world": frame @ mi.ScalarTransform4f().scale([scale, scale, 1.0]),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+        "emitter": {
+            "type": "area",
+            "radiance": {"type": "rgb", "value": (irradiance / size).tolist()},
+            "sampling_weight": weight,
+        },
+    }

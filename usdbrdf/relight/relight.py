@@ -1,0 +1,181 @@
+"""The published asset, with models put in, in its own light or another, path traced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.atomic import environment_failures
+from usdbrdf.job.progress import say
+from usdbrdf.relight.denoise import AUTO, OIDN, chosen_filter, denoised
+from usdbrdf.relight.insert import Insert
+from usdbrdf.relight.mitsuba_scene import mitsuba_scene
+from usdbrdf.relight.picture import (
+    DISPLAYED,
+    automatic_exposure,
+    check_picture_name,
+    write_picture,
+)
+from usdbrdf.relight.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
+from usdbrdf.relight.render import render_view
+from usdbrdf.relight.surfaces import Float
+from usdbrdf.relight.variant import mitsuba_variant
+from usdbrdf.relight.views import View
+from usdbrdf.relight.views_from_document import views_from_document
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.compose import open_edited
+from usdbrdf.stage.published import eye_height, published
+from usdbrdf.stage.published_cameras import published_camera, time_code
+
+MIN_BOUNCES = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelightOptions:
+    """What to render.
+
+    lights         USD file with lights or glowing meshes, or latitude-longitude .exr or .hdr; None
+                   is the light of the asset itself
+    keep_emitters  leave the asset's own light on beside ``lights``
+    inserts        models to put in
+    camera         prim path of a camera; None is the capture's
+    frame          time code; None is the earliest
+    views          document with poses, instead of a camera
+    samples        paths per pixel
+    bounces        reflections along a path, at least 4
+    width          pixels; None is the camera's own
+    denoise        "none", "oidn", or "auto": oidn where it is installed
+    exposure       stops, for PNG and JPEG; None is automatic
+    format         extension of the pictures of ``views``
+    """
+
+    lights: Path | None = None
+    keep_emitters: bool = False
+    inserts: tuple[Insert, ...] = ()
+    camera: str | None = None
+    frame: float | None = None
+    views: Path | None = None
+    samples: int = 256
+    bounces: int = 8
+    width: int | None = None
+    seed: int = 0
+    denoise: str = AUTO
+    exposure: float | None = None
+    format: str = "exr"
+
+
+def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
+    """Render the asset in ``folder`` into ``output``: a picture, or with views a folder of them.
+
+    What is rendered is the root layer as everybody opens it, the artist's edits included; nothing
+    of the asset is changed. Returns a summary of plain values.
+    """
+    options = options or RelightOptions()
+    _check(options, output, folder)
+    mitsuba, noise = mitsuba_variant(), chosen_filter(options.denoise)
+    asset = Asset.at(folder)
+    if not asset.root_layer.is_file():
+        raise InputRefused(f"{folder}: there is no asset in this folder. [asset.missing]")
+    stage = open_edited(asset)
+    time = time_code(stage, options.frame)
+    inserts = options.inserts
+    captured = published(stage, time, lambda sentence: say(f"warning: {sentence}"))
+    if options.views is None:
+        views: tuple[View, ...] = (published_camera(stage, options.camera, time),)
+    else:
+        views = views_from_document(options.views, asset, captured.metres_per_unit)
+    if options.width is not None:
+        views = tuple(view.at_width(options.width) for view in views)
+    scene = relit_scene(
+        captured,
+        options.lights,
+        inserts,
+        keep_emitters=options.keep_emitters,
+        eye_height=eye_height(stage) if any(i.falls_from_eye_height for i in inserts) else 0.0,
+    )
+    loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
+    targets = _targets(output, views, options)
+    exposure = _photograph(mitsuba, loaded, views, targets, options, denoise=noise == OIDN)
+    return {
+        "pictures": [str(target) for target in targets],
+        "variant": mitsuba.variant(),
+        "samples": options.samples,
+        "denoise": noise,
+        "bounces": options.bounces,
+        "surfaces": len(scene.surfaces),
+        "lights": len(scene.lights) + sum(s.material.emits for s in scene.surfaces),
+        "exposure": exposure,
+    }
+
+
+def _photograph(
+    mitsuba: Any,
+    loaded: Any,
+    views: Sequence[View],
+    targets: Sequence[Path],
+    options: RelightOptions,
+    *,
+    denoise: bool,
+) -> float | None:
+    """Render and write all views; returns the exposure in stops of displayed pictures."""
+    displayed = targets[0].suffix.lower() in DISPLAYED
+    pictures: list[Float] = []
+    for i, (view, target) in enumerate(zip(views, targets, strict=True)):
+        label = f"relight {i + 1} of {len(views)}"
+        seed = (options.seed, i)
+        rendered = render_view(
+            mitsuba, loaded, view, samples=options.samples, seed=seed, label=label
+        )
+        pictures.append(denoised(rendered) if denoise else rendered.radiance)
+        if not displayed:
+            _write(target, pictures.pop(), 0.0)
+    if not displayed:
+        return None
+    # One exposure for all, so that they can be compared.
+    stops = automatic_exposure(pictures) if options.exposure is None else options.exposure
+    for target, picture in zip(targets, pictures, strict=True):
+        _write(target, picture, stops)
+    say(f"exposure: {stops:+.2f} stops{' (automatic)' if options.exposure is None else ''}")
+    return stops
+
+
+def _check(options: RelightOptions, output: Path, folder: Path) -> None:
+    """Everything that can be refused before the renderer is started."""
+    if options.bounces < MIN_BOUNCES:
+        raise UsageError(
+            f"--bounces {options.bounces}: light between surfaces needs at least {MIN_BOUNCES}. "
+            "[relight.bounces]"
+        )
+    if options.samples < 1 or (options.width is not None and options.width < 1):
+        raise UsageError("--samples and --width must be at least 1. [relight.size]")
+    if options.views is None:
+        check_picture_name(output)
+    if output.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(
+            f"{output}: lies inside the asset {folder}, which stays as it is. Name another place "
+            "with -o. [relight.output]"
+        )
+    lights = options.lights
+    if lights is not None and lights.suffix.lower() not in USD_SUFFIXES | SKY_SUFFIXES:
+        raise UsageError(
+            f"--lights {lights}: lights come from a USD file, or from a latitude-longitude .exr "
+            "or .hdr. [relight.lights]"
+        )
+    for file in (lights, *(insert.model for insert in options.inserts)):
+        if file is not None and not file.is_file():
+            raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
+
+
+def _targets(output: Path, views: Sequence[View], options: RelightOptions) -> list[Path]:
+    if options.views is None:
+        return [output]
+    return [output / f"{Path(view.name).stem}.{options.format}" for view in views]
+
+
+def _write(target: Path, picture: Float, stops: float) -> None:
+    with environment_failures(str(target)):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(target, picture, stops)

@@ -1,0 +1,95 @@
+"""The asset, its light and the models put in -> one scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.progress import say
+from usdbrdf.relight.insert import Insert, placed, turned_up, with_material
+from usdbrdf.relight.lighting import emits_light, lit_by_others
+from usdbrdf.relight.model import surfaces_from_model
+from usdbrdf.relight.surfaces import Light, RelitScene, Surface
+from usdbrdf.stage.lights_from_stage import sky_of_picture
+from usdbrdf.stage.published import Published, published_file
+
+USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
+SKY_SUFFIXES = frozenset({".exr", ".hdr"})
+
+
+def relit_scene(
+    asset: Published,
+    lights: Path | None,
+    inserts: Sequence[Insert],
+    *,
+    keep_emitters: bool,
+    eye_height: float,
+) -> RelitScene:
+    """All surfaces and lights, in metres, in the asset's world.
+
+    lights      USD file or latitude-longitude picture; None is the light of the asset
+    eye_height  metres from which models fall
+    """
+    if not asset.surfaces:
+        raise InputRefused(
+            "no mesh of the asset is visible. Look at what edits.usda hides. [relight.empty]"
+        )
+    scene = RelitScene(surfaces=asset.surfaces, lights=asset.lights)
+    if lights is not None:
+        surfaces, given = _light_of_file(lights, asset.up_axis)
+        scene = lit_by_others(scene, surfaces, given, keep_emitters=keep_emitters)
+    inserted: list[Surface] = []
+    for insert in inserts:
+        dressed = [with_material(surface, insert) for surface in _model(insert, asset)]
+        inserted += placed(
+            dressed,
+            insert,
+            up_axis=asset.up_axis,
+            metres_per_unit=asset.metres_per_unit,
+            scene=(*scene.surfaces, *inserted),
+            eye_height=eye_height,
+        )
+    scene = RelitScene(surfaces=(*scene.surfaces, *inserted), lights=scene.lights)
+    if not emits_light(scene):
+        _warn("nothing in the scene emits light; the picture will be black.")
+    return scene
+
+
+def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequence[Light]]:
+    if file.suffix.lower() in SKY_SUFFIXES:
+        return (), (sky_of_picture(file, up_axis),)
+    found = published_file(file, _warn)
+    if not found.lights and not any(surface.material.emits for surface in found.surfaces):
+        raise InputRefused(
+            f"{file}: no light in it, and no mesh that glows. Add UsdLux lights or an "
+            "emissiveColor. [relight.lights]"
+        )
+    turn = turned_up(found.up_axis, up_axis)
+    surfaces = [surface.moved(turn) for surface in found.surfaces]
+    return surfaces, [light.moved(turn) for light in found.lights]
+
+
+def _model(insert: Insert, asset: Published) -> tuple[Surface, ...]:
+    """In metres, with the asset's up axis."""
+    suffix = insert.model.suffix.lower()
+    if suffix in USD_SUFFIXES:
+        found = published_file(insert.model, _warn)
+        if found.lights:
+            _warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
+        surfaces, model_up, scale = found.surfaces, found.up_axis, 1.0
+    else:
+        # glTF says metres and y up; the others say nothing and are taken to be as the asset is.
+        surfaces = surfaces_from_model(insert.model)
+        model_up = "Y" if suffix == ".glb" else asset.up_axis
+        scale = 1.0 if suffix == ".glb" else asset.metres_per_unit
+    if not surfaces:
+        raise InputRefused(f"{insert.model}: no mesh in it. Export the surface. [relight.model]")
+    turn = turned_up(insert.up or model_up, asset.up_axis) @ np.diag([scale, scale, scale, 1.0])
+    return tuple(surface.moved(turn) for surface in surfaces)
+
+
+def _warn(sentence: str) -> None:
+    say(f"warning: {sentence}")

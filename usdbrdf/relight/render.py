@@ -1,0 +1,108 @@
+"""A scene and a view -> mean radiance per pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.job.progress import progress
+from usdbrdf.relight.surfaces import Double, Float
+from usdbrdf.relight.views import View
+
+# Paths of one pass: bounds the memory of the vectorised path tracer, some 200 bytes a path, and
+# gives the bar something to count.
+_PATHS_PER_PASS = 1 << 22
+_NEAR_M, _FAR_M = 1e-3, 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rendered:
+    """(H, W, 3) float32 each.
+
+    radiance  mean over each pixel's square
+    albedo    of the first surface, in [0, 1], and its shading normal: what a denoiser looks at
+    """
+
+    radiance: Float
+    albedo: Float
+    normal: Float
+
+
+def render_view(
+    mi: Any, scene: Any, view: View, *, samples: int, seed: tuple[int, ...], label: str
+) -> Rendered:
+    """``samples`` paths per pixel; equal seeds give equal noise."""
+    fx, fy, _, cy = view.intrinsics
+    # Mitsuba's pixels are square: others are rendered so, and their rows gathered afterwards.
+    height = max(1, round(view.height * fx / fy))
+    stretch = height / view.height
+    sensor = _sensor(mi, view, height, cy * stretch)
+    integrator = mi.load_dict(
+        {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": scene.integrator()}
+    )
+    at_a_time = max(1, min(samples, _PATHS_PER_PASS // (view.width * height)))
+    counts = [at_a_time] * (samples // at_a_time)
+    if samples % at_a_time:
+        counts.append(samples % at_a_time)
+    states = np.random.SeedSequence(seed).generate_state(len(counts))
+    total = np.zeros((height, view.width, 9))
+    for count, state in progress(
+        list(zip(counts, states, strict=True)), total=len(counts), label=label, unit="passes"
+    ):
+        image = mi.render(scene, sensor=sensor, integrator=integrator, spp=count, seed=int(state))
+        total += count * np.array(image, np.float64)[..., -9:]
+    mean = _rows_gathered(total / samples, view.height)
+    if not np.isfinite(mean).all():
+        raise EnvironmentFailure(
+            f"{label}: the renderer returned values that are not finite. Look for extreme "
+            "materials or lights in the stage. [relight.nonfinite]"
+        )
+    radiance, albedo, normal = np.split(mean.astype(np.float32), 3, axis=2)
+    return Rendered(
+        radiance=np.ascontiguousarray(np.maximum(radiance, 0)),
+        albedo=np.ascontiguousarray(np.clip(albedo, 0, 1)),
+        normal=np.ascontiguousarray(np.clip(normal, -1, 1)),
+    )
+
+
+def _sensor(mi: Any, view: View, height: int, cy: float) -> Any:
+    fx, _, cx, _ = view.intrinsics
+    # Mitsuba's cameras look down +z with x to the left.
+    pose = view.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov_axis": "x",
+            "fov": float(np.degrees(2 * np.arctan(view.width / 2 / fx))),
+            "principal_point_offset_x": float(0.5 - cx / view.width),
+            "principal_point_offset_y": float(0.5 - cy / height),
+            "near_clip": _NEAR_M,
+            "far_clip": _FAR_M,
+            "to_world": mi.ScalarTransform4f(pose),
+            "sampler": {"type": "multijitter"},
+            "film": {
+                "type": "hdrfilm",
+                "width": view.width,
+                "height": height,
+                "pixel_format": "rgb",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            },
+        }
+    )
+
+
+def _rows_gathered(image: Double, height: int) -> Double:
+    """The picture with ``height`` rows, each the mean over its share of the given ones."""
+    given = len(image)
+    if given == height:
+        return image
+    edges = np.arange(height + 1) * given / height
+    starts, stops = edges[:-1, None], edges[1:, None]
+    rows = np.arange(given)[None]
+    overlap = np.clip(np.minimum(stops, rows + 1) - np.maximum(starts, rows), 0, 1)
+    weights = overlap / overlap.sum(axis=1, keepdims=True)
+    return np.asarray(np.einsum("or,rwc->owc", weights, image))

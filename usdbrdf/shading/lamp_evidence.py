@@ -1,0 +1,126 @@
+"""What the texels of reflectors show of lamps, segment by segment, and how it varies with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.shading.correlated_errors import covariance
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+
+# A segment needs this many texels to say anything about differences on it.
+_MIN_SEGMENT = 6
+# L_d holds the specular light that all frames see: that of the surroundings, at about the normal
+# reflectance of a dielectric. It does not follow the lamps, so it must not be taken for albedo. Its
+# share of S_0 / pi, how much that differs between surfaces, and how wrong it may be for them all.
+_AMBIENT, AMBIENT_SPREAD, _AMBIENT_ERROR = 0.015, 0.02, 0.015
+# It is never more than this share of L_d.
+_MOSTLY_AMBIENT = 0.75
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What N texels of reflectors show of K lamps.
+
+    radiance        (N, 3) float32, measured L_d
+    irradiance      (N, 3) float32, S_0 in W/m^2: from all light but the K lamps'
+    lamp_irradiance (K, N, 3) float32, S_k: from lamp k alone, at its lower bound
+    position        (N, 3) float32, metres
+    segment         (N,) int32, equal where the albedo may be taken as alike
+    object          (N,) int32, equal where errors may agree beyond the segment
+    prior           (K, 2) float64, mean and standard deviation of log g_k before the evidence
+    """
+
+    radiance: Float
+    irradiance: Float
+    lamp_irradiance: Float
+    position: Float
+    segment: Int
+    object: Int
+    prior: Double
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """Texels of one segment: log of pi L_d without ambient specular light (n, 3), its change by
+    what that light may be wrong (n,), distances (n, n) in metres, variance relative to the common
+    noise of the texels (n,) and of the whole segment (scale), and what its own specular light may
+    differ by (specular, relative)."""
+
+    index: npt.NDArray[np.int64]
+    object: int
+    observed: Double
+    ambient: Double
+    distance: Double
+    variance: Double
+    scale: float
+    specular: float
+
+
+def segments_of(evidence: Evidence) -> list[Segment]:
+    """Segments with enough texels that are lit and not black."""
+    total = evidence.irradiance + evidence.lamp_irradiance.sum(axis=0)
+    usable = (evidence.radiance > 0).all(axis=1) & (total > 0).all(axis=1)
+    segments = []
+    for number in np.unique(evidence.segment[usable]):
+        index = np.flatnonzero(usable & (evidence.segment == number))
+        if len(index) < _MIN_SEGMENT:
+            continue
+        position = evidence.position[index].astype(np.float64)
+        observed = _without_ambient(evidence, index, _AMBIENT)
+        more = _without_ambient(evidence, index, _AMBIENT + _AMBIENT_ERROR)
+        segments.append(
+            Segment(
+                index=index,
+                object=int(evidence.object[index[0]]),
+                observed=observed,
+                ambient=(more - observed).mean(axis=1),
+                distance=np.linalg.norm(position[:, None] - position, axis=-1),
+                variance=np.ones(len(index)),
+                scale=1.0,
+                specular=0.0,
+            )
+        )
+    return segments
+
+
+def _without_ambient(evidence: Evidence, index: npt.NDArray[np.int64], share: float) -> Double:
+    """log(pi L_d - share S_0) (n, 3)."""
+    whole = np.pi * evidence.radiance[index].astype(np.float64)
+    ambient = np.minimum(share * evidence.irradiance[index], _MOSTLY_AMBIENT * whole)
+    return np.asarray(np.log(whole - ambient))
+
+
+def log_irradiance(evidence: Evidence, index: npt.NDArray[np.int64], log_g: Double) -> Double:
+    """log S (n, 3) of the texels."""
+    lamps = np.einsum("kc,knc->nc", np.exp(log_g), evidence.lamp_irradiance[:, index])
+    return np.asarray(np.log(evidence.irradiance[index] + lamps))
+
+
+def segment_covariance(item: Segment, shape: Double) -> Double:
+    """(n, n), of the logarithms; shape as in ``covariance``."""
+    return item.scale * covariance(shape, item.distance, item.variance, item.specular)
+
+
+def lamp_share(evidence: Evidence, item: Segment, log_g: Double) -> Double:
+    """How much of S is whose lamp's, (K, n, 3): the derivative of log S by log g."""
+    lamps = np.exp(log_g)[:, None] * evidence.lamp_irradiance[:, item.index]
+    return np.asarray(lamps / (evidence.irradiance[item.index] + lamps.sum(axis=0)))
+
+
+def normal_equations(
+    evidence: Evidence, item: Segment, weight: Double, log_g: Double
+) -> tuple[Double, Double, Double]:
+    """Per channel: curvature (3, K, K), gradient (3, K) and weighted square (3,)."""
+    residual = item.observed - log_irradiance(evidence, item.index, log_g)
+    share = lamp_share(evidence, item, log_g)
+    weighted = np.einsum("nm,kmc->ckn", weight, share)
+    curvature = np.einsum("ckn,lnc->ckl", weighted, share)
+    gradient = np.einsum("ckn,nc->ck", weighted, residual)
+    square = np.einsum("nc,nm,mc->c", residual, weight, residual)
+    return curvature, gradient, square

@@ -1,0 +1,32 @@
+"""The scene with its light, as the steps after shading see it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.geometry.surface_radiance import surface_texture
+from usdbrdf.material.lit_scene import LitScene
+from usdbrdf.shading.environment import Environment
+from usdbrdf.shading.lights import lights_from_radiance
+from usdbrdf.steps.atlas import Atlas
+
+
+def lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
+    """L_d as texture and as lights; where shading found an emitter, the radiance it found there
+    (of lamps that clipped in every frame L_d is only a lower bound)."""
+    scene, texels = atlas.scene, atlas.texels
+    emission = atlas.map_where_present("emission", 3)
+    emissive = (emission > 0).any(axis=1, keepdims=True)
+    lit = np.where(emissive, emission, atlas.map("lit"))
+    return LitScene(
+        scene=scene,
+        rays=RayScene(scene.points, scene.triangles),
+        radiance=surface_texture(texels, scene.face_object, lit),
+        lights=lights_from_radiance(scene, texels, lit),
+        emission=surface_texture(
+            texels, scene.face_object, np.repeat(emissive.astype(np.float32), 3, axis=1)
+        ),
+        environment=environment,
+        size=float(np.linalg.norm(np.ptp(scene.points, axis=0))),
+    )

@@ -1,0 +1,87 @@
+"""Inside step 3: irradiance at every texel, traced tile by tile so that a kill costs one tile."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.geometry.surface_radiance import surface_texture
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.job.progress import progress, say
+from usdbrdf.job.stage import StageRun
+from usdbrdf.shading.denoise import denoise_lightmap
+from usdbrdf.shading.environment import Environment
+from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.shading.lights import lights_from_radiance
+from usdbrdf.steps.atlas import Atlas
+
+Float = npt.NDArray[np.float32]
+
+# Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
+# bounds the memory of the ray buffers.
+_TILE = 1 << 15
+
+
+def trace_irradiance(
+    run: StageRun,
+    atlas: Atlas,
+    rays: RayScene,
+    lit: Float,
+    environment: Environment,
+    sampling: Sampling,
+) -> Irradiance:
+    """S at all texels with the radiance ``lit`` (T, 3) as the light, from where a kill left it."""
+    scene, texels = atlas.scene, atlas.texels
+    radiance = surface_texture(texels, scene.face_object, lit)
+    lights = lights_from_radiance(scene, texels, lit)
+    size = float(np.linalg.norm(np.ptp(scene.points, axis=0)))
+    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
+    # surfaces lit from outside the scan.
+    dark = np.pi * lit.mean(axis=1)
+    order, patch = patches_of_texels(texels)
+    tiles = list(_tiles(patch))
+    say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
+
+    def tile(first: int, last: int) -> dict[str, npt.NDArray[Any]]:
+        index = order[first:last]
+        found = irradiance_at(
+            rays, radiance, lights, environment, texels.position[index], texels.normal[index],
+            patch[first:last], sampling, size, dark[index],
+        )  # fmt: skip
+        return dict(vars(found))
+
+    parts: dict[str, list[npt.NDArray[Any]]] = {}
+    for number, (first, last) in enumerate(
+        progress(tiles, total=len(tiles), label="shade", unit="tiles")
+    ):
+        done = run.checkpoint(f"tile-{number}", partial(tile, first, last))
+        for name, values in done.items():
+            parts.setdefault(name, []).append(values)
+    back = np.argsort(order)
+    return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
+
+
+def _tiles(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
+    """Ranges of about _TILE texels that do not cut a patch."""
+    starts = np.flatnonzero(np.diff(patch, prepend=-1))
+    first = 0
+    while first < len(patch):
+        after = np.searchsorted(starts, first + _TILE)
+        last = int(starts[after]) if after < len(starts) else len(patch)
+        yield first, last
+        first = last
+
+
+def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
+    """Each object's S (T, 3) through the lightmap filter."""
+    return np.concatenate(
+        [
+            texels.from_image(i, denoise_lightmap(texels.image(i, irradiance)))
+            for i in range(len(texels.resolution))
+        ]
+    )
