@@ -7,7 +7,8 @@ step, look, override in edits.usda, and go on.
     ingest   files        -> scan.usdc       geometry, one prim per object, cameras as captured
     texture  frames       -> texturing.usda  L_d, the lit diffuse radiance: median of what was seen
     shade    L_d          -> shading.usda    irradiance S by ray tracing, albedo = pi L_d / S
-    fit      frames       -> material.usda   roughness and specular of each object
+    fit      frames       -> material.usda   roughness and specular of each object; with these, L_d
+                                             and albedo again, without specular light
 """
 
 from __future__ import annotations
@@ -68,8 +69,6 @@ def convert(
             "ingest": ingest(Path(capture), asset, chosen.ingest, adapter),
             "texture": texture(asset, chosen.texture),
             "shade": shade(asset, chosen.shade),
-            # Joint refinement of L_d and the lobes over all views belongs here: it would hand the
-            # debiased L_d back to ``shade`` and its lobes to ``fit``.
             "fit": fit(asset, chosen.fit),
         }
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from usdbrdf.material.grid_fit import GridFit, fit_grid, mean_of, multiple_of, nothing
+from usdbrdf.material.grid_fit import GridFit, fit_grid, multiple_of, nothing
 
 PIXELS = 300
 Residual = Literal["paper", "scaled"]
@@ -117,30 +117,11 @@ def test_evidence_is_the_share_of_the_residual_that_the_lobe_explains():
     assert nothing.psi == 0
 
 
-def test_a_free_level_per_group_needs_no_diffuse_image():
-    # 50 texels with six views each; every texel has a diffuse radiance of its own, unknown, and
-    # samples of different weight. Only the change between a texel's views is left to explain.
-    _, basis = _scene()
-    group = np.arange(PIXELS, dtype=np.int64) // 6
-    texture = np.random.default_rng(5).lognormal(0, 1, (50, 3))
-    observed = _render(texture[group], basis, 0.3, 0.25)
-    weight = np.random.default_rng(6).uniform(0.1, 3, (PIXELS, 1))
-    found = fit_grid(observed.astype(np.float32), weight, basis, mean_of(group, np.sqrt(weight)))
-    assert (found.phi, found.psi) == (pytest.approx(0.3, abs=1e-6), pytest.approx(0.25, abs=1e-3))
-    assert found.evidence > 0.999
-
-
-@pytest.mark.parametrize("kind", ["multiple", "mean"])
-def test_what_is_projected_out_is_gone_and_stays_gone(kind: str):
+def test_what_is_projected_out_is_gone_and_stays_gone():
     rng = np.random.default_rng(12345)
     values = rng.standard_normal((PIXELS, 3))
-    root = rng.uniform(0.5, 2, (PIXELS, 1))
-    group = rng.integers(0, 40, PIXELS).astype(np.int64)
-    if kind == "multiple":
-        diffuse = rng.uniform(0.2, 0.8, (PIXELS, 3)) * root
-        project, removed = multiple_of(diffuse), diffuse * [3, -1, 0.5]
-    else:
-        project, removed = mean_of(group, root), root * rng.standard_normal((40, 3))[group]
+    diffuse = rng.uniform(0.2, 0.8, (PIXELS, 3)) * rng.uniform(0.5, 2, (PIXELS, 1))
+    project, removed = multiple_of(diffuse), diffuse * [3, -1, 0.5]
     np.testing.assert_allclose(project(removed), 0, atol=1e-12)
     np.testing.assert_allclose(project(values + removed), project(values), atol=1e-12)
     np.testing.assert_allclose(project(project(values)), project(values), atol=1e-12)

@@ -197,6 +197,12 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
             target_frame=-1 if name == "wall" else 2,
             num_pixels=12,
             method="views",
+            phi_error=float("nan") if name == "wall" else 0.03125,
+            psi_error=float("nan") if name == "wall" else 0.125,
+            phi_confidence="none" if name == "wall" else "high",
+            psi_confidence="none" if name == "wall" else "low",
+            aovs=aovs_of(asset, name, ("diffuse", "base_color")),
+            mean_color=(0.0, 0.0, 0.0) if name == "lamp" else (0.25, 0.125, 0.0625),
         )
         for prim, name in zip(prims, identifiers, strict=True)
     )

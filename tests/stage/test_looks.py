@@ -10,11 +10,12 @@ from usdbrdf.stage.asset import ROLES
 
 GREY = ("spread", "coverage", "samples", "stderr")
 AOV_LOOKS = ("lit", "mean", "spread", "coverage", "samples", "irradiance", "stderr", "albedo")
+REFINED = ("diffuse", "base_color")
 LOOKS = {
     "scan": set(),
     "texturing": {"lit", "mean", "spread", "coverage", "samples"},
     "shading": {*AOV_LOOKS, "shaded"},
-    "material": {*AOV_LOOKS, "shaded", "roughness", "specular"},
+    "material": {*AOV_LOOKS, *REFINED, "shaded", "roughness", "specular"},
 }
 SELECTED = {"texturing": "lit", "shading": "shaded", "material": "shaded"}
 
@@ -71,7 +72,7 @@ def test_every_object_is_bound_in_every_look(built, look):
             assert api.ComputeBoundMaterial(purpose)[0].GetPath() == expected
 
 
-@pytest.mark.parametrize("look", AOV_LOOKS)
+@pytest.mark.parametrize("look", AOV_LOOKS + REFINED)
 def test_a_map_is_shown_unlit_and_raw(built, look):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     select(stage, look)
@@ -111,15 +112,25 @@ def test_the_fitted_parameters_show_as_greys(built):
 def test_the_shaded_material_of_a_reflector(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     shader = surface_of(bound(stage, built.prims[0]))
-    albedo = source_of(shader, "diffuseColor")
-    assert albedo.GetInput("file").Get().path == "../textures/Stuhl_No_1.albedo.exr"
-    assert albedo.GetInput("fallback").Get() == (0.5, 0.25, 0.125, 1)
+    # The colour without specular light is stronger than the albedo.
+    colour = source_of(shader, "diffuseColor")
+    assert colour.GetInput("file").Get().path == "../textures/Stuhl_No_1.base_color.exr"
+    assert colour.GetInput("fallback").Get() == (0.25, 0.125, 0.0625, 1)
     assert shader.GetInput("emissiveColor").Get() == (0, 0, 0)
     assert shader.GetInput("roughness").Get() == pytest.approx(0.5)
     assert shader.GetInput("ior").Get() == pytest.approx(1.5)
     assert shader.GetInput("metallic").Get() == 0
     assert shader.GetInput("useSpecularWorkflow").Get() == 0
     assert not shader.GetInput("specularColor")
+
+
+def test_without_a_refined_colour_the_material_reads_the_albedo(built):
+    built.fitted = tuple(replace(item, aovs=()) for item in built.fitted)
+    built.write_layer("material")
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    albedo = source_of(surface_of(bound(stage, built.prims[0])), "diffuseColor")
+    assert albedo.GetInput("file").Get().path == "../textures/Stuhl_No_1.albedo.exr"
+    assert albedo.GetInput("fallback").Get() == (0.5, 0.25, 0.125, 1)
 
 
 def test_the_shaded_material_of_an_emitter(built):
@@ -140,7 +151,7 @@ def test_an_object_that_glows_in_places_reflects_as_well(built):
     built.write_layer("shading")
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     shader = surface_of(bound(stage, wall.prim_path))
-    assert source_of(shader, "diffuseColor").GetPath().name == "AlbedoTexture"
+    assert source_of(shader, "diffuseColor").GetPath().name == "BaseColorTexture"
     assert source_of(shader, "emissiveColor").GetPath().name == "EmissionTexture"
 
 

@@ -1,7 +1,7 @@
 """Values that went into the stage come back from it."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from usdbrdf.stage.read import (
     open_edited,
     open_measured,
     open_weaker,
+    read_aovs,
     read_fit,
     read_shading,
     read_texturing,
@@ -77,7 +78,23 @@ def test_records_come_back(built):
         assert {a.name for a in read.aovs} >= {a.name for a in shaded.aovs}
         assert same(read, type(shaded)(**{**shaded.__dict__, "aovs": read.aovs}))
 
-        assert same(read_fit(open_measured(built.asset), fitted.prim_path), fitted)
+        stage = open_measured(built.asset)
+        assert {a.name for a in read_aovs(stage, fitted.prim_path)} >= {"diffuse", "base_color"}
+        # The maps are read by themselves, and the mean colour is for the material alone.
+        wanted = replace(fitted, aovs=(), mean_color=(0.0, 0.0, 0.0))
+        assert same(read_fit(stage, fitted.prim_path), wanted)
+
+
+def test_errors_and_confidence_come_back(built):
+    stage = open_measured(built.asset)
+    found = read_fit(stage, built.prims[0])
+    assert (found.phi_error, found.psi_error) == (0.03125, 0.125)
+    assert (found.phi_confidence, found.psi_confidence) == ("high", "low")
+    # What is not known is not authored, so that no schema's fallback passes for a measurement.
+    wall = stage.GetPrimAtPath(built.prims[1])
+    for name in ("phi", "psi", "phiError", "psiError"):
+        assert not wall.GetAttribute(f"usdBrdf:fit:{name}").HasAuthoredValue()
+    assert math.isnan(read_fit(stage, built.prims[1]).phi_error)
 
 
 def test_how_well_a_lamp_is_known(built):

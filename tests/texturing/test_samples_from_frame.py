@@ -153,11 +153,11 @@ def test_an_occluder_leaves_no_samples_behind_it_or_near_its_edge(plane: World):
     world = world_of([floor, quad((-0.1, -0.1, 0.5), (0.2, 0, 0), (0, 0.2, 0), size=(8, 8))])
     pose = _camera()
     image = _picture_of_plane(pose, _pattern)
-    # The occluder's pixels are bright red: a sample that took any of it would show.
+    # The occluder's pixels are red: a sample that took any of it would show.
     first = first_surfaces(
         world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
     )
-    image[first.object == 1] = (100, 0, 0)
+    image[first.object == 1] = (2, 0, 0)
     shot = _shoot(world, image, pose)
     own = world.texels.of_object(0)
     position = world.texels.position[own]
@@ -267,3 +267,29 @@ def test_nothing_comes_from_behind_the_camera_or_from_the_image_border(plane: Wo
     assert row.min() >= 1
     assert row.max() <= HEIGHT - 1
     assert (shot.kind == SAMPLE).sum() > 200
+
+
+def test_beside_a_glaring_lamp_no_sample_is_taken():
+    # The lamp hangs half a metre above the floor's middle; three pixels around it see its glare.
+    floor = quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(40, 40))
+    world = world_of([floor, quad((-0.1, -0.1, 0.5), (0.2, 0, 0), (0, 0.2, 0), size=(8, 8))])
+    pose = _camera()
+    first = first_surfaces(
+        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
+    )
+    own = world.texels.of_object(0)
+    kinds = []
+    for lamp in (5.0, 500.0):
+        image = _picture_of_plane(pose, lambda x, y: np.ones((*x.shape, 3)))
+        image[first.object == 1] = lamp
+        kinds.append(_shoot(world, image, pose).kind[own])
+    dim, glaring = kinds
+    lost = (dim == SAMPLE) & (glaring == NOTHING)
+    assert lost.sum() > 20
+    assert not ((dim == NOTHING) & (glaring == SAMPLE)).any()
+    crossing = world.texels.position[own, :2] * 0.75 + 0.25 * EYE[:2]
+    away = np.abs(crossing).max(axis=1) - 0.1
+    # A pixel is 1/80 * 1.5 m wide on the lamp.
+    assert away[lost].max() < 4.6 * 1.5 / 80
+    on_floor = glaring == SAMPLE
+    assert (away[on_floor] > 2.5 * 1.5 / 80).all()

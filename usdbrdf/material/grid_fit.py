@@ -6,8 +6,6 @@ projection that removes it, from the images and from the lobe alike:
     nothing       I_d was subtracted already: the paper's residual
     multiple_of   I_d times a free factor per channel: the median texture still holds the specular
                   light that is seen from everywhere, and taken literally leaves none to psi
-    mean_of       an I_d of its own for every texel, the same in all frames that see it: L_d need
-                  not be known at all
 """
 
 from __future__ import annotations
@@ -93,19 +91,6 @@ def multiple_of(diffuse: Double) -> Projection:
 
     def project(values: Double) -> Double:
         rest: Double = values - diffuse * ((diffuse * values).sum(axis=0) / square)
-        return rest
-
-    return project
-
-
-def mean_of(group: npt.NDArray[np.int64], root_weight: Double) -> Projection:
-    """Takes the weighted mean over each group off its members: group (P,), root_weight (P, 1)."""
-    root = root_weight[:, 0]
-    square = np.maximum(np.bincount(group, root * root), 1e-30)
-
-    def project(values: Double) -> Double:
-        means = [np.bincount(group, root * values[:, c]) / square for c in range(3)]
-        rest: Double = values - root_weight * np.stack(means, axis=-1)[group]
         return rest
 
     return project

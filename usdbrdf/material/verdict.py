@@ -13,9 +13,7 @@ from usdbrdf.material.prior import PRIOR_ERROR, with_prior
 # objects without a highlight, and fits with 0.3 were off by up to 0.2 in psi.
 MIN_EVIDENCE, SOME_EVIDENCE = 0.4, 0.2
 # A parameter is known if its standard deviation is at most this.
-MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.18
-# With this one the frames say nothing.
-_NOTHING = 0.24
+MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.16
 # The fit of a single frame has no errors of its own: roughnesses that far apart must not fit alike,
 # and its evidence counts from here on.
 _MAX_FLAT_PHI = 0.4 / math.sqrt(12)
@@ -39,26 +37,29 @@ class Verdict:
 def verdict_on_views(
     phi: tuple[float, float],
     psi: tuple[float, float],
+    unresolved: float,
     evidence: float,
     prior: tuple[float, float],
     seen: bool,
 ) -> Verdict:
-    """On a fit of many views. phi, psi: (value, standard deviation), NaN without a fit; prior:
-    (phi, psi) of the class.
+    """On a fit of many views. phi, psi: (value, standard deviation), NaN without a fit; unresolved,
+    evidence: see LobeEstimate; prior: (phi, psi) of the class.
 
-    A parameter that the frames determine is published as found. The other becomes the mean of what
-    they say and of the prior, weighted by their precisions.
+    Each is published as the mean of what the frames say and of the prior, weighted by their
+    precisions: where the frames determine it, that is what they say. Of a highlight that is hardly
+    larger than the samples' footprint they say something, but the stated error includes what the
+    footprint may have done. Without evidence the prior stands alone.
     """
     published, confidence = [], []
     for (value, error), of_class, limit in zip(
         (phi, psi), prior, (MAX_PHI_ERROR, MAX_PSI_ERROR), strict=True
     ):
-        if evidence >= MIN_EVIDENCE and error <= limit:
+        if evidence >= SOME_EVIDENCE:
+            value, error = with_prior(value, error, of_class, NOTHING_KNOWN)
+            error = min(math.hypot(error, unresolved * value), NOTHING_KNOWN)
             published.append((value, error))
-            confidence.append("high")
-        elif evidence >= SOME_EVIDENCE and error < _NOTHING:
-            published.append(with_prior(value, error, of_class, NOTHING_KNOWN))
-            confidence.append("low")
+            sure = evidence >= MIN_EVIDENCE and error <= limit
+            confidence.append("high" if sure else "low")
         else:
             published.append((of_class, PRIOR_ERROR))
             confidence.append("none")

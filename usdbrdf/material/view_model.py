@@ -114,7 +114,7 @@ class ViewModel:
         rest = self._radiance - non_diffuse
         reduced = self.reduced(rest)
         effect = linalg.cho_solve(self._factor, reduced.shared)
-        square = effect**2 + np.diag(linalg.lapack.dpotri(*self._factor)[0])
+        square = effect**2 + _diagonal_of_inverse(self._factor)
         self._deviation = np.array(
             [
                 max(_LEAST, float(np.sqrt(square[first:last].mean()))) if last > first else _LEAST
@@ -221,6 +221,14 @@ def _design(
     places = np.concatenate(rows), np.concatenate(columns)
     shape = 3 * len(level), int(first[-1])
     return sparse.csr_matrix((np.concatenate(values), places), shape=shape), first
+
+
+def _diagonal_of_inverse(factor: tuple[Double, bool]) -> Double:
+    """From a Cholesky factor; LAPACK itself refuses a matrix without rows."""
+    if not len(factor[0]):
+        return np.zeros(0)
+    diagonal: Double = np.diag(linalg.lapack.dpotri(*factor)[0])
+    return diagonal
 
 
 def _block_diagonal(blocks: Double) -> sparse.bsr_matrix:

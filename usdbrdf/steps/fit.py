@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.texels import Texels
-from usdbrdf.job.progress import progress
+from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageResult, StageRun
 from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import fit_views
@@ -96,6 +96,8 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
                 f"object-{i}", partial(_fit_arrays, lit, atlas.texels, frames, survey, i, options)
             )
             objects.append(_record(lit, i, found, options, bool(seen[own].any())))
+        measured = sum(item.status == "measured" for item in objects)
+        say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":
             objects = _refined(run, asset, atlas, lit, frames, objects, options)
         write_material_layer(
@@ -211,9 +213,9 @@ def _fit_arrays(
     index: int,
     options: FitOptions,
 ) -> dict[str, npt.NDArray[Any]]:
-    """phi, psi, their errors, cost and evidence (NaN where the object could not be fitted), the
-    number of samples, and the target frame (-1: many frames)."""
-    numbers, used, target = np.full(6, np.nan), 0, -1
+    """phi, psi, their errors, share unresolved, cost and evidence (NaN where the object could not
+    be fitted), the number of samples, and the target frame (-1: many frames)."""
+    numbers, used, target = np.full(7, np.nan), 0, -1
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
@@ -222,7 +224,8 @@ def _fit_arrays(
         )
         if lobe is not None:
             numbers[:] = (
-                lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.cost, lobe.evidence
+                lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
+                lobe.evidence,
             )  # fmt: skip
     elif survey.target[index] >= 0 and not _is_lamp(lit, index):
         target = int(survey.target[index])
@@ -233,7 +236,7 @@ def _fit_arrays(
         if found is not None:
             # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
             error = (found.phi_high - found.phi_low) / math.sqrt(12)
-            numbers[:] = found.phi, found.psi, error, np.nan, found.cost, found.evidence
+            numbers[:] = found.phi, found.psi, error, np.nan, 0, found.cost, found.evidence
     return {"numbers": numbers, "used": np.array(used), "target": np.array(target)}
 
 
@@ -252,10 +255,13 @@ def _record(
     seen: bool,
 ) -> FittedObject:
     obj = lit.scene.objects[index]
-    phi, psi, phi_error, psi_error, cost, evidence = (float(x) for x in found["numbers"])
+    numbers = (float(number) for number in found["numbers"])
+    phi, psi, phi_error, psi_error, unresolved, cost, evidence = numbers
     prior = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
     if options.method == "views":
-        verdict = verdict_on_views((phi, phi_error), (psi, psi_error), evidence, prior, seen)
+        verdict = verdict_on_views(
+            (phi, phi_error), (psi, psi_error), unresolved, evidence, prior, seen
+        )
     else:
         keep = options.method == "paper"
         verdict = verdict_on_frame((phi, phi_error), psi, evidence, prior, seen, keep)

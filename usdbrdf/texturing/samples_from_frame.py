@@ -4,6 +4,7 @@ The loop is over texels, not pixels. A texel takes a sample where it faces the c
 pixels around its projection (3 x 3, or as many as its footprint covers) all show its own object
 near its own tangent plane (so it is unoccluded, and away from depth edges and the image border),
 and where every pixel of its footprint lies between noise floor and saturation in every channel.
+Beside a lamp it takes none: no lens and no filter keeps all of a lamp's light to its own pixels.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from numba import prange
+from scipy import ndimage
 
 from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.geometry.rays import RayScene
@@ -28,6 +30,10 @@ Bool = npt.NDArray[np.bool_]
 _MIN_COSINE = 0.1
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
+
+# Glare: pixels this many times brighter than the frame's median, within this many pixels, and this
+# many times brighter than the sample itself. Of such light some per cent arrive two pixels off.
+_GLARING, _GLARE_REACH, _GLARE_CONTRAST = 10.0, 3, 3.0
 
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 
@@ -93,10 +99,20 @@ def samples_from_frame(
         camera_from_world,
         world_from_camera[:3, 3].copy(),
         np.asarray(intrinsics, np.float64),
+        _glare(radiance, valid, clipped),
         kind,
         values,
     )
     return kind, values
+
+
+def _glare(radiance: Float, valid: Bool, clipped: Bool) -> Float:
+    """(H, W) float32: the brightest glaring pixel nearby, in any channel; 0 where there is none."""
+    level = radiance.max(axis=2)
+    usual = float(np.median(level[valid])) if valid.any() else 0.0
+    glaring = np.where((valid | clipped) & (level > _GLARING * usual), level, 0)
+    brightest: Float = ndimage.maximum_filter(glaring, 2 * _GLARE_REACH + 1, mode="nearest")
+    return brightest
 
 
 @kernel
@@ -130,6 +146,7 @@ def _sample(
     camera_from_world: Double,
     eye: Double,
     intrinsics: Double,
+    glare: Float,
     kind: npt.NDArray[np.int8],
     values: Float,
 ) -> None:
@@ -179,6 +196,8 @@ def _sample(
                 num_clipped += saturated
         # Partly saturated is no bound: a lamp's neighbour catches some of its light.
         if num_valid == 4 * taps_x * taps_y:
+            if glare[row, column] * (taps_x * taps_y) > _GLARE_CONTRAST * total.max():
+                continue
             kind[t] = SAMPLE
             for c in range(3):
                 values[t, c] = total[c] / (taps_x * taps_y)

@@ -1,0 +1,149 @@
+"""Lobes from made-up views whose frames err as frames do: what comes back, and how sure it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from usdbrdf.material.fit_lobe import Candidate, fit_lobe
+from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate
+from usdbrdf.material.verdict import SOME_EVIDENCE
+from usdbrdf.material.view_model import ViewSamples
+
+TEXELS, FRAMES = 50, 10
+SAMPLES = TEXELS * FRAMES
+LIGHT = np.array([1.0, 0.9, 0.8])
+SEEDS = range(20)
+# Relative standard deviations of what frames share: exposure, patches, white balance.
+FRAME, PATCH, COLOUR, OWN = 0.02, 0.04, 0.01, 0.015
+Basis = Callable[[float], tuple[np.ndarray, np.ndarray]]
+
+
+def _basis(mirrored: np.ndarray, *, footprint: float = 0.03) -> Basis:
+    """base and slope for samples whose half vectors are tan(angle) = ``mirrored`` away from the
+    normal, a lamp of radiance 20 and solid angle 0.03 being there: its GGX lobe, as wide as
+    ``footprint`` at least, before surroundings of radiance 0.5."""
+
+    def basis(phi: float) -> tuple[np.ndarray, np.ndarray]:
+        square = phi**2 + footprint**2
+        lobe = square / (np.pi * (square + mirrored**2) ** 2)
+        light = (0.5 + 20 * 0.03 * np.minimum(lobe, 300) / 4)[:, None] * LIGHT
+        return (0.002 * light).astype(np.float32), (0.08 * light).astype(np.float32)
+
+    return basis
+
+
+def _noisy(basis: Basis, seed: int, share: float) -> Basis:
+    """The same with relative noise, as ray tracing brings it, for every roughness alike."""
+    noise = 1 + share * np.random.default_rng([seed, 7]).standard_normal((SAMPLES, 1))
+
+    def noisy(phi: float) -> tuple[np.ndarray, np.ndarray]:
+        base, slope = basis(phi)
+        return base * noise.astype(np.float32), slope * noise.astype(np.float32)
+
+    return noisy
+
+
+def _views(seed: int) -> tuple[ViewSamples, np.ndarray]:
+    """Diffuse samples with errors, and how far from the mirror direction each sees the lamp."""
+    rng = np.random.default_rng(seed)
+    place = rng.random((TEXELS, 2))
+    position = np.concatenate([place, np.zeros((TEXELS, 1))], axis=1)
+    texel, frame = (a.ravel() for a in np.mgrid[0:TEXELS, 0:FRAMES])
+    # Each frame shows the lamp's mirror image somewhere on the surface or beside it.
+    seen_at = rng.uniform(-0.2, 1.2, (FRAMES, 2))
+    mirrored = 0.6 * np.linalg.norm(place[texel] - seen_at[frame], axis=1)
+    diffuse = rng.uniform(0.1, 0.5, (TEXELS, 3))[texel]
+    cell = frame * 4 + (position[texel, :2] > 0.5) @ [1, 2]
+    error = FRAME * rng.standard_normal((FRAMES, 1))[frame]
+    error = error + COLOUR * rng.standard_normal((FRAMES, 3))[frame]
+    error = error + PATCH * rng.standard_normal((FRAMES * 4, 1))[cell]
+    error = error + OWN * rng.standard_normal((SAMPLES, 3))
+    samples = ViewSamples(
+        texel=texel,
+        frame=frame,
+        position=position[texel].astype(np.float32),
+        radiance=(diffuse * (1 + error)).astype(np.float32),
+        noise=np.full((SAMPLES, 3), 1e-3, np.float32),
+        patch=0.2,
+    )
+    return samples, mirrored
+
+
+def _shone_on(samples: ViewSamples, basis: Basis, phi: float, psi: float) -> ViewSamples:
+    base, slope = basis(phi)
+    return replace(samples, radiance=samples.radiance + base + np.float32(psi) * slope)
+
+
+def _fit(samples: ViewSamples, *bases: tuple[Basis, float]) -> LobeEstimate:
+    """With candidates (basis, blur) that have the same basis twice, without noise."""
+    return fit_lobe(samples, [Candidate(first=b, second=b, blur=blur) for b, blur in bases])
+
+
+@pytest.mark.parametrize(("phi", "psi"), [(0.06, 0.4), (0.16, 0.7), (0.35, 0.9)])
+def test_the_lobe_comes_back_within_its_errors(phi: float, psi: float):
+    found = []
+    for seed in SEEDS:
+        samples, mirrored = _views(seed)
+        basis = _basis(mirrored)
+        found.append(_fit(_shone_on(samples, basis, phi, psi), (basis, 0.0)))
+    phis, psis, phi_errors, psi_errors = np.array(
+        [(f.phi, f.psi, f.phi_error, f.psi_error) for f in found]
+    ).T
+    assert (np.abs(phis - phi) <= phi_errors).mean() >= 0.8
+    assert (np.abs(psis - psi) <= psi_errors).mean() >= 0.8
+    # The errors say something.
+    assert np.median(phi_errors) < 0.1
+    assert np.median(psi_errors) < 0.2
+
+
+def test_errors_that_frames_share_are_no_lobe():
+    evidence, phi_error = [], []
+    for seed in SEEDS:
+        samples, mirrored = _views(seed)
+        found = _fit(samples, (_basis(mirrored), 0.0))
+        evidence.append(found.evidence)
+        phi_error.append(found.phi_error)
+    assert np.median(evidence) < 0.02
+    assert max(evidence) < SOME_EVIDENCE
+    assert np.median(phi_error) > 0.9 * NOTHING_KNOWN
+
+
+def test_noise_of_the_rays_does_not_draw_psi_to_zero():
+    phi, psi, noise = 0.1, 0.6, 0.1
+    halves, twice = [], []
+    for seed in SEEDS[:8]:
+        samples, mirrored = _views(seed)
+        basis = _basis(mirrored)
+        samples = _shone_on(samples, basis, phi, psi)
+        first, second = (_noisy(basis, 2 * seed + half, noise) for half in (0, 1))
+        halves.append(fit_lobe(samples, [Candidate(first=first, second=second, blur=0)]).psi)
+        twice.append(fit_lobe(samples, [Candidate(first=first, second=first, blur=0)]).psi)
+    assert np.mean(halves) == pytest.approx(psi, abs=0.02)
+    # Noise squared adds to the square of the slope, which psi is divided by.
+    assert np.mean(twice) < 0.93 * psi
+
+
+def test_the_footprint_that_fits_is_the_one_that_is_used():
+    # The lobe was seen through the wider footprint: through the narrow one it looks rougher.
+    phi, psi, blur = 0.05, 0.5, 0.06
+    right = []
+    for seed in SEEDS[:6]:
+        plain, mirrored = _views(seed)
+        narrow, wide = _basis(mirrored, footprint=0.03), _basis(mirrored, footprint=0.1)
+        samples = _shone_on(plain, wide, phi, psi)
+        alone = _fit(samples, (narrow, 0.01))
+        both = _fit(samples, (narrow, 0.01), (wide, blur))
+        assert abs(both.phi - phi) < abs(alone.phi - phi)
+        # What its blur leaves open.
+        added = math.hypot(both.phi, 2 * blur) - both.phi
+        assert both.unresolved == pytest.approx(added / both.phi)
+        right.append(both.phi)
+        # A candidate that fits worse changes nothing.
+        samples = _shone_on(plain, narrow, phi, psi)
+        assert _fit(samples, (narrow, 0.01)) == _fit(samples, (narrow, 0.01), (wide, blur))
+    assert np.mean(right) == pytest.approx(phi, abs=0.02)

@@ -1,0 +1,79 @@
+"""From costs to a lobe with errors, where the answer can be written down."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, lobe_from_costs
+
+PHIS = np.linspace(0, 1, 101)
+FREEDOM = 1000
+
+
+def _normal(
+    phi: float, psi: float, phi_error: float, psi_error: float, least: float
+) -> tuple[np.ndarray, float]:
+    """terms of cost = least + ((phi - .) / phi_error)^2 + ((psi - .) / psi_error)^2, and the cost
+    at psi = 0 with the best phi."""
+    c2 = np.full(len(PHIS), psi_error**-2)
+    c0 = least + ((PHIS - phi) / phi_error) ** 2 + psi**2 * c2
+    return np.stack([c0, psi * c2, c2], axis=-1), least + (psi / psi_error) ** 2
+
+
+@pytest.mark.parametrize(("least", "temper"), [(50.0, 1.0), (400.0, 4.0)])
+def test_a_normal_posterior_has_its_own_deviations(least: float, temper: float):
+    # Above 100 the cost is tempered: 1 % of it is not told apart.
+    terms, without = _normal(0.415, 0.6, 0.04, 0.05, least)
+    found = lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0)
+    assert (found.phi, found.psi) == pytest.approx((0.415, 0.6))
+    assert found.phi_error == pytest.approx(0.04 * math.sqrt(temper), rel=0.02)
+    assert found.psi_error == pytest.approx(0.05 * math.sqrt(temper), rel=0.02)
+    assert found.cost == pytest.approx(least / FREEDOM, rel=1e-3)
+    assert found.evidence == pytest.approx(1 - least / without, abs=1e-3)
+    assert found.unresolved == 0
+
+
+def test_uneven_roughnesses_count_by_the_space_between_them():
+    # The same cost at few and at many roughnesses: the same deviations.
+    phis = np.concatenate([np.linspace(0, 0.4, 21), np.linspace(0.4, 0.5, 41)[1:],
+                           np.linspace(0.5, 1, 26)[1:]])  # fmt: skip
+    terms, without = _normal(0.45, 0.6, 0.1, 0.05, 50)
+    between = np.stack([np.interp(phis, PHIS, term) for term in terms.T], axis=-1)
+    found = lobe_from_costs(phis, between, without, FREEDOM, 0.0)
+    assert found.phi_error == pytest.approx(0.1, rel=0.03)
+
+
+def test_specular_beyond_its_range_is_clamped():
+    for true, wanted in ((-0.3, 0.0), (1.4, 1.0)):
+        terms, without = _normal(0.3, true, 0.05, 0.2, 50)
+        found = lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0)
+        assert found.psi == pytest.approx(wanted)
+        # Nearer to the truth is cheaper: what is left of the normal is narrower than the whole.
+        assert 0 < found.psi_error < 0.2
+
+
+def test_costs_that_do_not_differ_say_that_nothing_is_known():
+    terms = np.tile([500.0, 0.0, 0.0], (len(PHIS), 1))
+    found = lobe_from_costs(PHIS, terms, 500.0, FREEDOM, 0.0)
+    assert found.evidence == 0
+    # From an end of the range everything is even farther away than from its middle.
+    assert found.phi_error == pytest.approx(NOTHING_KNOWN)
+    assert found.psi_error == pytest.approx(NOTHING_KNOWN)
+
+
+@pytest.mark.parametrize("without", [0.0, 20.0])
+def test_a_lobe_that_explains_nothing_has_no_evidence(without: float):
+    terms, _ = _normal(0.3, 0.5, 0.1, 0.1, 50)
+    assert lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0).evidence == 0
+
+
+def test_a_lobe_narrower_than_its_footprint_is_unresolved():
+    shares = []
+    for phi in (0.5, 0.1, 0.02):
+        terms, without = _normal(phi, 0.5, 0.02, 0.05, 50)
+        shares.append(lobe_from_costs(PHIS, terms, without, FREEDOM, 0.03).unresolved)
+    # hypot(phi, 2 blur) = (1 + share) phi
+    assert shares == pytest.approx([math.hypot(1, 0.06 / phi) - 1 for phi in (0.5, 0.1, 0.02)])

@@ -1,0 +1,285 @@
+"""The fit takes the specular light off again that was added to frames of a diffuse room."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from pxr import Usd, UsdShade
+from scipy import stats
+
+import usdbrdf
+from tests.scenes import MadeCapture, look_at, make_capture, ring_of_poses
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.geometry.cameras import pixel_centres
+from usdbrdf.geometry.rays import lift_from_surface
+from usdbrdf.job.progress import set_quiet
+from usdbrdf.job.stage import StageRun
+from usdbrdf.material.lit_scene import LitScene
+from usdbrdf.material.predict import non_diffuse_radiance
+from usdbrdf.material.target_frames import SurfacePoints, visible_points
+from usdbrdf.scan.scan import Frames
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.read import frames_from_stage, open_measured, read_aovs, read_shading
+from usdbrdf.steps import refine
+from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.steps.lit import lit_scene
+from usdbrdf.steps.refine import Lobes, refined_maps
+from usdbrdf.steps.texture import MEASURED
+
+Float = npt.NDArray[np.float32]
+
+# Dim enough, in the light of the others, not to be taken for a lamp itself.
+CEILING = {"ceiling": (0.125, 0.125, 0.125)}
+# phi, psi. The lamp reflects nothing.
+LOBE = {"floor": (0.2, 0.8), "ceiling": (0.6, 0.4), "walls": (0.3, 0.6), "box": (0.15, 0.9)}
+# The state is saved once, after the 16th frame.
+NUM_FRAMES, FIRST_UNSAVED = 18, 16
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quiet():
+    set_quiet(True)
+    yield
+    set_quiet(False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """clean, glossy: the same room with diffuse radiance alone and with lobes, both shaded."""
+
+    folder: Path
+    clean: Atlas
+    glossy: Asset
+
+
+def _poses() -> np.ndarray:
+    """Two thirds look down at the room, the others up at the lamp."""
+    lamp = np.array([2.0, 1.5, 2.4])
+    up = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(6)]
+    return np.concatenate([ring_of_poses(12), [look_at(place, lamp) for place in up]])
+
+
+def _shaded(capture: MadeCapture, folder: Path) -> Asset:
+    options = usdbrdf.TextureOptions(texel_size=0.2)
+    sampling = usdbrdf.Sampling(standard_error=0.0, max_rays=64)
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.ingest(capture.folder, asset, usdbrdf.IngestOptions())
+        usdbrdf.texture(asset, options)
+        usdbrdf.shade(asset, usdbrdf.ShadeOptions(sampling=sampling))
+        return asset
+
+
+def _atlas(asset: Asset) -> Atlas:
+    return atlas_from_stage(open_measured(asset))
+
+
+def _lobes(atlas: Atlas) -> Lobes:
+    rows = [LOBE.get(item.label, (1.0, 0.0)) for item in atlas.scene.objects]
+    phi, psi = np.array(rows, np.float32).T
+    return Lobes(phi=phi, psi=psi)
+
+
+def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, seed: int) -> Float:
+    """What the lobes reflect of the diffuse room, (R, 3); nothing from the lamp."""
+    own = lit.owner(points.face)
+    lamp = [item.label for item in lit.scene.objects].index("lamp")
+    reflects = np.flatnonzero((own >= 0) & (own != lamp))
+    result = np.zeros((len(own), 3), np.float32)
+    result[reflects] = non_diffuse_radiance(
+        lit, points.take(reflects), lobes.phi[own[reflects]], lobes.psi[own[reflects]], rays, seed
+    )
+    return result
+
+
+def _add_specular(capture: MadeCapture, atlas: Atlas, frames: Frames) -> None:
+    """To the photographs of the diffuse room."""
+    lit, lobes = lit_scene(atlas, black_environment()), _lobes(atlas)
+    for i, path in enumerate(sorted((capture.folder / "frames").iterdir())):
+        image = read_exr(path)
+        height, width = image.shape[:2]
+        points = visible_points(
+            lit.rays, lit.scene, frames.world_from_camera[i], frames.intrinsics[i],
+            pixel_centres(width, height),
+        )  # fmt: skip
+        image += _specular(lit, lobes, points, 64, 100 + i).reshape(image.shape)
+        write_exr(path, image)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Room:
+    folder = tmp_path_factory.mktemp("refine")
+    made = {
+        name: make_capture(
+            folder / name, size=(40, 30), subdivisions=1, poses=_poses(), radiance=CEILING
+        )
+        for name in ("clean", "glossy")
+    }
+    clean = _shaded(made["clean"], folder / "assets" / "clean")
+    atlas = _atlas(clean)
+    _add_specular(made["glossy"], atlas, frames_from_stage(open_measured(clean)))
+    glossy = _shaded(made["glossy"], folder / "assets" / "glossy")
+    return Room(folder=folder, clean=atlas, glossy=glossy)
+
+
+def _fitted(room: Room, name: str, options: usdbrdf.FitOptions) -> Asset:
+    """A copy of the glossy room, as far from its photographs, with a fit."""
+    folder = room.folder / "assets" / name
+    shutil.copytree(room.glossy.folder, folder)
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.fit(asset, options)
+        return asset
+
+
+@pytest.fixture(scope="module")
+def fitted(room: Room) -> Asset:
+    return _fitted(room, "fitted", usdbrdf.FitOptions())
+
+
+def _reflecting(room: Room, atlas: Atlas) -> np.ndarray:
+    """(T,): measured and no lamp."""
+    owner = np.array([item.label for item in atlas.scene.objects])[atlas.texels.object_index()]
+    measured = (atlas.map("coverage")[:, 0] == MEASURED) & (room.clean.map("coverage")[:, 0] == 1)
+    return measured & (owner != "lamp")
+
+
+def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Median relative error."""
+    return float(np.median(np.abs(found - wanted).sum(axis=1) / wanted.sum(axis=1)))
+
+
+def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
+    """S of some texels in the glossy room: that of the diffuse one, and pi times the mean specular
+    radiance that arrives along 64 cosine-distributed rays."""
+    lit, texels = lit_scene(clean, black_environment()), clean.texels
+    normal = texels.normal[which].astype(np.float64)
+    u = stats.qmc.Sobol(2, rng=0).random(64)
+    height = np.sqrt(1 - u[:, 0])
+    tangent = np.cross(normal, [0.3, 0.5, 0.8])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
+    angle = 2 * np.pi * u[:, 1]
+    local = np.stack([np.sqrt(u[:, 0]) * np.cos(angle), np.sqrt(u[:, 0]) * np.sin(angle), height])
+    directions = np.einsum("ck,tcd->tkd", local, frame).reshape(-1, 3).astype(np.float32)
+    origin = lift_from_surface(texels.position[which], texels.normal[which], lit.size)
+    origin = np.repeat(origin, 64, axis=0)
+    hits = lit.rays.closest(origin, directions)
+    points = SurfacePoints(
+        face=hits.face, u=hits.u, v=hits.v, position=origin + hits.distance[:, None] * directions,
+        normal=clean.scene.corner_normals[np.maximum(hits.face, 0), 0], to_camera=-directions,
+    )  # fmt: skip
+    arriving = _specular(lit, _lobes(clean), points, 32, 1)
+    return clean.map("irradiance")[which] + np.pi * arriving.reshape(-1, 64, 3).mean(axis=1)
+
+
+def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
+    stage = open_measured(room.glossy)
+    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
+    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    lit = lit_scene(atlas, black_environment())
+    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), 0)
+    which = _reflecting(room, atlas)
+    truth = room.clean.map("lit")[which]
+    before = _off(atlas.map("lit")[which], truth)
+    assert before > 0.05
+    assert _off(found["diffuse"].values[which], truth) < 0.1 * before
+
+
+def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset):
+    atlas = _atlas(fitted)
+    which, owner = _reflecting(room, atlas), atlas.texels.object_index()
+    for i, item in enumerate(atlas.scene.objects):
+        own = which & (owner == i)
+        if item.label == "lamp":
+            continue
+        assert own.sum() > 20
+        wanted = room.clean.map("lit")[own]
+        assert _off(atlas.map("diffuse")[own], wanted) < 0.5 * _off(atlas.map("lit")[own], wanted)
+    some = np.random.default_rng(0).choice(np.flatnonzero(which), 400, replace=False)
+    wanted = np.pi * room.clean.map("lit")[some] / _true_irradiance(room.clean, some)
+    found, before = (_off(atlas.map(name)[some], wanted) for name in ("base_color", "albedo"))
+    assert before > 0.02
+    assert found < 0.5 * before
+
+
+def test_the_base_colour_is_the_refined_radiance_over_the_same_irradiance(fitted: Asset):
+    atlas = _atlas(fitted)
+    base_color = atlas.map("base_color")
+    assert base_color.min() >= 0
+    assert base_color.max() <= 1
+    measured = atlas.map("coverage")[:, 0] == MEASURED
+    dark = measured & (atlas.map_where_present("emission", 3) == 0).all(axis=1)
+    wanted = np.pi * atlas.map("diffuse") / atlas.map("irradiance")
+    np.testing.assert_allclose(base_color[dark], np.clip(wanted, 0, 1)[dark], atol=2e-3)
+
+
+def test_the_lamp_keeps_its_radiance(room: Room, fitted: Asset):
+    atlas = _atlas(fitted)
+    index = [item.label for item in atlas.scene.objects].index("lamp")
+    own = atlas.texels.of_object(index)
+    assert read_shading(atlas.stage, atlas.scene.objects[index].prim_path).emitter
+    emission = atlas.map_where_present("emission", 3)[own]
+    shines = (emission > 0).any(axis=1)
+    assert shines.sum() > 10
+    np.testing.assert_array_equal(atlas.map("diffuse")[own][shines], emission[shines])
+    np.testing.assert_array_equal(atlas.map("base_color")[own][shines], 0)
+
+
+def _diffuse_color(asset: Asset, label: str) -> str:
+    """The file that a renderer reads an object's colour from."""
+    stage = Usd.Stage.Open(str(asset.root_layer))
+    prim = stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{label}")
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0]
+    sources, _ = shader.GetInput("diffuseColor").GetConnectedSources()
+    texture = UsdShade.Shader(sources[0].source.GetPrim())
+    return Path(texture.GetInput("file").Get().path).name
+
+
+def test_the_material_shows_the_base_colour(fitted: Asset):
+    assert _diffuse_color(fitted, "floor") == "floor.base_color.exr"
+    assert (fitted.folder / "previews" / "base_color.png").is_file()
+
+
+def test_other_fits_leave_the_albedo(room: Room):
+    paper = _fitted(room, "paper", usdbrdf.FitOptions(method="paper", max_pixels=60))
+    stage = open_measured(paper)
+    for item in atlas_from_stage(stage).scene.objects:
+        names = {aov.name for aov in read_aovs(stage, item.prim_path)}
+        assert "lit" in names
+        assert not names & {"diffuse", "base_color"}
+    assert _diffuse_color(paper, "floor") == "floor.albedo.exr"
+
+
+def _contents(folder: Path) -> dict[str, str]:
+    """SHA-256 of every texture."""
+    files = sorted((folder / "textures").iterdir())
+    return {path.name: sha256_of(path) for path in files if path.is_file()}
+
+
+def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatch):
+    starts = []
+    through_all = refine.radiance_from_frames
+
+    def interrupted(*arguments, **options):
+        starts.append(arguments[6])
+        for done in through_all(*arguments, **options):
+            yield done
+            if len(starts) == 1 and done == FIRST_UNSAVED:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(refine, "radiance_from_frames", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _fitted(room, "again", usdbrdf.FitOptions())
+    folder = room.folder / "assets" / "again"
+    assert not list((folder / "textures").glob("*.diffuse.exr"))
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.fit(asset, usdbrdf.FitOptions())
+    assert starts == [0, FIRST_UNSAVED]
+    assert _contents(folder) == _contents(fitted.folder)
