@@ -12,6 +12,7 @@ from pathlib import Path
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.scan.ingest_options import IngestOptions
+from usdbrdf.shading.denoise import CHOICES
 from usdbrdf.shading.irradiance import Sampling
 from usdbrdf.steps.fit import FitOptions
 from usdbrdf.steps.shade import ShadeOptions
@@ -186,9 +187,9 @@ def add_shade_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--denoise",
-        choices=("none", "oidn"),
+        choices=CHOICES,
         default=known.denoise,
-        help="lightmap filter for S; oidn needs usdbrdf[denoise]",
+        help="lightmap filter for S; oidn needs usdbrdf[denoise], auto takes it where it is there",
     )
 
 

@@ -46,7 +46,7 @@ _MIN_VIEWS = 3
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
 # the brighter samples would be valid.
 _ABOVE_NOISE = 4.0
-_MIXTURE = Mixture(per_lobe=4, lights=12, cosine=8)
+_MIXTURE = Mixture(per_lobe=6, lights=24, cosine=12)
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 

@@ -98,7 +98,7 @@ class Follower:
         )  # fmt: skip
         kind, radiance = samples_from_frame(
             self._texels, self._owner, surfaces, view.radiance, view.valid, clipped,
-            view.world_from_camera, view.intrinsics,
+            view.world_from_camera, view.intrinsics, beside_glare=True,
         )  # fmt: skip
         seen = np.flatnonzero(kind == SAMPLE)
         self._seen[row, seen] = True

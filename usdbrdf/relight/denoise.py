@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 
 from usdbrdf.relight.render import Rendered
 from usdbrdf.relight.surfaces import Float
-from usdbrdf.shading.denoise import require_oidn
+from usdbrdf.shading.denoise import AUTO, CHOICES, OIDN, chosen_filter
 
-AUTO, NONE, OIDN = CHOICES = ("auto", "none", "oidn")
-
-
-def chosen_filter(wanted: str) -> str:
-    """ "none" or "oidn"; auto is oidn where it is installed. EnvironmentFailure where it is wanted
-    and is not."""
-    if wanted == AUTO:
-        return OIDN if find_spec("pyoidn") else NONE
-    if wanted == OIDN:
-        require_oidn()
-    return wanted
+__all__ = ["AUTO", "CHOICES", "OIDN", "chosen_filter", "denoised"]
 
 
 def denoised(rendered: Rendered) -> Float:

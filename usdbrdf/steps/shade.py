@@ -14,7 +14,7 @@ from usdbrdf.errors import UsageError
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult, StageRun
-from usdbrdf.shading.denoise import require_oidn
+from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.irradiance import Irradiance, Sampling
 from usdbrdf.stage.asset import Asset
@@ -39,11 +39,12 @@ _MAX_RAYS = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """sampling; denoise "none" or "oidn" (lightmap filter, extra ``denoise``); environment, a
-    latitude-longitude HDR picture for rays that leave the scene, None for black."""
+    """sampling; denoise "none", "oidn" (lightmap filter, extra ``denoise``) or "auto": oidn where
+    it is installed; environment, a latitude-longitude HDR picture for rays that leave the scene,
+    None for black."""
 
     sampling: Sampling = field(default_factory=Sampling)
-    denoise: Literal["none", "oidn"] = "none"
+    denoise: Literal["auto", "none", "oidn"] = AUTO
     environment: Path | None = None
 
     def __post_init__(self) -> None:
@@ -57,8 +58,8 @@ class ShadeOptions:
 
 def shade(asset: Asset, options: ShadeOptions) -> StageResult:
     """Trace S, divide, find the emitters, write shading.usda and its EXR maps."""
-    if options.denoise == "oidn":
-        require_oidn()
+    # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
+    lightmap_filter = chosen_filter(options.denoise)
     layers = weaker_layers(asset, "shading")
     stage = open_weaker(asset, "shading")
     inputs = {
@@ -66,7 +67,7 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
         **environment_hash(options.environment),
         "maps": hash_of_maps(asset, "lit", "coverage"),
     }
-    parameters = {**asdict(options.sampling), "denoise": options.denoise}
+    parameters = {**asdict(options.sampling), "denoise": lightmap_filter}
     step = Step(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
     def work(run: StageRun) -> dict[str, Any]:
@@ -80,14 +81,14 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
         )
         traced = trace_irradiance(run, atlas, rays, light.lit, environment, options.sampling)
         irradiance = traced.mean
-        if options.denoise == "oidn":
+        if lightmap_filter == OIDN:
             irradiance = denoised_irradiance(atlas.texels, traced.mean)
         shaded = _shaded(atlas, light, seen, clipped, traced, irradiance)
         summary = _write(run, step, atlas, shaded)
         view = overview(atlas.scene, rays, frames_from_stage(stage))
         view.write(run.output("previews/albedo.png"), atlas.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), atlas.texels, irradiance)
-        return summary
+        return {**summary, "denoise": lightmap_filter}
 
     return step.run(work)
 

@@ -75,12 +75,13 @@ def samples_from_frame(
     clipped: Bool,
     world_from_camera: Double,
     intrinsics: Double,
+    beside_glare: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
     """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, and saturated all over its footprint),
     (T,) int8, and the radiance of the samples, (T, 3) float32.
 
     radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
-    intrinsics fx, fy, cx, cy.
+    intrinsics fx, fy, cx, cy. beside_glare: take samples there too, for whom highlights matter.
     """
     camera_from_world = np.linalg.inv(world_from_camera).astype(np.float64, copy=False)
     kind = np.zeros(len(texels), np.int8)
@@ -99,7 +100,7 @@ def samples_from_frame(
         camera_from_world,
         world_from_camera[:3, 3].copy(),
         np.asarray(intrinsics, np.float64),
-        _glare(radiance, valid, clipped),
+        np.zeros_like(valid, np.float32) if beside_glare else _glare(radiance, valid, clipped),
         kind,
         values,
     )

@@ -1,0 +1,130 @@
+"""The lightmap filter takes noise away and leaves the light and its contact shadows."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, box, quad, room, world_of
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.shading.denoise import CHOICES, chosen_filter, denoise_lightmap
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.steps.trace import denoised_irradiance
+
+SIDE = 1.28  # m
+TEXELS = 64  # of the floor, along each side: 2 cm
+LEG = (0.62, 0.68)  # m, in x and y: three texels of the floor lie below it
+CONTACT = 0.045  # m
+
+
+class Floor(NamedTuple):
+    """S of the floor's texels (T,), the channels' mean, and their distance from the leg in m."""
+
+    traced: np.ndarray
+    filtered: np.ndarray
+    converged: np.ndarray
+    distance: np.ndarray
+
+    def depth(self, values: np.ndarray, near: float, far: float) -> float:
+        """How much darker the floor is between two distances from the leg than away from it."""
+        ring = (self.distance > near) & (self.distance < far)
+        away = (self.distance > 0.3) & (self.distance < 0.5)
+        return float(1 - values[ring].mean() / values[away].mean())
+
+
+@pytest.fixture(scope="module")
+def floor() -> Floor:
+    """A leg of 6 x 6 cm on a floor, below a lamp of 70 x 70 cm that outshines all else."""
+    pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    ground = quad((0, 0, 0), (SIDE, 0, 0), (0, SIDE, 0), (TEXELS, TEXELS))
+    surroundings = [ground, *room((0, 0, 0), (SIDE, SIDE, 1.5))[1:]]
+    leg = box((LEG[0], LEG[0], 0), (LEG[1], LEG[1], 0.7))
+    world = world_of([*surroundings, *leg, *box((0.2, 0.2, 1.4), (0.9, 0.9, 1.45))])
+    lit = world.per_object([(0.1,) * 3] * 6 + [(0.02,) * 3] * 6 + [(30, 30, 30)] * 6)
+    traced = _irradiance(world, lit, Sampling())
+    converged = _irradiance(world, lit, Sampling(standard_error=0.0, max_rays=4096, seed=977))
+    filtered = denoised_irradiance(world.texels, traced)
+    own = world.texels.of_object(0)
+    place = world.texels.position[own, :2].astype(np.float64)
+    outside = np.maximum(LEG[0] - place, place - LEG[1]).max(axis=1)
+    traced, filtered, converged = (v[own].mean(axis=1) for v in (traced, filtered, converged))
+    return Floor(traced, filtered, converged, outside)
+
+
+def _irradiance(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray:
+    """S (T, 3) on the floor, 0 elsewhere."""
+    texels = world.texels
+    order, patch = patches_of_texels(texels)
+    on_floor = texels.object_index()[order] == 0
+    order, patch = order[on_floor], patch[on_floor]
+    found = np.zeros_like(lit)
+    found[order] = irradiance_at(
+        world.rays, world.texture(lit), world.lights(lit), black_environment(),
+        texels.position[order], texels.normal[order], patch, sampling, world.size,
+    ).mean  # fmt: skip
+    return found
+
+
+def test_the_noise_falls_and_the_mean_stays(floor: Floor):
+    seen = floor.distance > 0
+    traced, filtered = (
+        values[seen] / floor.converged[seen] - 1 for values in (floor.traced, floor.filtered)
+    )
+    assert np.sqrt((filtered**2).mean()) < 0.65 * np.sqrt((traced**2).mean())
+    assert abs(filtered.mean()) < 0.002
+    assert abs(floor.filtered[seen].sum() / floor.traced[seen].sum() - 1) < 0.002
+
+
+def test_the_contact_shadow_of_a_thin_leg_keeps_its_depth(floor: Floor):
+    depth = floor.depth(floor.converged, 0, CONTACT)
+    assert depth > 0.1
+    assert floor.depth(floor.filtered, 0, CONTACT) == pytest.approx(depth, rel=0.04)
+    # Texel by texel from the leg outwards: the shadow is not smeared.
+    for ring in range(4):
+        near, far = 0.02 * ring, 0.02 * (ring + 1)
+        truth = floor.depth(floor.converged, near, far)
+        assert floor.depth(floor.filtered, near, far) == pytest.approx(truth, abs=0.03)
+
+
+def _digest() -> str:
+    noise = np.random.default_rng(5)
+    found = hashlib.sha256()
+    for height, width in ((1, 1), (3, 2), (40, 33), (210, 300)):
+        picture = noise.gamma(2, size=(height, width, 3)).astype(np.float32)
+        found.update(denoise_lightmap(picture).tobytes())
+    return found.hexdigest()
+
+
+def test_the_filter_gives_the_same_bits_in_every_run_and_on_any_number_of_threads():
+    pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    here = _digest()
+    assert _digest() == here
+    for threads in ("1", "2"):
+        script = "from tests.shading.test_denoise import _digest; print(_digest())"
+        child = subprocess.run(
+            [sys.executable, "-c", script],
+            env={**os.environ, "OIDN_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert child.stdout.strip() == here, threads
+
+
+def test_auto_is_the_filter_where_it_is_installed():
+    pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    assert [chosen_filter(wanted) for wanted in CHOICES] == ["oidn", "none", "oidn"]
+
+
+def test_without_the_package_auto_is_none_and_oidn_is_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    assert [chosen_filter(wanted) for wanted in ("auto", "none")] == ["none", "none"]
+    with pytest.raises(EnvironmentFailure, match=r"usdbrdf\[denoise\].*\[shading.denoise\]"):
+        chosen_filter("oidn")
