@@ -50,7 +50,7 @@ def test_a_measurement_is_published_as_found(evidence: float):
     assert found.status == "measured"
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9, 1.1, 1.5])
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.1, 1.3])
 def test_each_parameter_is_judged_by_its_own_error(share: float):
     # Errors that, with the prior's precision added, come to ``share`` of the limit.
     def before(limit: float) -> float:
@@ -88,13 +88,18 @@ def test_without_evidence_the_prior_stays(evidence: float):
 
 
 def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
-    # Three quarters of either may be the footprint's: of psi = 0.8 that is far too much.
-    sharp, found = _on_views(), _on_views(unresolved=0.75)
-    assert (found.phi, found.psi) == (sharp.phi, sharp.psi)
-    assert found.phi_error == pytest.approx(math.hypot(sharp.phi_error, 0.75 * sharp.phi))
-    assert found.psi_error == pytest.approx(NOTHING_KNOWN)
-    assert (found.phi_confidence, found.psi_confidence) == ("high", "low")
-    assert found.status == "prior"
+    # A quarter of phi may be the footprint's, or all but a little of it.
+    sharp = _on_views()
+    for unresolved, confidence in ((0.25, "high"), (1.5, "low")):
+        found = _on_views(unresolved=unresolved)
+        assert (found.phi, found.psi) == (sharp.phi, sharp.psi)
+        assert found.phi_error == pytest.approx(math.hypot(sharp.phi_error, unresolved * sharp.phi))
+        # A blurred highlight holds the same light.
+        assert found.psi_error == pytest.approx(
+            min(math.hypot(sharp.psi_error, unresolved * sharp.psi / 3), NOTHING_KNOWN)
+        )
+        assert found.phi_confidence == confidence
+        assert found.status == ("measured" if confidence == "high" else "prior")
 
 
 def test_what_no_frame_sees_is_unseen():

@@ -22,10 +22,12 @@ SIDE = 1.28  # m
 TEXELS = 64  # of the floor, along each side: 2 cm
 LEG = (0.62, 0.68)  # m, in x and y: three texels of the floor lie below it
 CONTACT = 0.045  # m
+RUNS = 4  # with random numbers of their own, so that what is common to all is the filter's
 
 
 class Floor(NamedTuple):
-    """S of the floor's texels (T,), the channels' mean, and their distance from the leg in m."""
+    """S of the floor's texels, the channels' mean: traced and filtered (RUNS, T), converged (T,);
+    distance (T,) from the leg, in metres."""
 
     traced: np.ndarray
     filtered: np.ndarray
@@ -36,7 +38,7 @@ class Floor(NamedTuple):
         """How much darker the floor is between two distances from the leg than away from it."""
         ring = (self.distance > near) & (self.distance < far)
         away = (self.distance > 0.3) & (self.distance < 0.5)
-        return float(1 - values[ring].mean() / values[away].mean())
+        return float(1 - values[..., ring].mean() / values[..., away].mean())
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +50,14 @@ def floor() -> Floor:
     leg = box((LEG[0], LEG[0], 0), (LEG[1], LEG[1], 0.7))
     world = world_of([*surroundings, *leg, *box((0.2, 0.2, 1.4), (0.9, 0.9, 1.45))])
     lit = world.per_object([(0.1,) * 3] * 6 + [(0.02,) * 3] * 6 + [(30, 30, 30)] * 6)
-    traced = _irradiance(world, lit, Sampling())
+    traced = [_irradiance(world, lit, Sampling(seed=seed)) for seed in range(RUNS)]
     converged = _irradiance(world, lit, Sampling(standard_error=0.0, max_rays=4096, seed=977))
-    filtered = denoised_irradiance(world.texels, traced)
+    filtered = [denoised_irradiance(world.texels, values) for values in traced]
     own = world.texels.of_object(0)
     place = world.texels.position[own, :2].astype(np.float64)
     outside = np.maximum(LEG[0] - place, place - LEG[1]).max(axis=1)
-    traced, filtered, converged = (v[own].mean(axis=1) for v in (traced, filtered, converged))
-    return Floor(traced, filtered, converged, outside)
+    runs = (np.stack(values)[:, own].mean(axis=-1) for values in (traced, filtered))
+    return Floor(*runs, converged[own].mean(axis=-1), outside)
 
 
 def _irradiance(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray:
@@ -75,22 +77,24 @@ def _irradiance(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray
 def test_the_noise_falls_and_the_mean_stays(floor: Floor):
     seen = floor.distance > 0
     traced, filtered = (
-        values[seen] / floor.converged[seen] - 1 for values in (floor.traced, floor.filtered)
+        values[:, seen] / floor.converged[seen] - 1 for values in (floor.traced, floor.filtered)
     )
     assert np.sqrt((filtered**2).mean()) < 0.65 * np.sqrt((traced**2).mean())
     assert abs(filtered.mean()) < 0.002
-    assert abs(floor.filtered[seen].sum() / floor.traced[seen].sum() - 1) < 0.002
+    # Of every run: the filter's own change, whatever the noise.
+    change = floor.filtered[:, seen].sum(axis=1) / floor.traced[:, seen].sum(axis=1) - 1
+    assert np.abs(change).max() < 0.002
 
 
 def test_the_contact_shadow_of_a_thin_leg_keeps_its_depth(floor: Floor):
     depth = floor.depth(floor.converged, 0, CONTACT)
     assert depth > 0.1
-    assert floor.depth(floor.filtered, 0, CONTACT) == pytest.approx(depth, rel=0.04)
+    assert floor.depth(floor.filtered, 0, CONTACT) == pytest.approx(depth, rel=0.05)
     # Texel by texel from the leg outwards: the shadow is not smeared.
     for ring in range(4):
         near, far = 0.02 * ring, 0.02 * (ring + 1)
         truth = floor.depth(floor.converged, near, far)
-        assert floor.depth(floor.filtered, near, far) == pytest.approx(truth, abs=0.03)
+        assert floor.depth(floor.filtered, near, far) == pytest.approx(truth, abs=0.015)
 
 
 def _digest() -> str:

@@ -26,7 +26,7 @@ def asset(tmp_path) -> Asset:
     capture = make_capture(tmp_path / "scan", frames=8, subdivisions=1)
     with usdbrdf.working_on(tmp_path / "room") as asset:
         usdbrdf.ingest(capture.folder, asset, usdbrdf.IngestOptions())
-        usdbrdf.texture(asset, usdbrdf.TextureOptions(texel_size=0.2))
+        usdbrdf.texture(asset, usdbrdf.TextureOptions(texel_size=0.4))
     yield asset
     set_quiet(False)
 

@@ -13,7 +13,10 @@ from usdbrdf.material.prior import PRIOR_ERROR, with_prior
 # objects without a highlight, and fits with 0.3 were off by up to 0.2 in psi.
 MIN_EVIDENCE, SOME_EVIDENCE = 0.4, 0.2
 # A parameter is known if its standard deviation is at most this.
-MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.16
+MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.17
+# A blurred highlight is wider, but holds the same light: of the share of phi that the footprint may
+# account for, this much counts for psi too.
+_PSI_SHARE = 1 / 3
 # The fit of a single frame has no errors of its own: roughnesses that far apart must not fit alike,
 # and its evidence counts from here on.
 _MAX_FLAT_PHI = 0.4 / math.sqrt(12)
@@ -51,12 +54,12 @@ def verdict_on_views(
     footprint may have done. Without evidence the prior stands alone.
     """
     published, confidence = [], []
-    for (value, error), of_class, limit in zip(
-        (phi, psi), prior, (MAX_PHI_ERROR, MAX_PSI_ERROR), strict=True
+    for (value, error), of_class, limit, share in zip(
+        (phi, psi), prior, (MAX_PHI_ERROR, MAX_PSI_ERROR), (1, _PSI_SHARE), strict=True
     ):
         if evidence >= SOME_EVIDENCE:
             value, error = with_prior(value, error, of_class, NOTHING_KNOWN)
-            error = min(math.hypot(error, unresolved * value), NOTHING_KNOWN)
+            error = min(math.hypot(error, share * unresolved * value), NOTHING_KNOWN)
             published.append((value, error))
             sure = evidence >= MIN_EVIDENCE and error <= limit
             confidence.append("high" if sure else "low")
