@@ -81,7 +81,9 @@ def _shone_on(samples: ViewSamples, basis: Basis, phi: float, psi: float) -> Vie
 
 def _fit(samples: ViewSamples, *bases: tuple[Basis, float]) -> LobeEstimate:
     """With candidates (basis, blur) that have the same basis twice, without noise."""
-    return fit_lobe(samples, [Candidate(first=b, second=b, blur=blur) for b, blur in bases])
+    return fit_lobe(
+        samples, [Candidate(first=b, second=b, third=b, blur=blur) for b, blur in bases]
+    )
 
 
 @pytest.mark.parametrize(("phi", "psi"), [(0.06, 0.4), (0.16, 0.7), (0.35, 0.9)])

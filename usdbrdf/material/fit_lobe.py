@@ -32,13 +32,18 @@ _UPDATES, _MORE = 4, 2
 class Candidate:
     """What the lobe would look like with one footprint of the samples.
 
-    first, second  phi -> (base, slope) of I_nd = base + psi slope, (P, 3) each, with independent
-                   noise
-    blur           standard deviation of the normal over a footprint, in radians
+    first, second, third  phi -> (base, slope) of I_nd = base + psi slope, (P, 3) each, with
+                          independent noise
+    blur                  standard deviation of the normal over a footprint, in radians
+
+    Noise squared would draw psi towards 0; the product of two independent noises does not. But
+    weights that follow from these two would choose samples in which they cancel, and draw psi up:
+    weights are the third's.
     """
 
     first: Basis
     second: Basis
+    third: Basis
     blur: float
 
 
@@ -83,22 +88,24 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
         np.array(fine.phis),
         fine.terms,
         model.product(whole, whole),
+        _cost_with_noise(model, samples.radiance, tables[best], fine),
         model.degrees_of_freedom,
         candidates[best].blur,
     )
 
 
 class _Table:
-    """A candidate's two bases, evaluated once per roughness."""
+    """A candidate's bases, evaluated once per roughness: two for costs, one for weights."""
 
     def __init__(self, candidate: Candidate) -> None:
         self.at = cache(lambda phi: (candidate.first(phi), candidate.second(phi)))
+        self.of_weights = cache(candidate.third)
 
 
 def _improve(model: ViewModel, samples: ViewSamples, table: _Table) -> None:
     _, best, psi = _search(model, samples.radiance, table, _LEVEL_1).least
-    (b1, a1), (b2, a2) = table.at(_LEVEL_1[best])
-    model.update((b1 + b2 + psi * (a1 + a2)) / 2)
+    base, slope = table.of_weights(_LEVEL_1[best])
+    model.update(base + psi * slope)
 
 
 def _search(model: ViewModel, radiance: Float, table: _Table, phis: Sequence[float]) -> _Search:
@@ -109,6 +116,15 @@ def _search(model: ViewModel, radiance: Float, table: _Table, phis: Sequence[flo
         crossed = model.product(slopes[0], rest[1]) + model.product(slopes[1], rest[0])
         terms[k] = model.product(*rest), crossed / 2, model.product(*slopes)
     return _Search(phis=phis, terms=terms)
+
+
+def _cost_with_noise(model: ViewModel, radiance: Float, table: _Table, found: _Search) -> float:
+    """The least cost with the bases' own noise in it: the mean of either basis' squares."""
+    _, best, psi = found.least
+    rest = [
+        model.reduced(radiance - base - psi * slope) for base, slope in table.at(found.phis[best])
+    ]
+    return sum(model.product(one, one) for one in rest) / len(rest)
 
 
 def _with_level_2(best: int) -> list[float]:

@@ -46,7 +46,7 @@ _MIN_VIEWS = 3
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
 # the brighter samples would be valid.
 _ABOVE_NOISE = 4.0
-_MIXTURE = Mixture(per_lobe=6, lights=24, cosine=12)
+_MIXTURE = Mixture(per_lobe=4, lights=16, cosine=8)
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 
@@ -74,16 +74,14 @@ def fit_views(
     # differences, which are all that is fitted.
     points_of_texel = len(_OFFSETS) * samples.texel[:, None]
     stream = (points_of_texel + np.arange(len(_OFFSETS))).ravel()
-    # Two bases with rays of their own: noise squared would draw psi towards 0, the product of two
-    # independent noises does not.
-    candidates = [
-        Candidate(
-            first=lobe_basis(lit, points, len(samples.texel), 2 * seed, _MIXTURE, stream),
-            second=lobe_basis(lit, points, len(samples.texel), 2 * seed + 1, _MIXTURE, stream),
-            blur=_deviation_of_normal(points),
-        )
-        for points in footprints
-    ]
+    candidates = []
+    for points in footprints:
+        bases = [
+            lobe_basis(lit, points, len(samples.texel), 3 * seed + k, _MIXTURE, stream)
+            for k in range(3)
+        ]
+        blur = _deviation_of_normal(points)
+        candidates.append(Candidate(first=bases[0], second=bases[1], third=bases[2], blur=blur))
     return fit_lobe(samples, candidates), len(samples.texel)
 
 

@@ -36,13 +36,14 @@ class LobeEstimate:
 
 
 def lobe_from_costs(
-    phis: Double, terms: Double, without: float, freedom: int, blur: float
+    phis: Double, terms: Double, without: float, noisy: float, freedom: int, blur: float
 ) -> LobeEstimate:
     """The best lobe and its errors.
 
     phis     (K,) ascending, from 0 to 1
     terms    (K, 3): cost(phi, psi) = c0 - 2 psi c1 + psi^2 c2
     without  cost without specular light
+    noisy    the least cost with the rays' noise in it
     freedom  degrees of freedom, for the unit of the cost
     blur     standard deviation, in radians, of the surface normal over the footprint of a sample: a
              lobe narrower than that is not seen as such
@@ -53,7 +54,9 @@ def lobe_from_costs(
     phi = _vertex(phis, profile)
     least = float(profile.min())
     surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
-    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0))
+    # The rays' noise is an error of the lobe as much as the frames' is.
+    of_rays = max(1.0, noisy / max(least, 1e-12))
+    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0)) * of_rays
     density = np.exp(-0.5 * (surface - surface.min()) / temper)
     density *= np.gradient(phis)[:, None]
     density /= density.sum()
