@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.evaluate.truth import (
+from usdbrdf.evaluation.truth import (
     albedo_error,
     emitters,
     known_objects,
@@ -32,7 +32,7 @@ from usdbrdf.evaluate.truth import (
     scored_texels,
     true_albedo,
 )
-from usdbrdf.evaluate.viewed_asset import has_map
+from usdbrdf.evaluation.viewed_asset import has_map
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.scan.frame_reading import read_frame

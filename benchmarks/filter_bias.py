@@ -27,7 +27,7 @@ import numpy as np
 from against_reference import MIN_SAMPLES, Array, near_others, weighted_median
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.evaluate.viewed_asset import has_map
+from usdbrdf.evaluation.viewed_asset import has_map
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.stage.asset import Asset

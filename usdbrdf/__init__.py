@@ -4,15 +4,15 @@ from usdbrdf.stage.schema import register as _register
 
 _register()
 
-from usdbrdf.evaluate.compare_assets import compare as compare  # noqa: E402
-from usdbrdf.evaluate.evaluate_views import EvaluateOptions as EvaluateOptions  # noqa: E402
-from usdbrdf.evaluate.evaluate_views import evaluate as evaluate  # noqa: E402
+from usdbrdf.evaluation.compare_assets import compare as compare  # noqa: E402
+from usdbrdf.evaluation.evaluate_views import EvaluateOptions as EvaluateOptions  # noqa: E402
+from usdbrdf.evaluation.evaluate_views import evaluate as evaluate  # noqa: E402
 from usdbrdf.pipeline import ConvertOptions as ConvertOptions  # noqa: E402
 from usdbrdf.pipeline import convert as convert  # noqa: E402
 from usdbrdf.pipeline import working_on as working_on  # noqa: E402
-from usdbrdf.relight.insert import Insert as Insert  # noqa: E402
-from usdbrdf.relight.relight import RelightOptions as RelightOptions  # noqa: E402
-from usdbrdf.relight.relight import relight as relight  # noqa: E402
+from usdbrdf.relighting.insert import Insert as Insert  # noqa: E402
+from usdbrdf.relighting.relight import RelightOptions as RelightOptions  # noqa: E402
+from usdbrdf.relighting.relight import relight as relight  # noqa: E402
 from usdbrdf.scan.ingest_options import IngestOptions as IngestOptions  # noqa: E402
 from usdbrdf.shading.irradiance import Sampling as Sampling  # noqa: E402
 from usdbrdf.steps.fit import FitOptions as FitOptions  # noqa: E402

@@ -15,14 +15,14 @@ from typing import NoReturn
 from usdbrdf import compare, evaluate, fit, ingest, options, relight, shade, texture, working_on
 from usdbrdf.command_parser import command_parser
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.evaluate.command_options import evaluate_options
-from usdbrdf.evaluate.compare_assets import DOCUMENT as COMPARISON
-from usdbrdf.evaluate.compare_assets import comparison_line, figures
-from usdbrdf.evaluate.evaluate_views import DOCUMENT as EVALUATION
-from usdbrdf.evaluate.report import summary_line, truth_line
+from usdbrdf.evaluation.command_options import evaluate_options
+from usdbrdf.evaluation.compare_assets import DOCUMENT as COMPARISON
+from usdbrdf.evaluation.compare_assets import comparison_line, figures
+from usdbrdf.evaluation.evaluate_views import DOCUMENT as EVALUATION
+from usdbrdf.evaluation.report import summary_line, truth_line
 from usdbrdf.job.progress import printable, say, set_quiet
 from usdbrdf.job.stage import StageResult
-from usdbrdf.relight.command_options import relight_options
+from usdbrdf.relighting.command_options import relight_options
 from usdbrdf.scan.adapters import Adapter, list_adapters
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.schema import plugin_path

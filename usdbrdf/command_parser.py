@@ -8,9 +8,9 @@ from typing import Any, NoReturn
 
 from usdbrdf import options
 from usdbrdf.errors import UsageError
-from usdbrdf.evaluate.command_options import add_compare_options, add_evaluate_options
+from usdbrdf.evaluation.command_options import add_compare_options, add_evaluate_options
 from usdbrdf.job.stamp import code_version
-from usdbrdf.relight.command_options import add_relight_options
+from usdbrdf.relighting.command_options import add_relight_options
 
 EXIT_CODES = """exit codes:
   0 done   1 a defect of usdbrdf   2 wrong options   3 input refused (do not retry)

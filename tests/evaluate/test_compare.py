@@ -11,9 +11,9 @@ import usdbrdf
 from tests.scenes import edited, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluate.correspondence import correspondence
-from usdbrdf.evaluate.relit import MapNames, matched, relit
-from usdbrdf.evaluate.viewed_asset import measured_atlas
+from usdbrdf.evaluation.correspondence import correspondence
+from usdbrdf.evaluation.relit import MapNames, matched, relit
+from usdbrdf.evaluation.viewed_asset import measured_atlas
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import usdbrdf
 from tests.scenes import MadeCapture, look_at, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.evaluate.plot import write_plot
-from usdbrdf.evaluate.truth import compare_with_truth, true_albedo
-from usdbrdf.evaluate.viewed_asset import measured_atlas
+from usdbrdf.evaluation.plot import write_plot
+from usdbrdf.evaluation.truth import compare_with_truth, true_albedo
+from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.images import image_size, read_exr
 
 LOW = usdbrdf.EvaluateOptions(samples_per_pixel=4, rays=32)

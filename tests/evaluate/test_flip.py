@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.evaluate.flip import Pair, flip_in_child, flip_maps
+from usdbrdf.evaluation.flip import Pair, flip_in_child, flip_maps
 
 RANDOM = np.random.default_rng(3).random((24, 32, 3)).astype(np.float32)
 

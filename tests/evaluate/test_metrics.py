@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from usdbrdf.evaluate.metrics import exposure_of, finite, nrmse, psnr, relative_l2
+from usdbrdf.evaluation.metrics import exposure_of, finite, nrmse, psnr, relative_l2
 
 REFERENCE = np.random.default_rng(1).random((6, 5, 3)).astype(np.float32) + np.float32(0.1)
 ALL = np.ones((6, 5), bool)

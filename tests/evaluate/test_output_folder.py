@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from usdbrdf.errors import OwnershipConflict, UsageError
-from usdbrdf.evaluate.output_folder import FILES, files_of, output_folder
+from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
 from usdbrdf.files.documents import read_json, write_json
 
 DOCUMENT = "found.json"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.scenes import look_at
-from usdbrdf.evaluate.render_view import render_view
-from usdbrdf.evaluate.viewed_asset import measured_atlas, viewed_asset
+from usdbrdf.evaluation.render_view import render_view
+from usdbrdf.evaluation.viewed_asset import measured_atlas, viewed_asset
 from usdbrdf.geometry.surface_radiance import surface_texture
 
 SIZE = (40, 30)

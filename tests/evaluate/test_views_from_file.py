@@ -8,8 +8,8 @@ import pytest
 import usdbrdf
 from tests.scenes import edited, make_capture, ring_of_poses
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluate.viewed_asset import measured_atlas
-from usdbrdf.evaluate.views_from_file import views_from_file
+from usdbrdf.evaluation.viewed_asset import measured_atlas
+from usdbrdf.evaluation.views_from_file import views_from_file
 from usdbrdf.stage.read import frames_from_stage
 
 

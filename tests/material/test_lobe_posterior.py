@@ -27,7 +27,7 @@ def _normal(
 def test_a_normal_posterior_has_its_own_deviations(least: float, temper: float):
     # Above 100 the cost is tempered: 1 % of it is not told apart.
     terms, without = _normal(0.415, 0.6, 0.04, 0.05, least)
-    found = lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0)
+    found = lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0)
     assert (found.phi, found.psi) == pytest.approx((0.415, 0.6))
     assert found.phi_error == pytest.approx(0.04 * math.sqrt(temper), rel=0.02)
     assert found.psi_error == pytest.approx(0.05 * math.sqrt(temper), rel=0.02)
@@ -42,14 +42,14 @@ def test_uneven_roughnesses_count_by_the_space_between_them():
                            np.linspace(0.5, 1, 26)[1:]])  # fmt: skip
     terms, without = _normal(0.45, 0.6, 0.1, 0.05, 50)
     between = np.stack([np.interp(phis, PHIS, term) for term in terms.T], axis=-1)
-    found = lobe_from_costs(phis, between, without, FREEDOM, 0.0)
+    found = lobe_from_costs(phis, between, without, 0.0, FREEDOM, 0.0)
     assert found.phi_error == pytest.approx(0.1, rel=0.03)
 
 
 def test_specular_beyond_its_range_is_clamped():
     for true, wanted in ((-0.3, 0.0), (1.4, 1.0)):
         terms, without = _normal(0.3, true, 0.05, 0.2, 50)
-        found = lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0)
+        found = lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0)
         assert found.psi == pytest.approx(wanted)
         # Nearer to the truth is cheaper: what is left of the normal is narrower than the whole.
         assert 0 < found.psi_error < 0.2
@@ -57,7 +57,7 @@ def test_specular_beyond_its_range_is_clamped():
 
 def test_costs_that_do_not_differ_say_that_nothing_is_known():
     terms = np.tile([500.0, 0.0, 0.0], (len(PHIS), 1))
-    found = lobe_from_costs(PHIS, terms, 500.0, FREEDOM, 0.0)
+    found = lobe_from_costs(PHIS, terms, 500.0, 0.0, FREEDOM, 0.0)
     assert found.evidence == 0
     # From an end of the range everything is even farther away than from its middle.
     assert found.phi_error == pytest.approx(NOTHING_KNOWN)
@@ -67,13 +67,19 @@ def test_costs_that_do_not_differ_say_that_nothing_is_known():
 @pytest.mark.parametrize("without", [0.0, 20.0])
 def test_a_lobe_that_explains_nothing_has_no_evidence(without: float):
     terms, _ = _normal(0.3, 0.5, 0.1, 0.1, 50)
-    assert lobe_from_costs(PHIS, terms, without, FREEDOM, 0.0).evidence == 0
+    assert lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0).evidence == 0
 
 
 def test_a_lobe_narrower_than_its_footprint_is_unresolved():
-    shares = []
+    widths = []
     for phi in (0.5, 0.1, 0.02):
         terms, without = _normal(phi, 0.5, 0.02, 0.05, 50)
-        shares.append(lobe_from_costs(PHIS, terms, without, FREEDOM, 0.03).unresolved)
-    # hypot(phi, 2 blur) = (1 + share) phi
-    assert shares == pytest.approx([math.hypot(1, 0.06 / phi) - 1 for phi in (0.5, 0.1, 0.02)])
+        widths.append(lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.03).unresolved)
+    assert widths == pytest.approx([math.hypot(phi, 0.06) - phi for phi in (0.5, 0.1, 0.02)])
+
+
+def test_noise_of_the_rays_widens_the_errors():
+    terms, without = _normal(0.415, 0.6, 0.04, 0.05, 50)
+    quiet, noisy = (lobe_from_costs(PHIS, terms, without, n, FREEDOM, 0.0) for n in (50.0, 200.0))
+    assert noisy.phi_error == pytest.approx(2 * quiet.phi_error, rel=0.02)
+    assert noisy.psi_error == pytest.approx(2 * quiet.psi_error, rel=0.02)

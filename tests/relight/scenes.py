@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.relight.mitsuba_scene import mitsuba_scene
-from usdbrdf.relight.render import render_view
-from usdbrdf.relight.surfaces import Light, Material, RelitScene, Surface, constant_map
-from usdbrdf.relight.views import View
+from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
+from usdbrdf.relighting.render import render_view
+from usdbrdf.relighting.surfaces import Light, Material, RelitScene, Surface, constant_map
+from usdbrdf.relighting.views import View
 
 # A smooth lobe of no reflectance at normal incidence: seen and lit from above, it is Lambert's.
 MATTE = {"f0": constant_map(0.0), "roughness": constant_map(0.1)[..., :1]}

@@ -10,7 +10,7 @@ import pytest
 
 from tests.relight.scenes import cube, material, plate
 from usdbrdf.errors import UsageError
-from usdbrdf.relight.insert import Insert, placed, with_material
+from usdbrdf.relighting.insert import Insert, placed, with_material
 
 _STUFF = material()
 

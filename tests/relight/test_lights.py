@@ -11,8 +11,8 @@ import pytest
 
 from tests.relight.scenes import cube, material, plate
 from usdbrdf.files.images import write_exr
-from usdbrdf.relight.lighting import lit_by_others
-from usdbrdf.relight.surfaces import (
+from usdbrdf.relighting.lighting import lit_by_others
+from usdbrdf.relighting.surfaces import (
     UNKNOWN_DIFFUSE,
     DistantLight,
     Light,

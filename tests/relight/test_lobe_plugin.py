@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.physics.brdf import f_nd
-from usdbrdf.relight import lobe_plugin
-from usdbrdf.relight.variant import VARIANTS, mitsuba_variant
+from usdbrdf.relighting import lobe_plugin
+from usdbrdf.relighting.variant import VARIANTS, mitsuba_variant
 
 _CASES = [(0.05, 0.9, 0.1), (0.3, 0.5, 0.4), (0.9, 0.1, 0.7)]
 

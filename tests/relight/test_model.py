@@ -14,10 +14,10 @@ from tests.relight.conftest import BASE
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_radiance
-from usdbrdf.relight.insert import Insert
-from usdbrdf.relight.model import surfaces_from_model
-from usdbrdf.relight.relit_scene import relit_scene
-from usdbrdf.relight.surfaces import Surface
+from usdbrdf.relighting.insert import Insert
+from usdbrdf.relighting.model import surfaces_from_model
+from usdbrdf.relighting.relit_scene import relit_scene
+from usdbrdf.relighting.surfaces import Surface
 from usdbrdf.stage.published import Published, published_file
 
 

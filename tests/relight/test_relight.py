@@ -16,8 +16,8 @@ from tests.relight.conftest import BASE
 from usdbrdf.cli import main
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.images import read_radiance, write_exr
-from usdbrdf.relight.relight import RelightOptions, relight
-from usdbrdf.relight.variant import VARIANTS, mitsuba_variant
+from usdbrdf.relighting.relight import RelightOptions, relight
+from usdbrdf.relighting.variant import VARIANTS, mitsuba_variant
 
 # Half the fan of a square lamp, 3 m above: F = 4/(2 pi) * 2 * a/sqrt(1+a^2) atan(a/sqrt(1+a^2)).
 _A = 1 / 3

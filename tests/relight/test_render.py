@@ -12,9 +12,9 @@ import pytest
 from tests.physics.brdf import directional_albedo
 from tests.relight.scenes import cube, looking, material, photograph, plate
 from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.relight.matched_lobe import matching_factor
-from usdbrdf.relight.surfaces import DistantLight, ShapeLight, SkyLight, constant_map
-from usdbrdf.relight.variant import VARIANTS, mitsuba_variant
+from usdbrdf.relighting.matched_lobe import matching_factor
+from usdbrdf.relighting.surfaces import DistantLight, ShapeLight, SkyLight, constant_map
+from usdbrdf.relighting.variant import VARIANTS, mitsuba_variant
 from usdbrdf.shading.environment import environment_at
 
 

@@ -57,7 +57,7 @@ class _Search:
     @property
     def least(self) -> tuple[float, int, float]:
         """The least cost, with the index of its roughness and its psi in [0, 1]."""
-        square = np.maximum(self.terms[:, 2], 1e-12)
+        square = np.maximum(self.terms[:, 2], 1e-12 * max(float(self.terms[:, 0].max()), 1.0))
         psi = np.clip(self.terms[:, 1] / square, 0, 1)
         cost = self.terms[:, 0] - 2 * psi * self.terms[:, 1] + psi**2 * square
         best = int(cost.argmin())

@@ -22,9 +22,9 @@ NOTHING_KNOWN = 1 / np.sqrt(12)
 @dataclass(frozen=True, kw_only=True)
 class LobeEstimate:
     """phi, psi in [0, 1], where the cost is least; their standard deviations as far as the samples
-    tell, which near NOTHING_KNOWN say just that; unresolved, the share of either that may be due to
-    the samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any
-    specular light."""
+    tell, which near NOTHING_KNOWN say just that; unresolved, how much of phi may be due to the
+    samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any specular
+    light."""
 
     phi: float
     psi: float
@@ -70,7 +70,7 @@ def lobe_from_costs(
         psi=best_psi,
         phi_error=min(phi_error, NOTHING_KNOWN),
         psi_error=min(psi_error, NOTHING_KNOWN),
-        unresolved=footprint / max(phi, 0.01),
+        unresolved=footprint,
         cost=least / max(freedom, 1),
         evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
     )

@@ -54,12 +54,13 @@ def verdict_on_views(
     footprint may have done. Without evidence the prior stands alone.
     """
     published, confidence = [], []
-    for (value, error), of_class, limit, share in zip(
-        (phi, psi), prior, (MAX_PHI_ERROR, MAX_PSI_ERROR), (1, _PSI_SHARE), strict=True
+    of_psi = _PSI_SHARE * psi[0] * min(unresolved / max(phi[0], 0.01), 1.0)
+    for (value, error), of_class, limit, blurred in zip(
+        (phi, psi), prior, (MAX_PHI_ERROR, MAX_PSI_ERROR), (unresolved, of_psi), strict=True
     ):
         if evidence >= SOME_EVIDENCE:
             value, error = with_prior(value, error, of_class, NOTHING_KNOWN)
-            error = min(math.hypot(error, share * unresolved * value), NOTHING_KNOWN)
+            error = min(math.hypot(error, blurred), NOTHING_KNOWN)
             published.append((value, error))
             sure = evidence >= MIN_EVIDENCE and error <= limit
             confidence.append("high" if sure else "low")
@@ -92,7 +93,15 @@ def verdict_on_frame(
     measured = fitted and evidence >= _MIN_EVIDENCE_OF_FRAME and phi[1] <= _MAX_FLAT_PHI
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
-        return Verdict(phi=phi[0], psi=psi, phi_error=phi[1], psi_error=math.nan, status=status)
+        return Verdict(
+            phi=phi[0],
+            psi=psi,
+            phi_error=phi[1],
+            psi_error=math.nan,
+            status=status,
+            phi_confidence="low",
+            psi_confidence="low",
+        )
     return Verdict(
         phi=prior[0],
         psi=prior[1],

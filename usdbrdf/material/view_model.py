@@ -33,6 +33,8 @@ Long = npt.NDArray[np.int64]
 _INDEPENDENT, _OF_SPECULAR = 0.012, 0.05
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
+# With more shared errors than this, patches are made larger.
+_MOST_EFFECTS = 2500
 # Degrees of freedom of Student's t.
 _TAIL = 15.0
 # A texel's own diffuse radiance is taken to be at least this share of its mean radiance.
@@ -183,11 +185,16 @@ class ViewModel:
 def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
     """The shared errors: which of them each sample has (-1: none), and the one channel that it is
     for (None: all three alike)."""
-    frame = _shared(samples.frame)
-    cells = [_cells(samples.position, size) for size in (samples.patch, 2.5 * samples.patch)]
-    small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
-    every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
-    return every + [(which, channel) for which in (frame, large) for channel in range(3)]
+    frame, patch = _shared(samples.frame), samples.patch
+    while True:
+        cells = [_cells(samples.position, size) for size in (patch, 2.5 * patch)]
+        small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
+        every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
+        every += [(which, channel) for which in (frame, large) for channel in range(3)]
+        # The normal matrix is dense: its size bounds memory and time.
+        if sum(int(which.max(initial=-1)) + 1 for which, _ in every) <= _MOST_EFFECTS:
+            return every
+        patch *= 1.5
 
 
 def _cells(position: Float, size: float) -> Long:

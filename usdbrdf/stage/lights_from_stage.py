@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
 
-from usdbrdf.relight.surfaces import (
+from usdbrdf.relighting.surfaces import (
     DistantLight,
     Double,
     Float,

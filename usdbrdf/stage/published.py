@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom
 
-from usdbrdf.relight.surfaces import Light, Surface
+from usdbrdf.relighting.surfaces import Light, Surface
 from usdbrdf.stage.compose import open_stage
 from usdbrdf.stage.frames_from_stage import frames_from_stage
 from usdbrdf.stage.lights_from_stage import lights_from_stage

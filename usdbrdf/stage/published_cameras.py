@@ -6,7 +6,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.errors import UsageError
-from usdbrdf.relight.views import View
+from usdbrdf.relighting.views import View
 from usdbrdf.stage.frames_from_stage import capture_camera
 
 _DEFAULT_WIDTH = 1280

@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, read_exr, read_radiance
-from usdbrdf.relight.surfaces import Float, Material, constant_map, preview_material
+from usdbrdf.relighting.surfaces import Float, Material, constant_map, preview_material
 from usdbrdf.stage.frames_from_stage import asset_file
 
 # The fallbacks of UsdPreviewSurface, which also stand for a mesh without any material.

@@ -11,7 +11,7 @@ from pxr import Usd, UsdGeom, UsdShade
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.relight.surfaces import Double, Float, Surface
+from usdbrdf.relighting.surfaces import Double, Float, Surface
 from usdbrdf.stage.published_materials import PublishedMaterial, published_material
 from usdbrdf.stage.scene_from_stage import triangulation_of
 from usdbrdf.stage.triangulate import Triangulation

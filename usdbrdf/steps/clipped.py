@@ -87,6 +87,8 @@ def estimate_clipped_light(
 
     def compute() -> dict[str, npt.NDArray[np.generic]]:
         chosen, segment = _chosen(atlas, groups, seen, seed)
+        if not len(chosen):
+            return dict(vars(nothing_known(len(groups))))
         evidence = _evidence(atlas, rays, lit, groups, chosen, segment, environment, seed)
         return dict(vars(estimate_clipped_emitters(evidence)))
 
@@ -124,7 +126,8 @@ def _chosen(atlas: Atlas, groups: ClippedGroups, seen: Bool, seed: int) -> tuple
     rank = np.argsort(np.log(random.random(len(usable))) / np.maximum(weight, 1e-30))[::-1]
     numbers = np.unique(segment)
     each = int(np.clip(_TEXELS // max(len(numbers), 1), 30, _PER_SEGMENT))
-    kept = np.sort(np.concatenate([rank[segment[rank] == number][:each] for number in numbers]))
+    picked = [rank[segment[rank] == number][:each] for number in numbers]
+    kept = np.sort(np.concatenate([np.zeros(0, np.int64), *picked]))
     return usable[kept], segment[kept]
 
 

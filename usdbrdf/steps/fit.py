@@ -149,6 +149,8 @@ def _said(item: FittedObject) -> dict[str, Any]:
         "psi": round(item.psi, 4),
         "phi_error": round(item.phi_error, 4) if math.isfinite(item.phi_error) else None,
         "psi_error": round(item.psi_error, 4) if math.isfinite(item.psi_error) else None,
+        "phi_confidence": item.phi_confidence,
+        "psi_confidence": item.psi_confidence,
         "status": item.status,
         "evidence": round(item.evidence, 4) if math.isfinite(item.evidence) else 0.0,
         "target_frame": item.target_frame,
@@ -255,7 +257,8 @@ def _record(
     seen: bool,
 ) -> FittedObject:
     obj = lit.scene.objects[index]
-    numbers = (float(number) for number in found["numbers"])
+    # Digits beyond these depend on how many threads the linear algebra had.
+    numbers = (round(float(number), 4) for number in found["numbers"])
     phi, psi, phi_error, psi_error, unresolved, cost, evidence = numbers
     prior = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
     if options.method == "views":

@@ -21,7 +21,7 @@ from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.scan.scan import Frames
 from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, TexelMap
-from usdbrdf.steps.texture import FILLED
+from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
@@ -66,6 +66,9 @@ def refined_maps(
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
     diffuse = np.where(emissive[:, None], emission, inpaint(texels, median, known))
+    # What clips in every frame is at least as bright as that.
+    clipped = atlas.map("coverage") == CLIPPED
+    diffuse = np.where(clipped, np.maximum(diffuse, atlas.map("lit")), diffuse)
     seen = atlas.map("coverage")[:, 0] != FILLED
     base_color, _ = albedo_map(texels, diffuse, atlas.map("irradiance"), seen, emissive)
     return {

@@ -10,21 +10,21 @@ from typing import Any
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.progress import say
-from usdbrdf.relight.denoise import AUTO, OIDN, chosen_filter, denoised
-from usdbrdf.relight.insert import Insert
-from usdbrdf.relight.mitsuba_scene import mitsuba_scene
-from usdbrdf.relight.picture import (
+from usdbrdf.relighting.denoise import AUTO, OIDN, chosen_filter, denoised
+from usdbrdf.relighting.insert import Insert
+from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
+from usdbrdf.relighting.picture import (
     DISPLAYED,
     automatic_exposure,
     check_picture_name,
     write_picture,
 )
-from usdbrdf.relight.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
-from usdbrdf.relight.render import render_view
-from usdbrdf.relight.surfaces import Float
-from usdbrdf.relight.variant import mitsuba_variant
-from usdbrdf.relight.views import View
-from usdbrdf.relight.views_from_document import views_from_document
+from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
+from usdbrdf.relighting.render import render_view
+from usdbrdf.relighting.surfaces import Float
+from usdbrdf.relighting.variant import mitsuba_variant
+from usdbrdf.relighting.views import View
+from usdbrdf.relighting.views_from_document import views_from_document
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.compose import open_edited
 from usdbrdf.stage.published import eye_height, published

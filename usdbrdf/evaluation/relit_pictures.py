@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.evaluate.metrics import exposure_of
-from usdbrdf.evaluate.pictures import magma, sheet
-from usdbrdf.evaluate.relit import Relit
+from usdbrdf.evaluation.metrics import exposure_of
+from usdbrdf.evaluation.pictures import magma, sheet
+from usdbrdf.evaluation.relit import Relit
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.geometry.rays import Hits, RayScene

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.evaluate.flip import Pair, flip_maps
-from usdbrdf.evaluate.metrics import exposure_of, finite, psnr, relative_l2
-from usdbrdf.evaluate.pictures import change, magma, sheet
-from usdbrdf.evaluate.render_view import RenderedView, ViewedAsset, render_view
-from usdbrdf.evaluate.views_from_file import Views
+from usdbrdf.evaluation.flip import Pair, flip_maps
+from usdbrdf.evaluation.metrics import exposure_of, finite, psnr, relative_l2
+from usdbrdf.evaluation.pictures import change, magma, sheet
+from usdbrdf.evaluation.render_view import RenderedView, ViewedAsset, render_view
+from usdbrdf.evaluation.views_from_file import Views
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress

@@ -9,8 +9,8 @@ import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress
-from usdbrdf.relight.surfaces import Double, Float
-from usdbrdf.relight.views import View
+from usdbrdf.relighting.surfaces import Double, Float
+from usdbrdf.relighting.views import View
 
 # Paths of one pass: bounds the memory of the vectorised path tracer, some 200 bytes a path, and
 # gives the bar something to count.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.relight.views import View
+from usdbrdf.relighting.views import View
 from usdbrdf.scan.findings import Findings
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.scan.scan_from_transforms import frame_records

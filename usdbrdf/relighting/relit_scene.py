@@ -9,10 +9,10 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
-from usdbrdf.relight.insert import Insert, placed, turned_up, with_material
-from usdbrdf.relight.lighting import emits_light, lit_by_others
-from usdbrdf.relight.model import surfaces_from_model
-from usdbrdf.relight.surfaces import Light, RelitScene, Surface
+from usdbrdf.relighting.insert import Insert, placed, turned_up, with_material
+from usdbrdf.relighting.lighting import emits_light, lit_by_others
+from usdbrdf.relighting.model import surfaces_from_model
+from usdbrdf.relighting.surfaces import Light, RelitScene, Surface
 from usdbrdf.stage.lights_from_stage import sky_of_picture
 from usdbrdf.stage.published import Published, published_file
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.relight.render import Rendered
-from usdbrdf.relight.surfaces import Float
+from usdbrdf.relighting.render import Rendered
+from usdbrdf.relighting.surfaces import Float
 from usdbrdf.shading.denoise import AUTO, CHOICES, OIDN, chosen_filter
 
 __all__ = ["AUTO", "CHOICES", "OIDN", "chosen_filter", "denoised"]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.evaluate.correspondence import Correspondence, correspondence
-from usdbrdf.evaluate.metrics import finite, median_relative, nrmse
-from usdbrdf.evaluate.truth import MIN_SAMPLES
+from usdbrdf.evaluation.correspondence import Correspondence, correspondence
+from usdbrdf.evaluation.metrics import finite, median_relative, nrmse
+from usdbrdf.evaluation.truth import MIN_SAMPLES
 from usdbrdf.steps.atlas import Atlas
 
 Float = npt.NDArray[np.float32]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.relight.denoise import CHOICES
-from usdbrdf.relight.insert import Insert
-from usdbrdf.relight.relight import MIN_BOUNCES, RelightOptions
+from usdbrdf.relighting.denoise import CHOICES
+from usdbrdf.relighting.insert import Insert
+from usdbrdf.relighting.relight import MIN_BOUNCES, RelightOptions
 
 _INSERT_HELP = """put a model in (USD, OBJ, PLY, GLB); may be given again. at=X,Y,Z, or
 drop=X,Y[,Z]: let it fall there (from the height Z; default: from that of the highest capture

@@ -12,7 +12,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.geometry.mesh_from_file import SUFFIXES, mesh_from_file
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.relight.surfaces import Float, Material, Surface, constant_map, preview_material
+from usdbrdf.relighting.surfaces import Float, Material, Surface, constant_map, preview_material
 
 _CREASE_ANGLE_DEG = 40.0
 # UsdPreviewSurface's own, where a file has no material.

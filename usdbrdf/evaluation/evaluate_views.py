@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.errors import UsageError
-from usdbrdf.evaluate.output_folder import FILES, files_of, output_folder
-from usdbrdf.evaluate.plot import write_plot
-from usdbrdf.evaluate.report import summary_of_views, table_text
-from usdbrdf.evaluate.score_views import Quality, exposure_of_views, score_views
-from usdbrdf.evaluate.truth import compare_with_truth
-from usdbrdf.evaluate.viewed_asset import map_or, measured_atlas, viewed_asset
-from usdbrdf.evaluate.views_from_file import views_from_file
+from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
+from usdbrdf.evaluation.plot import write_plot
+from usdbrdf.evaluation.report import summary_of_views, table_text
+from usdbrdf.evaluation.score_views import Quality, exposure_of_views, score_views
+from usdbrdf.evaluation.truth import compare_with_truth
+from usdbrdf.evaluation.viewed_asset import map_or, measured_atlas, viewed_asset
+from usdbrdf.evaluation.views_from_file import views_from_file
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 

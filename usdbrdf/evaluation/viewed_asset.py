@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluate.render_view import ViewedAsset
+from usdbrdf.evaluation.render_view import ViewedAsset
 from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.header import read_header

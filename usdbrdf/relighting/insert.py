@@ -10,7 +10,7 @@ import numpy as np
 
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.rays import RayScene
-from usdbrdf.relight.surfaces import Double, Int, Surface, constant_map
+from usdbrdf.relighting.surfaces import Double, Int, Surface, constant_map
 
 _UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
 

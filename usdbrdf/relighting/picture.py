@@ -9,7 +9,7 @@ import numpy as np
 from usdbrdf.errors import UsageError
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import write_exr, write_preview_png
-from usdbrdf.relight.surfaces import Float
+from usdbrdf.relighting.surfaces import Float
 
 LINEAR = (".exr",)
 DISPLAYED = (".png", ".jpg", ".jpeg")

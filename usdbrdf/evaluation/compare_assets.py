@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluate.output_folder import FILES, files_of, output_folder
-from usdbrdf.evaluate.relit import MapNames, Relit, errors, matched, relit
-from usdbrdf.evaluate.relit_pictures import write_pictures
-from usdbrdf.evaluate.report import table_text
-from usdbrdf.evaluate.viewed_asset import has_map, measured_atlas
+from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
+from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit
+from usdbrdf.evaluation.relit_pictures import write_pictures
+from usdbrdf.evaluation.report import table_text
+from usdbrdf.evaluation.viewed_asset import has_map, measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 from usdbrdf.job.progress import say

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from usdbrdf.relight.surfaces import Light, RelitScene, Surface
+from usdbrdf.relighting.surfaces import Light, RelitScene, Surface
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their
 # diagonal, or by a millimetre.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from usdbrdf.evaluate.evaluate_views import EvaluateOptions
+from usdbrdf.evaluation.evaluate_views import EvaluateOptions
 from usdbrdf.options import existing_file
 
 

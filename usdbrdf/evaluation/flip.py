@@ -43,7 +43,7 @@ def flip_maps(pairs: Sequence[Pair], label: str) -> list[Float]:
     }
     megapixels = sum(pair.reference.size for pair in pairs) / 3e6
     found = run_child(
-        "usdbrdf.evaluate.flip:flip_in_child",
+        "usdbrdf.evaluation.flip:flip_in_child",
         arrays,
         {"count": len(pairs)},
         _SECONDS + _SECONDS_PER_MEGAPIXEL * megapixels,

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.relight import lobe_plugin
-from usdbrdf.relight.matched_lobe import matching_factor
-from usdbrdf.relight.surfaces import Float, Surface
+from usdbrdf.relighting import lobe_plugin
+from usdbrdf.relighting.matched_lobe import matching_factor
+from usdbrdf.relighting.surfaces import Float, Surface
 
 # Share of the samples that go to the lobe where Mitsuba mixes two BSDFs.
 _GLOSSY_SHARE = 0.3

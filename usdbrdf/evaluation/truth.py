@@ -16,7 +16,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluate.metrics import finite, median_relative, nrmse
+from usdbrdf.evaluation.metrics import finite, median_relative, nrmse
 from usdbrdf.files.documents import read_json
 from usdbrdf.stage.read import read_fit
 from usdbrdf.steps.atlas import Atlas

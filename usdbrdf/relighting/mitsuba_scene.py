@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.relight.mitsuba_materials import bsdf, radiance_texture
-from usdbrdf.relight.surfaces import (
+from usdbrdf.relighting.mitsuba_materials import bsdf, radiance_texture
+from usdbrdf.relighting.surfaces import (
     DistantLight,
     Double,
     Float,
