@@ -28,7 +28,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "--wait",
-        type=_number,
+        type=finite_number,
         default=0.0,
         metavar="S",
         help="wait up to this many seconds for a busy asset folder",
@@ -79,7 +79,7 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--crease-angle",
-        type=_number,
+        type=finite_number,
         default=known.crease_angle_deg,
         metavar="DEG",
         help="faces that meet at more degrees than this meet in a sharp edge",
@@ -92,7 +92,7 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--min-component-area",
-        type=_number,
+        type=finite_number,
         default=known.min_component_area_m2,
         metavar="M2",
         help="without labels, connected parts of at least this many m^2 become objects",
@@ -109,13 +109,13 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--pose-scale",
-        type=_number,
+        type=finite_number,
         metavar="S",
         help="scale of the camera axes, to be divided out; default: 1, others are refused",
     )
     add(
         "--max-nonfinite",
-        type=_number,
+        type=finite_number,
         default=known.max_nonfinite,
         metavar="SHARE",
         help="drop a frame with a larger share of NaN or infinite pixels",
@@ -130,7 +130,7 @@ def add_ingest_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--meters-per-unit",
-        type=_number,
+        type=finite_number,
         metavar="M",
         help="length of a scene unit in metres; default: as the format says",
     )
@@ -142,13 +142,13 @@ def add_texture_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("texture").add_argument
     add(
         "--texel-size",
-        type=_number,
+        type=finite_number,
         metavar="M",
         help="side of a texel in metres; default: the frames' median pixel footprint",
     )
     add(
         "--quantile",
-        type=_number,
+        type=finite_number,
         default=known.quantile,
         metavar="P",
         help="quantile of a texel's observations that becomes L_d, between 0 and 1",
@@ -173,7 +173,7 @@ def add_shade_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--standard-error",
-        type=_number,
+        type=finite_number,
         default=known.sampling.standard_error,
         metavar="E",
         help="mis stops where the relative standard error of S is below this",
@@ -224,7 +224,7 @@ def add_light_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--seed",
-        type=_seed,
+        type=seed_number,
         default=ShadeOptions().sampling.seed,
         metavar="N",
         help="seed of the random numbers",
@@ -277,13 +277,13 @@ def fit_options(chosen: argparse.Namespace) -> FitOptions:
     )
 
 
-def _seed(text: str) -> int:
+def seed_number(text: str) -> int:
     if not (text.isdecimal() and int(text) < 2**32):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 4294967295")
     return int(text)
 
 
-def _number(text: str) -> float:
+def finite_number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:

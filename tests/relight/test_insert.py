@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.relight.scenes import cube, material, plate
+from tests.relight.scenes import MATTE, cube, looking, material, photograph, plate
 from usdbrdf.errors import UsageError
 from usdbrdf.relighting.insert import Insert, placed, with_material
+from usdbrdf.relighting.surfaces import SkyLight, constant_map, preview_material
+from usdbrdf.relighting.variant import VARIANTS, mitsuba_variant
 
 _STUFF = material()
 
@@ -92,3 +95,51 @@ def test_what_is_said_about_the_material_replaces_the_models() -> None:
     found = with_material(cube(_STUFF), metal).material
     assert found.f0.ravel() == pytest.approx([0.9, 0.6, 0.2])
     assert not found.diffuse.any()
+
+
+_GOLD = np.array([0.9, 0.6, 0.2], np.float32)
+
+
+def _metal() -> Any:
+    return preview_material(
+        diffuse=constant_map(*_GOLD),
+        metallic=constant_map(1.0)[..., :1],
+        roughness=constant_map(0.3)[..., :1],
+        emission=constant_map(0.0),
+    )
+
+
+def test_an_ior_alone_makes_a_dielectric_of_a_metal() -> None:
+    found = with_material(cube(_metal()), Insert(model=Path("a.glb"), ior=1.5)).material
+    assert found.diffuse.ravel() == pytest.approx(_GOLD)
+    assert found.f0.ravel() == pytest.approx([0.04] * 3)
+
+
+def test_a_colour_alone_leaves_a_metal_a_metal() -> None:
+    given = Insert(model=Path("a.glb"), color=(0.5, 0.6, 0.7))
+    found = with_material(cube(_metal()), given).material
+    assert not found.diffuse.any()
+    assert found.f0.ravel() == pytest.approx([0.5, 0.6, 0.7])
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_metal_takes_the_colours_of_the_corners(variant: str) -> None:
+    mi = mitsuba_variant(variant)
+    if mi.variant() != variant:
+        pytest.skip("no usable LLVM library")
+    stuff = replace(material(1.0), **MATTE)
+    plain = plate(stuff)
+    coloured = replace(plain, corner_colour=np.tile(_GOLD, (len(plain.triangles), 3, 1)))
+    given = Insert(model=Path("a.ply"), metallic=1.0, roughness=0.1)
+    found = with_material(coloured, given)
+    assert found.corner_colour is not None
+    assert found.corner_f0 is not None
+    assert not found.corner_colour.any()
+    assert found.corner_f0.reshape(-1, 3) == pytest.approx(np.tile(_GOLD, (6, 1)))
+    # Under an even sky, seen from above, a smooth metal shows its colour.
+    alike = with_material(plain, replace(given, color=tuple(float(c) for c in _GOLD)))
+    sky = SkyLight(image=np.ones((2, 4, 3), np.float32), world_from_here=np.eye(3))
+    eye = looking((0, 0, 2), (0, 0, 0))
+    seen, one = (photograph(mi, [item], eye, lights=[sky]) for item in (found, alike))
+    assert seen.mean(axis=(0, 1)) == pytest.approx(_GOLD, rel=0.1)
+    assert seen == pytest.approx(one, rel=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 
 from tests.relight.conftest import BASE
+from tests.relight.scenes import MATTE, looking, material, photograph, plate
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.images import read_radiance
+from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.model import surfaces_from_model
 from usdbrdf.relighting.relit_scene import relit_scene
-from usdbrdf.relighting.surfaces import Surface
+from usdbrdf.relighting.surfaces import SkyLight, Surface
+from usdbrdf.relighting.variant import mitsuba_variant
 from usdbrdf.stage.published import Published, published_file
 
 
@@ -179,8 +182,6 @@ def Scope "mtl"
 
 
 def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: Published) -> None:
-    from usdbrdf.files.images import write_exr
-
     write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
     (tmp_path / "thing.usda").write_text(_USD)
     found = _inserted(tmp_path / "thing.usda", stage)
@@ -193,6 +194,43 @@ def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: Published) 
     # Decimetres with y up: the upper face is 0.2 m above, facing up.
     assert glow.bounds[:, 2] == pytest.approx([0.2, 0.2])
     assert glow.corner_normals[..., 2] == pytest.approx(np.ones((2, 3)))
+
+
+def test_an_input_of_another_type_is_told_and_left(tmp_path: Path) -> None:
+    text = _USD.replace("float inputs:roughness = 0.7", "color3f inputs:roughness = (1, 1, 1)")
+    text = text.replace("float4 inputs:scale = (2, 2, 2, 1)", "string inputs:scale = 'wide'")
+    (tmp_path / "thing.usda").write_text(text)
+    write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
+    said: list[str] = []
+    found = published_file(tmp_path / "thing.usda", said.append).surfaces
+    glow, plain = sorted(found, key=lambda surface: not surface.material.emits)
+    assert plain.material.roughness.ravel() == pytest.approx([0.5])
+    assert glow.material.emission == pytest.approx(np.full((2, 3, 3), 1.5))
+    assert ["inputs:roughness" in s or "inputs:scale" in s for s in said] == [True, True]
+
+
+@pytest.mark.parametrize("mode", ["repeat", "clamp", "mirror"])
+def test_textures_are_wrapped_as_the_stage_says(tmp_path: Path, mode: str) -> None:
+    wraps = f'token inputs:wrapS = "{mode}"\ntoken inputs:wrapT = "{mode}"\nasset inputs:file'
+    (tmp_path / "thing.usda").write_text(_USD.replace("asset inputs:file", wraps))
+    write_exr(tmp_path / "glow.exr", np.ones((2, 3, 3), np.float32))
+    found = published_file(tmp_path / "thing.usda", pytest.fail).surfaces
+    assert sorted(surface.material.wrap for surface in found) == sorted([mode, "clamp"])
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+def test_beyond_its_edge_a_texture_goes_on_as_its_mode_says(wrap: str) -> None:
+    image = np.zeros((1, 4, 3), np.float32)
+    image[:, :2] = 0.8  # the left half
+    stuff = replace(material(), diffuse=image, wrap=wrap, **MATTE)
+    floor = plate(stuff)
+    assert floor.corner_uv is not None
+    # Where the camera looks, u is 1.25: a quarter into the next copy.
+    floor = replace(floor, corner_uv=floor.corner_uv + np.array([0.75, 0], np.float32))
+    sky = SkyLight(image=np.ones((2, 4, 3), np.float32), world_from_here=np.eye(3))
+    eye = looking((0, 0, 2), (0, 0, 0))
+    seen = photograph(mitsuba_variant("scalar_rgb"), [floor], eye, lights=[sky]).mean()
+    assert seen == pytest.approx(0.8 if wrap == "repeat" else 0.0, abs=0.05)
 
 
 def test_a_model_that_fell_is_in_the_picture(room: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pytest
 from tests.relight.conftest import BASE
 from usdbrdf.cli import main
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.files.images import read_radiance, write_exr
+from usdbrdf.files.images import read_radiance
 from usdbrdf.relighting.relight import RelightOptions, relight
 from usdbrdf.relighting.variant import VARIANTS, mitsuba_variant
 
@@ -153,20 +154,38 @@ def test_both_variants_render_a_folder_of_views(
     if variant != VARIANTS[1] and mitsuba_variant().variant() != variant:
         pytest.skip("no usable LLVM library")
     _choose(monkeypatch, variant)
-    views = tmp_path / "views.json"
-    pose = np.eye(4)
-    pose[2, 3] = 1.0
-    frames = [{"file_path": f"{name}.exr", "transform_matrix": pose.tolist()} for name in "ab"]
-    for name in "ab":
-        write_exr(tmp_path / f"{name}.exr", np.ones((8, 8, 3), np.float32))
-    lens = {"w": 8, "h": 8, "fl_x": 100.0, "fl_y": 100.0, "cx": 4.0, "cy": 4.0}
-    views.write_text(json.dumps({**lens, "frames": frames}))
+    views = _views(tmp_path, "a", "b")
     found = relight(room, tmp_path / "out", RelightOptions(views=views, samples=64, denoise="none"))
     pictures = [read_radiance(tmp_path / "out" / f"{name}.exr") for name in "ab"]
     assert [Path(name).name for name in found["pictures"]] == ["a.exr", "b.exr"]
     for picture in pictures:
         assert picture.mean(axis=(0, 1)) == pytest.approx(_FLOOR * _LAMP * _FORM, rel=0.02)
     assert (pictures[0] != pictures[1]).any()  # noise of its own in each view
+
+
+def test_views_without_images_need_their_size_stated(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = _views(tmp_path, "../elsewhere/a")
+    relight(room, tmp_path / "out", RelightOptions(views=views, samples=1, denoise="none"))
+    assert (tmp_path / "out" / "a.exr").is_file()
+    document = json.loads(views.read_text())
+    document["frames"][0]["file_path"] = "a.exr"
+    del document["w"]
+    views.write_text(json.dumps(document))
+    status, said = _refused([str(room), "-o", str(tmp_path / "b"), "--views", str(views)], capsys)
+    assert (status, "does not exist" in said) == (3, True)
+
+
+def _views(folder: Path, *names: str) -> Path:
+    """A document of poses a metre above the floor; there are no images."""
+    pose = np.eye(4)
+    pose[2, 3] = 1.0
+    frames = [{"file_path": f"{name}.exr", "transform_matrix": pose.tolist()} for name in names]
+    lens = {"w": 8, "h": 8, "fl_x": 100.0, "fl_y": 100.0, "cx": 4.0, "cy": 4.0}
+    document = folder / "views.json"
+    document.write_text(json.dumps({**lens, "frames": frames}))
+    return document
 
 
 def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
@@ -186,9 +205,14 @@ def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[
         (["--camera", "/room/nobody"], 2, "/room/eye"),
         (["--bounces", "3"], 2, "at least 4"),
         (["--insert", "a.ply", "colour=1"], 2, "color="),
-        (["--insert", "a.ply", "at=1,2"], 2, "expected 3 number"),
+        (["--insert", "a.ply", "at=1,2"], 2, "expected 3 finite number"),
         (["--insert", "a.ply", "at=1,2,3", "drop=1,2"], 2, "exclude each other"),
         (["--frame", "12"], 2, "--frame 12"),
+        (["--frame", "nan"], 2, "finite"),
+        (["--seed", "-1"], 2, "whole number"),
+        (["--exposure", "nan"], 2, "finite"),
+        (["--insert", "a.ply", "scale=inf"], 2, "finite"),
+        (["--insert", "a.ply", "at=1,nan,0"], 2, "finite"),
     ],
 )
 def test_refusals_are_one_sentence(
@@ -204,6 +228,55 @@ def test_refusals_are_one_sentence(
     assert found == status
     assert any(word in said for word in words.split("|")), said
     assert not target.exists()
+
+
+def test_a_matrix_excludes_what_it_holds_itself(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    matrix = tmp_path / "m.txt"
+    np.savetxt(matrix, np.eye(4))
+    start = [str(room), "-o", str(tmp_path / "a.exr"), "--insert", "a.ply", f"matrix={matrix}"]
+    for more in ("scale=2", "rotate=30"):
+        status, said = _refused([*start, more], capsys)
+        assert status == 2
+        assert "no effect beside matrix=" in said
+
+
+def test_what_stands_in_the_place_of_the_output_is_refused_before_rendering(
+    room: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys.modules[RelightOptions.__module__], "render_view", None)
+    folder, file = tmp_path / "d.exr", tmp_path / "file"
+    folder.mkdir()
+    file.write_text("mine")
+    camera = ["--camera", "/room/eye"]
+    status, said = _refused([str(room), "-o", str(folder), *camera], capsys)
+    assert (status, "a folder of this name" in said) == (6, True)
+    status, said = _refused([str(room), "-o", str(file / "a.exr"), *camera], capsys)
+    assert (status, "not a folder" in said) == (6, True)
+    views = _views(tmp_path, "a")
+    status, said = _refused([str(room), "-o", str(file), "--views", str(views)], capsys)
+    assert (status, "not a folder" in said) == (6, True)
+    (tmp_path / "out" / "a.exr").mkdir(parents=True)
+    status, said = _refused([str(room), "-o", str(tmp_path / "out"), "--views", str(views)], capsys)
+    assert (status, "a folder of this name" in said) == (6, True)
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("exposure", [None, 1.0])
+def test_displayed_views_have_one_exposure_and_leave_nothing_beside(
+    room: Path, tmp_path: Path, exposure: float | None
+) -> None:
+    options = RelightOptions(
+        views=_views(tmp_path, "a", "b"), samples=16, denoise="none", format="png"
+    )
+    found = relight(room, tmp_path / "out", replace(options, exposure=exposure))
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
+    expected = math.log2(0.8 / (float((_FLOOR * _LAMP).mean()) * _FORM))
+    assert found["exposure"] == pytest.approx(expected if exposure is None else 1.0, abs=0.3)
 
 
 def test_output_inside_the_asset_and_unknown_formats_are_refused(

@@ -117,6 +117,26 @@ def test_how_well_a_lamp_is_known(built):
             assert read.radiance_error == error
 
 
+def test_what_earlier_versions_did_not_author(built):
+    lamp = next(item for item in built.shaded if item.emitter)
+    stage = open_measured(built.asset)
+    for bound, status in ((True, "lowerBound"), (False, "measured")):
+        edited = without(built, stage, "emitter:radianceStatus", "fit:phiConfidence")
+        edited.GetPrimAtPath(lamp.prim_path).GetAttribute("usdBrdf:emitter:lowerBound").Set(bound)
+        assert read_shading(edited, lamp.prim_path).radiance_status == status
+        found = read_fit(edited, built.prims[0])
+        assert (found.phi_confidence, found.psi_confidence) == ("none", "low")
+
+
+def without(built, stage, *names):
+    """The stage flattened into one layer, with opinions about these attributes removed."""
+    flat = Usd.Stage.Open(stage.Flatten())
+    for path in built.prims:
+        for name in names:
+            flat.GetPrimAtPath(path).RemoveProperty(f"usdBrdf:{name}")
+    return flat
+
+
 def test_before_a_stage_ran_there_is_nothing_to_read(built):
     stage = open_weaker(built.asset, "texturing")
     for read in (read_texturing, read_shading, read_fit):

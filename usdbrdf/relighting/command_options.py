@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.options import finite_number, seed_number
 from usdbrdf.relighting.denoise import CHOICES
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.relight import MIN_BOUNCES, RelightOptions
@@ -51,7 +52,7 @@ def add_relight_options(parser: argparse.ArgumentParser) -> None:
         help=_INSERT_HELP,
     )
     add("--camera", metavar="PRIM", help="path of a camera in the stage; default: the capture's")
-    add("--frame", type=float, metavar="N", help="time code; default: the first")
+    add("--frame", type=finite_number, metavar="N", help="time code; default: the first")
     add("--views", type=Path, metavar="FILE", help="nerfstudio document with poses to render from")
     add("--format", choices=("exr", "png", "jpg"), default=known.format, help="with --views")
     add("--width", type=int, metavar="N", help="pixels across; default: the camera's")
@@ -63,7 +64,13 @@ def add_relight_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"reflections along a path, at least {MIN_BOUNCES}",
     )
-    add("--seed", type=int, default=known.seed, metavar="N", help="seed of the random numbers")
+    add(
+        "--seed",
+        type=seed_number,
+        default=known.seed,
+        metavar="N",
+        help="seed of the random numbers",
+    )
     add(
         "--denoise",
         choices=CHOICES,
@@ -72,7 +79,7 @@ def add_relight_options(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--exposure",
-        type=float,
+        type=finite_number,
         metavar="STOPS",
         help="of .png and .jpg; default: the 90th percentile of mean RGB becomes 0.8",
     )
@@ -117,18 +124,19 @@ def _insert(words: list[str]) -> Insert:
 
 
 def _numbers(*counts: int, low: float = -math.inf, high: float = math.inf) -> Callable[..., Any]:
-    """A reader of so many numbers with commas between them, each in [low, high]."""
+    """A reader of so many numbers with commas between them, each finite and in [low, high]."""
 
     def read(text: str, said: str) -> tuple[float, ...]:
         try:
             values = tuple(float(word) for word in text.split(","))
         except ValueError:
             values = ()
-        if len(values) not in counts or not all(low <= v <= high for v in values):
+        usable = all(math.isfinite(v) and low <= v <= high for v in values)
+        if len(values) not in counts or not usable:
             shape = " or ".join(str(count) for count in counts)
             limits = "" if math.isinf(low) else f" of at least {low:g}"
             limits += "" if math.isinf(high) else f" and at most {high:g}"
-            raise UsageError(f"{said}: expected {shape} number(s){limits}. [relight.insert]")
+            raise UsageError(f"{said}: expected {shape} finite number(s){limits}. [relight.insert]")
         return values
 
     return read

@@ -10,7 +10,15 @@ import numpy as np
 
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.rays import RayScene
-from usdbrdf.relighting.surfaces import Double, Int, Surface, constant_map
+from usdbrdf.relighting.surfaces import (
+    Double,
+    Int,
+    Material,
+    Surface,
+    constant_map,
+    normal_reflectance,
+    preview_material,
+)
 
 _UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
 
@@ -21,11 +29,14 @@ class Insert:
 
     at          (3,) where the model's origin comes to lie; None: the stage's origin
     drop        (2,) or (3,) the horizontal coordinates over which it falls, and from what height
-    matrix      (4, 4) world from model, column vectors, instead of all of these
+    matrix      (4, 4) world from model, column vectors, instead of these, of scale and of rotation
     scale       factor on the model's size
     rotate_deg  about the up axis, counter-clockwise seen from above
     up          the model's up axis, "Y" or "Z"; None: as its format says
-    roughness, ior, metallic, color   of the material, instead of the model's own
+    roughness, ior, metallic, color   of the material, instead of the model's own; ior alone makes
+                a dielectric
+
+    UsageError where a matrix comes with a scale or a rotation, which it holds itself.
     """
 
     model: Path
@@ -39,6 +50,13 @@ class Insert:
     ior: float | None = None
     metallic: float | None = None
     color: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.matrix is not None and (self.scale != 1.0 or self.rotate_deg != 0.0):
+            raise UsageError(
+                f"--insert {self.model}: scale= and rotate= have no effect beside matrix=. Put "
+                "them into the matrix. [relight.insert]"
+            )
 
     @property
     def falls_from_eye_height(self) -> bool:
@@ -91,21 +109,48 @@ def placed(
 
 
 def with_material(surface: Surface, insert: Insert) -> Surface:
-    """The surface with what the insert says about its material."""
+    """The surface with what the insert says about its material; what it does not say, stays."""
     material = surface.material
-    metallic = insert.metallic or 0.0
-    if insert.color is not None:
-        surface = replace(surface, corner_colour=None)
-        material = replace(material, diffuse=constant_map(*insert.color))
     if insert.roughness is not None:
         material = replace(material, roughness=constant_map(insert.roughness)[..., :1])
+    base = material.diffuse if material.base is None else material.base
+    if insert.color is not None:
+        surface = replace(surface, corner_colour=None, corner_f0=None)
+        base = constant_map(*insert.color)
     if insert.ior is not None or insert.metallic is not None:
-        ior = 1.5 if insert.ior is None else insert.ior
-        dielectric = np.float32(((1 - ior) / (1 + ior)) ** 2)
-        f0 = dielectric + np.float32(metallic) * (material.diffuse - dielectric)
-        diffuse = material.diffuse * np.float32(1 - metallic)
-        material = replace(material, f0=np.asarray(f0, np.float32), diffuse=diffuse)
-    return replace(surface, material=material)
+        metallic = constant_map(insert.metallic or 0.0)[..., :1]
+    elif insert.color is not None and material.metallic is not None:
+        metallic = material.metallic  # the same metal in another colour
+    else:
+        if insert.color is not None:
+            material = replace(material, diffuse=base)
+        return replace(surface, material=material)
+    ior = 1.5 if insert.ior is None else insert.ior
+    mixed = preview_material(
+        diffuse=base,
+        metallic=metallic,
+        roughness=material.roughness,
+        emission=material.emission,
+        ior=ior,
+    )
+    material = replace(mixed, wrap=material.wrap)
+    if surface.corner_colour is None or not metallic.any():
+        return replace(surface, material=material, corner_f0=None)
+    return _coloured_metal(surface, material, float(metallic[0, 0, 0]), ior)
+
+
+def _coloured_metal(surface: Surface, material: Material, metallic: float, ior: float) -> Surface:
+    """The surface whose metalness takes the colours of its corners."""
+    assert surface.corner_colour is not None
+    dielectric = normal_reflectance(ior)
+    f0 = dielectric + np.float32(metallic) * (surface.corner_colour - dielectric)
+    mean = constant_map(*(float(value) for value in f0.reshape(-1, 3).mean(axis=0)))
+    return replace(
+        surface,
+        corner_colour=surface.corner_colour * np.float32(1 - metallic),
+        corner_f0=np.asarray(f0, np.float32),
+        material=replace(material, diffuse=constant_map(1.0), f0=mean),
+    )
 
 
 def _in_metres(matrix: Double, metres_per_unit: float) -> Double:

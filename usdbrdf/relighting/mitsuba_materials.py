@@ -30,15 +30,15 @@ def bsdf(mi: Any, surface: Surface, *, native: bool | None = None) -> dict[str, 
     return {"type": "twosided", "bsdf": plugin} if surface.two_sided else plugin
 
 
-def radiance_texture(mi: Any, image: Float) -> dict[str, Any]:
+def radiance_texture(mi: Any, image: Float, wrap: str = "clamp") -> dict[str, Any]:
     """A map of radiance for an emitter."""
     if image.shape[:2] == (1, 1):
         return {"type": "rgb", "value": [float(v) for v in image[0, 0]]}
-    return colour_texture(mi, image)
+    return colour_texture(mi, image, wrap)
 
 
-def colour_texture(mi: Any, image: Float) -> dict[str, Any]:
-    """A map of 1 or 3 channels as a texture; texels at pixel centres, bilinear, clamped."""
+def colour_texture(mi: Any, image: Float, wrap: str = "clamp") -> dict[str, Any]:
+    """A map of 1 or 3 channels as a texture; texels at pixel centres, bilinear."""
     # Mitsuba refuses a constant reflectance above 1; as a map it may have any value.
     if image.shape[:2] == (1, 1) and image.max() <= 1:
         return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(image[0, 0], 3)]}
@@ -47,14 +47,20 @@ def colour_texture(mi: Any, image: Float) -> dict[str, Any]:
         # Mitsuba's v points down the rows of a picture.
         "bitmap": mi.Bitmap(np.ascontiguousarray(image[::-1], np.float32)),
         "raw": True,
-        "wrap_mode": "clamp",
+        "wrap_mode": wrap,
     }
 
 
 def _diffuse(mi: Any, surface: Surface, factor: float = 1.0) -> dict[str, Any]:
     if surface.corner_colour is not None:
         return {"type": "mesh_attribute", "name": "vertex_colour", "scale": factor}
-    return colour_texture(mi, surface.material.diffuse * np.float32(factor))
+    return colour_texture(mi, surface.material.diffuse * np.float32(factor), surface.material.wrap)
+
+
+def _f0(mi: Any, surface: Surface, factor: float = 1.0) -> dict[str, Any]:
+    if surface.corner_f0 is not None:
+        return {"type": "mesh_attribute", "name": "vertex_f0", "scale": factor}
+    return colour_texture(mi, surface.material.f0 * np.float32(factor), surface.material.wrap)
 
 
 def _lobe(mi: Any, surface: Surface) -> dict[str, Any]:
@@ -63,15 +69,15 @@ def _lobe(mi: Any, surface: Surface) -> dict[str, Any]:
     return {
         "type": lobe_plugin.NAME,
         "diffuse": _diffuse(mi, surface),
-        "f0": colour_texture(mi, material.f0),
-        "phi": _grey_texture(mi, material.roughness**2),
+        "f0": _f0(mi, surface),
+        "phi": _grey_texture(mi, material.roughness**2, material.wrap),
     }
 
 
-def _grey_texture(mi: Any, image: Float) -> dict[str, Any]:
+def _grey_texture(mi: Any, image: Float, wrap: str) -> dict[str, Any]:
     if image.shape[:2] == (1, 1):
         return {"type": "uniform", "value": float(image[0, 0, 0])}
-    return colour_texture(mi, image)
+    return colour_texture(mi, image, wrap)
 
 
 def _native(mi: Any, surface: Surface) -> dict[str, Any]:
@@ -86,9 +92,9 @@ def _native(mi: Any, surface: Surface) -> dict[str, Any]:
     conductor = {
         "type": "roughconductor",
         "distribution": "ggx",
-        "alpha": _grey_texture(mi, np.maximum(material.roughness**2, 1e-3)),
+        "alpha": _grey_texture(mi, np.maximum(material.roughness**2, 1e-3), material.wrap),
         "eta": {"type": "rgb", "value": eta},
         "k": {"type": "rgb", "value": 0.0},
-        "specular_reflectance": colour_texture(mi, material.f0 / grey * factor / _GLOSSY_SHARE),
+        "specular_reflectance": _f0(mi, surface, factor / grey / _GLOSSY_SHARE),
     }
     return {"type": "blendbsdf", "weight": _GLOSSY_SHARE, "matte": diffuse, "glossy": conductor}

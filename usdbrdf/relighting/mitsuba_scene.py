@@ -59,7 +59,7 @@ def _mesh(mi: Any, surface: Surface) -> Any:
     props["bsdf"] = mi.load_dict(bsdf(mi, surface))
     if surface.material.emits:
         weight = _power(surface)
-        emission = radiance_texture(mi, surface.material.emission)
+        emission = radiance_texture(mi, surface.material.emission, surface.material.wrap)
         area = {"type": "area", "radiance": emission, "sampling_weight": weight}
         props["emitter"] = mi.load_dict(area)
     mesh = mi.Mesh(
@@ -72,6 +72,8 @@ def _mesh(mi: Any, surface: Surface) -> Any:
     )
     if surface.corner_colour is not None:
         mesh.add_attribute("vertex_colour", 3, _flat(surface.corner_colour))
+    if surface.corner_f0 is not None:
+        mesh.add_attribute("vertex_f0", 3, _flat(surface.corner_f0))
     buffers = mi.traverse(mesh)
     buffers["vertex_positions"] = _flat(corners)
     buffers["vertex_normals"] = _flat(surface.corner_normals)

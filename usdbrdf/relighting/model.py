@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +118,11 @@ def _material(visual: Any, *, textured: bool) -> Material:
     if metal_rough is not None:  # glTF: roughness in green, metalness in blue
         roughness = roughness * metal_rough[..., 1:2]
         metallic = metallic * metal_rough[..., 2:3]
-    return preview_material(
+    mixed = preview_material(
         diffuse=base, metallic=metallic, roughness=roughness, emission=emission, ior=_IOR
     )
+    # The default of OBJ and of glTF, whose samplers the reader does not keep.
+    return replace(mixed, wrap="repeat")
 
 
 def _factor(value: Any, channels: int, fallback: float) -> Float:

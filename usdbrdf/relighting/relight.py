@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.files.atomic import environment_failures
+from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
+from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.job.progress import say
 from usdbrdf.relighting.denoise import AUTO, OIDN, chosen_filter, denoised
 from usdbrdf.relighting.insert import Insert
@@ -17,6 +19,8 @@ from usdbrdf.relighting.picture import (
     DISPLAYED,
     automatic_exposure,
     check_picture_name,
+    exposure_levels,
+    refuse_taken,
     write_picture,
 )
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
@@ -89,6 +93,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         views = views_from_document(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
         views = tuple(view.at_width(options.width) for view in views)
+    targets = _targets(output, views, options)
     scene = relit_scene(
         captured,
         options.lights,
@@ -97,7 +102,8 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         eye_height=eye_height(stage) if any(i.falls_from_eye_height for i in inserts) else 0.0,
     )
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
-    targets = _targets(output, views, options)
+    with environment_failures(str(output)):
+        targets[0].parent.mkdir(parents=True, exist_ok=True)
     exposure = _photograph(mitsuba, loaded, views, targets, options, denoise=noise == OIDN)
     return {
         "pictures": [str(target) for target in targets],
@@ -121,24 +127,47 @@ def _photograph(
     denoise: bool,
 ) -> float | None:
     """Render and write all views; returns the exposure in stops of displayed pictures."""
-    displayed = targets[0].suffix.lower() in DISPLAYED
-    pictures: list[Float] = []
-    for i, (view, target) in enumerate(zip(views, targets, strict=True)):
+    rendered = _rendered(mitsuba, loaded, views, options, denoise=denoise)
+    if targets[0].suffix.lower() not in DISPLAYED:
+        for target, picture in zip(targets, rendered, strict=True):
+            write_picture(target, picture, 0.0)
+        return None
+    if options.exposure is None:
+        stops = _write_exposed_alike(targets, rendered)
+    else:
+        stops = options.exposure
+        for target, picture in zip(targets, rendered, strict=True):
+            write_picture(target, picture, stops)
+    say(f"exposure: {stops:+.2f} stops{' (automatic)' if options.exposure is None else ''}")
+    return stops
+
+
+def _rendered(
+    mitsuba: Any, loaded: Any, views: Sequence[View], options: RelightOptions, *, denoise: bool
+) -> Iterator[Float]:
+    """(H, W, 3) radiance of one view after the other."""
+    for i, view in enumerate(views):
         label = f"relight {i + 1} of {len(views)}"
         seed = (options.seed, i)
-        rendered = render_view(
-            mitsuba, loaded, view, samples=options.samples, seed=seed, label=label
-        )
-        pictures.append(denoised(rendered) if denoise else rendered.radiance)
-        if not displayed:
-            _write(target, pictures.pop(), 0.0)
-    if not displayed:
-        return None
-    # One exposure for all, so that they can be compared.
-    stops = automatic_exposure(pictures) if options.exposure is None else options.exposure
-    for target, picture in zip(targets, pictures, strict=True):
-        _write(target, picture, stops)
-    say(f"exposure: {stops:+.2f} stops{' (automatic)' if options.exposure is None else ''}")
+        found = render_view(mitsuba, loaded, view, samples=options.samples, seed=seed, label=label)
+        yield denoised(found) if denoise else found.radiance
+
+
+def _write_exposed_alike(targets: Sequence[Path], rendered: Iterator[Float]) -> float:
+    """Write the pictures with one exposure for all, so that they can be compared; returns it in
+    stops. Until it is known they wait on disk: many would not fit into memory."""
+    levels = []
+    beside = targets[0].parent
+    with environment_failures(str(beside)):
+        folder = TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=beside)
+    with folder as waiting:
+        spilled = [Path(waiting) / f"{i}.exr" for i in range(len(targets))]
+        for spill, picture in zip(spilled, rendered, strict=True):
+            levels.append(exposure_levels(picture))
+            write_exr(spill, picture, half=False)
+        stops = automatic_exposure(levels)
+        for target, spill in zip(targets, spilled, strict=True):
+            write_picture(target, read_radiance(spill), stops)
     return stops
 
 
@@ -153,6 +182,7 @@ def _check(options: RelightOptions, output: Path, folder: Path) -> None:
         raise UsageError("--samples and --width must be at least 1. [relight.size]")
     if options.views is None:
         check_picture_name(output)
+    refuse_taken(output, folder=options.views is not None)
     if output.resolve().is_relative_to(folder.resolve()):
         raise UsageError(
             f"{output}: lies inside the asset {folder}, which stays as it is. Name another place "
@@ -172,10 +202,7 @@ def _check(options: RelightOptions, output: Path, folder: Path) -> None:
 def _targets(output: Path, views: Sequence[View], options: RelightOptions) -> list[Path]:
     if options.views is None:
         return [output]
-    return [output / f"{Path(view.name).stem}.{options.format}" for view in views]
-
-
-def _write(target: Path, picture: Float, stops: float) -> None:
-    with environment_failures(str(target)):
-        target.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(target, picture, stops)
+    targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
+    for target in targets:
+        refuse_taken(target, folder=False)
+    return targets

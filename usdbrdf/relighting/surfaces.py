@@ -28,12 +28,18 @@ class Material:
     f0         (H, W, 3) float32, specular reflectance at normal incidence; white at the edge
     roughness  (H, W, 1) float32, as UsdPreviewSurface's: its square is the alpha of GGX
     emission   (H, W, 3) float32, radiance that leaves the front of the surface
+    wrap       what the maps are beyond uv of 0 to 1: "clamp", "repeat" or "mirror"
+    base, metallic   (H, W, 3) and (H, W, 1) float32, of what diffuse and f0 of a metal were mixed;
+               None where there is no metal
     """
 
     diffuse: Float
     f0: Float
     roughness: Float
     emission: Float
+    wrap: str = "clamp"
+    base: Float | None = None
+    metallic: Float | None = None
 
     @property
     def emits(self) -> bool:
@@ -58,6 +64,7 @@ class Surface:
     corner_normals  (F, 3, 3) float32 unit vectors
     corner_uv       (F, 3, 2) float32, v up; None where the material has no maps
     corner_colour   (F, 3, 3) float32 to be multiplied on the diffuse map; None where it has none
+    corner_f0       (F, 3, 3) float32 in place of the map of f0; None where that holds
     two_sided       False if the back is black
     """
 
@@ -67,6 +74,7 @@ class Surface:
     corner_normals: Float
     corner_uv: Float | None = None
     corner_colour: Float | None = None
+    corner_f0: Float | None = None
     material: Material
     two_sided: bool = True
 
@@ -83,7 +91,7 @@ class Surface:
         points = self.points @ linear.T + world_from_here[:3, 3]
         turned: dict[str, Any] = {
             name: getattr(self, name)
-            for name in ("triangles", "corner_normals", "corner_uv", "corner_colour")
+            for name in ("triangles", "corner_normals", "corner_uv", "corner_colour", "corner_f0")
         }
         turned["corner_normals"] = _unit(self.corner_normals @ np.linalg.inv(linear))
         if np.linalg.det(linear) < 0:
@@ -170,6 +178,11 @@ def zoomed(image: Float, height: int, width: int) -> Float:
     return np.asarray(image[rows][:, columns])
 
 
+def normal_reflectance(ior: float) -> np.float32:
+    """Specular reflectance of a dielectric at normal incidence, against air."""
+    return np.float32(((1 - ior) / (1 + ior)) ** 2)
+
+
 def preview_material(
     *,
     diffuse: Float,
@@ -186,19 +199,23 @@ def preview_material(
     """
     if specular is not None:
         return Material(diffuse=diffuse, f0=specular, roughness=roughness, emission=emission)
-    height, width = np.maximum(diffuse.shape[:2], metallic.shape[:2])
+    dielectric = normal_reflectance(ior)
     if not metallic.any():  # the usual case, and the diffuse map may be large
-        height, width = 1, 1
-        of_metal = np.zeros((1, 1, 3), np.float32)
-    else:
-        of_metal = diffuse = zoomed(diffuse, height, width)
-        metallic = zoomed(metallic, height, width)
-    dielectric = np.float32(((1 - ior) / (1 + ior)) ** 2)
+        return Material(
+            diffuse=diffuse,
+            f0=constant_map(float(dielectric)),
+            roughness=roughness,
+            emission=emission,
+        )
+    height, width = np.maximum(diffuse.shape[:2], metallic.shape[:2])
+    diffuse, metallic = zoomed(diffuse, height, width), zoomed(metallic, height, width)
     return Material(
         diffuse=np.asarray(diffuse * (1 - metallic), np.float32),
-        f0=np.asarray(dielectric + metallic * (of_metal - dielectric), np.float32),
+        f0=np.asarray(dielectric + metallic * (diffuse - dielectric), np.float32),
         roughness=roughness,
         emission=emission,
+        base=diffuse,
+        metallic=metallic,
     )
 
 

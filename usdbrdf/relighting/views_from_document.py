@@ -18,10 +18,11 @@ def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> t
     """The views of a document of the asset's capture, named after their images.
 
     Poses are in the capture's frame and unit and are treated as ingest treated those of the
-    capture. InputRefused where one of them cannot be used or two would have the same name.
+    capture; images need not exist where the document states width and height. InputRefused where
+    one of them cannot be used or two would have the same name.
     """
     findings = Findings()
-    records = frame_records(source, IngestOptions(), findings)
+    records = frame_records(source, IngestOptions(), findings, images=False)
     pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
     records = rigid_records(records, findings, source, pose_scale=pose_scale)
     if findings.dropped:

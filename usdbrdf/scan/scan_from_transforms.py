@@ -81,13 +81,16 @@ def read(path: Path, options: IngestOptions) -> Scan:
     )
 
 
-def frame_records(source: Path, options: IngestOptions, findings: Findings) -> list[FrameRecord]:
+def frame_records(
+    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+) -> list[FrameRecord]:
     """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
 
-    Those without pose or file are in ``findings``; poses are not yet known to be rigid.
+    Those without pose or file are in ``findings``; poses are not yet known to be rigid. Without
+    ``images`` no file is asked for where the document itself states width and height.
     """
     source = source.resolve()
-    capture = _Capture(source=source, document=_document(source), options=options)
+    capture = _Capture(source=source, document=_document(source), options=options, images=images)
     return _records(capture, findings)
 
 
@@ -98,6 +101,7 @@ class _Capture:
     source: Path
     document: Mapping[str, Any]
     options: IngestOptions
+    images: bool = True
 
     def refuse(self, text: str, rule: str) -> InputRefused:
         return InputRefused(f"{self.source}: {text} [{rule}]")
@@ -141,15 +145,17 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
         return None
     _refuse_distortion(capture, frame, name)
-    path = _image_path(capture, name)
-    if not path.is_file():
+    width, height = capture.positive(frame, "w"), capture.positive(frame, "h")
+    stated = width is not None and height is not None
+    needed = capture.images or not stated
+    path = _image_path(capture, name) if needed else capture.source.parent / name
+    if needed and not path.is_file():
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
     pose = _pose(frame.get("transform_matrix"))
     if pose is None:
         findings.drop(name, "it has no transform_matrix of 4 x 4 finite numbers", "capture.pose")
         return None
-    width, height = capture.positive(frame, "w"), capture.positive(frame, "h")
     if width is None or height is None:
         try:
             width, height, _ = image_size(path)

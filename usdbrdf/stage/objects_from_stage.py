@@ -71,13 +71,15 @@ def read_shading(stage: Usd.Stage, prim_path: str) -> ShadedObject | None:
     if _value(prim, "shading:raysPerTexel") is None:
         return None
     emitter = _value(prim, "emitter:radiance") is not None
+    # Authored by versions that knew no other statuses than these two.
+    earlier = "lowerBound" if _value(prim, "emitter:lowerBound") else "measured"
     return ShadedObject(
         prim_path=prim_path,
         identifier=str(_value(prim, "identifier")),
         aovs=read_aovs(stage, prim_path),
         emitter=emitter,
         radiance=_colour(prim, "emitter:radiance"),
-        radiance_status=str(_value(prim, "emitter:radianceStatus") or "measured"),
+        radiance_status=str(_value(prim, "emitter:radianceStatus") or earlier),
         radiance_error=_number(prim, "emitter:radianceError"),
         area_fraction=_number(prim, "emitter:areaFraction") if emitter else 0.0,
         mean_albedo=_colour(prim, "shading:meanAlbedo"),
@@ -105,8 +107,8 @@ def read_fit(stage: Usd.Stage, prim_path: str) -> FittedObject | None:
         method=str(_value(prim, "fit:method")),
         phi_error=_number(prim, "fit:phiError"),
         psi_error=_number(prim, "fit:psiError"),
-        phi_confidence=str(_value(prim, "fit:phiConfidence")),
-        psi_confidence=str(_value(prim, "fit:psiConfidence")),
+        phi_confidence=str(_value(prim, "fit:phiConfidence") or "none"),
+        psi_confidence=str(_value(prim, "fit:psiConfidence") or "none"),
     )
 
 

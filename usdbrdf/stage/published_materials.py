@@ -27,6 +27,8 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
     "opacity": (1.0,),
 }
 _FLOAT_FORMATS = frozenset({".exr", ".hdr"})
+# "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
+_WRAP = {"repeat": "repeat", "mirror": "mirror"}
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
@@ -45,7 +47,7 @@ class PublishedMaterial:
     @property
     def without_diffuse(self) -> Material:
         """With white in place of the diffuse colour, which the mesh brings per corner."""
-        return replace(self.material, diffuse=constant_map(1.0))
+        return replace(self.material, diffuse=constant_map(1.0), base=None, metallic=None)
 
     def transformed(self, st: Float) -> Float:
         if self.uv_from_st is None:
@@ -69,7 +71,7 @@ def published_material(
     if inputs.pop("opacity").min() < 1:
         warn(f"<{material.GetPath()}>: opacity is not rendered; the surface is taken as opaque.")
     return PublishedMaterial(
-        material=_material_of(inputs),
+        material=replace(_material_of(inputs), wrap=reader.wrap or "clamp"),
         uv_primvar=reader.uv_primvar,
         colour_primvar=reader.colour_primvar,
         uv_from_st=reader.uv_from_st,
@@ -106,14 +108,14 @@ class _Reader:
     uv_primvar: str = ""
     colour_primvar: str = ""
     uv_from_st: Float | None = None
+    wrap: str = ""
 
     def read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""
         plain = np.array(fallback, np.float32)[None, None]
         source = _source(wanted)
         if source is None:
-            value = _value(wanted, self.time)
-            return plain if value is None else np.array(value, np.float32).reshape(plain.shape)
+            return self._numbers(wanted, fallback)[None, None]
         shader, output = source
         kind = shader.GetShaderId()
         if kind == "UsdUVTexture":
@@ -127,9 +129,8 @@ class _Reader:
     def _texture(self, shader: UsdShade.Shader, output: str, plain: Float) -> Float:
         self._uv(shader)
         channels = plain.shape[2]
-        unread = np.array(
-            _value(shader.GetInput("fallback"), self.time) or (0, 0, 0, 1), np.float32
-        )
+        self._wrap(shader)
+        unread = self._numbers(shader.GetInput("fallback"), (0, 0, 0, 1))
         named = shader.GetInput("file")
         file = asset_file(_producer(named), self.time) if named else None
         space = str(_value(shader.GetInput("sourceColorSpace"), self.time) or "auto")
@@ -138,10 +139,8 @@ class _Reader:
             texels = unread[None, None, :3]
         else:
             texels = read_texture(file, space)
-        for name, combine in (("scale", np.multiply), ("bias", np.add)):
-            value = _value(shader.GetInput(name), self.time)
-            if value is not None:
-                texels = combine(texels, np.array(value, np.float32)[:3])
+        texels = texels * self._numbers(shader.GetInput("scale"), (1, 1, 1, 1))[:3]
+        texels = texels + self._numbers(shader.GetInput("bias"), (0, 0, 0, 0))[:3]
         if channels == 1:
             texels = texels[..., [_CHANNEL.get(output, 0)]]
         return np.ascontiguousarray(texels, np.float32)
@@ -149,10 +148,49 @@ class _Reader:
     def _uv(self, texture: UsdShade.Shader) -> None:
         source = _source(texture.GetInput("st"))
         if source is not None and source[0].GetShaderId() == "UsdTransform2d":
-            self.uv_from_st = _transform_2d(source[0], self.time)
+            self.uv_from_st = self._transform_2d(source[0])
             source = _source(source[0].GetInput("in"))
         if source is not None:
             self.uv_primvar = str(_value(source[0].GetInput("varname"), self.time) or "st")
+
+    def _transform_2d(self, shader: UsdShade.Shader) -> Float:
+        """(3, 3) of UsdTransform2d: scale, then rotate counter-clockwise, then translate."""
+        turn = np.radians(self._numbers(shader.GetInput("rotation"), (0,))[0])
+        scale = self._numbers(shader.GetInput("scale"), (1, 1))
+        matrix = np.eye(3, dtype=np.float32)
+        matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
+        matrix[:2, 2] = self._numbers(shader.GetInput("translation"), (0, 0))
+        return matrix
+
+    def _wrap(self, texture: UsdShade.Shader) -> None:
+        modes = [str(_value(texture.GetInput(name), self.time)) for name in ("wrapS", "wrapT")]
+        found = [_WRAP.get(mode, "clamp") for mode in modes]
+        if len({*found, self.wrap or found[0]}) > 1:
+            self.warn(
+                f"<{texture.GetPath()}>: one mode of wrapping is rendered for all textures of a "
+                f"material; it is {self.wrap or found[0]!r}."
+            )
+        self.wrap = self.wrap or found[0]
+
+    def _numbers(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
+        """(N,) float32 of a plain value; the fallback where it has another type or is not
+        finite."""
+        value = _value(wanted, self.time)
+        usable = np.array(fallback, np.float32)
+        if value is None:
+            return usable
+        try:
+            numbers = np.array(value, np.float32).ravel()
+        except (TypeError, ValueError):
+            numbers = np.empty(0, np.float32)
+        if numbers.size == usable.size and np.isfinite(numbers).all():
+            return numbers
+        assert wanted is not None
+        self.warn(
+            f"<{wanted.GetAttr().GetPath()}>: {value!r} is not {usable.size} finite number(s); "
+            "its fallback is shown."
+        )
+        return usable
 
 
 def read_texture(file: Path, space: str) -> Float:
@@ -166,16 +204,6 @@ def read_texture(file: Path, space: str) -> Float:
     if space == "sRGB" or (space == "auto" and file.suffix.lower() not in _FLOAT_FORMATS):
         return to_working_space(texels, "srgb_rec709_scene")
     return texels
-
-
-def _transform_2d(shader: UsdShade.Shader, time: Usd.TimeCode) -> Float:
-    """(3, 3) of UsdTransform2d: scale, then rotate counter-clockwise, then translate."""
-    turn = np.radians(float(_value(shader.GetInput("rotation"), time) or 0.0))
-    scale = np.array(_value(shader.GetInput("scale"), time) or (1, 1), np.float32)
-    matrix = np.eye(3, dtype=np.float32)
-    matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
-    matrix[:2, 2] = _value(shader.GetInput("translation"), time) or (0, 0)
-    return matrix
 
 
 def _source(wanted: UsdShade.Input | None) -> tuple[UsdShade.Shader, str] | None:
