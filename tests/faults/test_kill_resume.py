@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 import usdbrdf.steps.fit
-import usdbrdf.steps.shade
 import usdbrdf.steps.texture
+import usdbrdf.steps.trace
 from tests.scenes import make_capture
 from usdbrdf.cli import main
 from usdbrdf.files import atomic
@@ -29,8 +29,8 @@ from usdbrdf.job.ownership import edited_files
 TILE = 64  # texels
 PROGRAM = f"""
 import sys
-import usdbrdf.steps.shade
-usdbrdf.steps.shade._TILE = {TILE}
+import usdbrdf.steps.trace
+usdbrdf.steps.trace._TILE = {TILE}
 from usdbrdf.cli import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -92,7 +92,7 @@ def undisturbed(base):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    monkeypatch.setattr(usdbrdf.steps.shade, "_TILE", TILE)
+    monkeypatch.setattr(usdbrdf.steps.trace, "_TILE", TILE)
 
 
 @pytest.fixture
@@ -177,7 +177,7 @@ def calls(monkeypatch):
 
     count(usdbrdf.steps.texture, "unwrap")
     count(usdbrdf.steps.texture, "radiance_from_frames")
-    count(usdbrdf.steps.shade, "irradiance_at")
+    count(usdbrdf.steps.trace, "irradiance_at")
     count(usdbrdf.steps.fit, "choose_target_frames")
     count(usdbrdf.steps.fit, "_fit_arrays")
     return counted
