@@ -168,12 +168,19 @@ def material_error(atlas: Atlas, known: Known, shines: Bool) -> dict[str, Any]:
             "found": [round(fit.phi, 3), round(fit.psi, 3)],
             "status": fit.status,
             "evidence": finite(fit.evidence, 3),
+            "confidence": [fit.phi_confidence, fit.psi_confidence],
+            "stated_error": [finite(fit.phi_error, 3), finite(fit.psi_error, 3)],
             "error": [round(abs(fit.phi - truth["phi"]), 3), round(abs(fit.psi - truth["psi"]), 3)],
         }
 
     def mean(status: str | None, k: int) -> float | None:
         errors = [r["error"][k] for r in rows.values() if status in (None, r["status"])]
         return float(np.mean(errors)) if errors else None
+
+    def largest(k: int) -> float | None:
+        return max(
+            (r["error"][k] for r in rows.values() if r["status"] == "measured"), default=None
+        )
 
     return {
         "objects": len(rows),
@@ -182,5 +189,7 @@ def material_error(atlas: Atlas, known: Known, shines: Bool) -> dict[str, Any]:
         "measured": sum(r["status"] == "measured" for r in rows.values()),
         "measured_mean_abs_phi": mean("measured", 0),
         "measured_mean_abs_psi": mean("measured", 1),
+        "measured_largest_phi": largest(0),
+        "measured_largest_psi": largest(1),
         "rows": rows,
     }
