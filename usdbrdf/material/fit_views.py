@@ -8,6 +8,7 @@ holds the specular light that is seen from everywhere, then enters as incident l
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 
 import numpy as np
 import numpy.typing as npt
@@ -104,11 +105,10 @@ def _footprints(
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
+    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_WIDER)}
     for count in range(len(_WIDER), 0, -1):
         widths = (_FOOTPRINT, *_WIDER[:count])
-        inner = np.arange(len(kept))
-        for width in widths:
-            inner = np.intersect1d(inner, whole(observed, width)[0])
+        inner = reduce(np.intersect1d, [within[width] for width in widths])
         inner = inner[_several_views(observed.texel[inner])]
         if len(inner) >= max(_KEPT * len(kept), MIN_OBSERVATIONS):
             observed = observed.take(inner)

@@ -165,12 +165,6 @@ def _per_corner(
     if rows.size % width:
         return None
     rows = rows.reshape(-1, width)
-    row_of_corner = {
-        UsdGeom.Tokens.faceVarying: fans.corners,
-        UsdGeom.Tokens.vertex: fans.triangles,
-        UsdGeom.Tokens.varying: fans.triangles,
-        UsdGeom.Tokens.uniform: np.repeat(fans.polygon[:, None], 3, axis=1),
-        UsdGeom.Tokens.constant: np.zeros_like(fans.triangles),
-    }[interpolation]
+    row_of_corner = fans.element_of_corner(interpolation)
     # Too few of them: the file is wrong about these values, not about its shape.
     return rows[row_of_corner] if row_of_corner.max() < len(rows) else None

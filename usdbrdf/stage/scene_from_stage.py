@@ -134,13 +134,7 @@ def _local_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.fl
     if not values:
         return None
     normals = np.asarray(values, np.float64).reshape(-1, 3)
-    element_of_corner = {
-        UsdGeom.Tokens.faceVarying: fans.corners,
-        UsdGeom.Tokens.vertex: fans.triangles,
-        UsdGeom.Tokens.varying: fans.triangles,
-        UsdGeom.Tokens.uniform: np.repeat(fans.polygon[:, None], 3, axis=1),
-        UsdGeom.Tokens.constant: np.zeros_like(fans.triangles),
-    }[interpolation]
+    element_of_corner = fans.element_of_corner(interpolation)
     if element_of_corner.size and element_of_corner.max() >= len(normals):
         return None  # too few of them: the file is wrong about its normals, not about its shape
     chosen = normals[element_of_corner]

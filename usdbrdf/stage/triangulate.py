@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from pxr import UsdGeom
 
 Int = npt.NDArray[np.int32]
 
@@ -22,6 +23,17 @@ class Triangulation:
     triangles: Int
     corners: Int
     polygon: Int
+
+    def element_of_corner(self, interpolation: str) -> Int:
+        """(T, 3) int32: which value of a primvar of this interpolation each corner has."""
+        by_interpolation: dict[str, Int] = {
+            UsdGeom.Tokens.faceVarying: self.corners,
+            UsdGeom.Tokens.vertex: self.triangles,
+            UsdGeom.Tokens.varying: self.triangles,
+            UsdGeom.Tokens.uniform: np.repeat(self.polygon[:, None], 3, axis=1),
+            UsdGeom.Tokens.constant: np.zeros_like(self.triangles),
+        }
+        return by_interpolation[interpolation]
 
 
 def triangulate(

@@ -159,8 +159,8 @@ def _said(item: FittedObject) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Survey:
-    """What one pass over the frames gathers: per object the target frame (-1: none); the
-    observations of followed texels."""
+    """What one pass over the frames gathers, as the method needs: per object the target frame (-1:
+    none), or the observations of followed texels."""
 
     target: Int
     observations: Observations
@@ -172,17 +172,20 @@ def _survey(
     def gather() -> dict[str, npt.NDArray[Any]]:
         measured = (atlas.map("coverage")[:, 0] == MEASURED) & atlas.texels.interior
         usable = measured & ~(atlas.map_where_present("emission", 3) > 0).any(axis=1)
-        if options.method != "views":
-            usable[:] = False
-        follower = Follower(lit, atlas.texels, usable, len(frames), options.seed)
+        by_views = options.method == "views"
+        follower = Follower(lit, atlas.texels, usable & by_views, len(frames), options.seed)
         counts = []
         numbers = range(len(frames))
         for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
             pixels = read_frame(frames, i)
-            counts.append(_count(lit, frames, i, pixels.valid))
-            view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
-            follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
-        target, _ = choose_target_frames(counts)
+            if by_views:
+                view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
+                follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
+            else:
+                counts.append(_count(lit, frames, i, pixels.valid))
+        target = np.full(len(lit.scene.objects), -1, np.int32)
+        if counts:
+            target, _ = choose_target_frames(counts)
         chosen = follower.chosen(atlas.texels, options.seed)
         return {"target": target, **chosen.arrays()}
 
