@@ -1,0 +1,47 @@
+"""What Blender's USD importer leaves behind: our attributes, and which prim became what.
+
+The importer keeps only attributes that are marked custom; those of a schema are not.
+"""
+
+import bpy
+
+from . import usd_asset
+
+# On objects and materials: the layer and the prim that they came from. On objects besides: the
+# prim that has the looks, their names, and the one that is shown.
+FILE, PRIM = "usdbrdf_file", "usdbrdf_prim"
+ROOT, LOOKS, SHOWN = "usdbrdf_root", "usdbrdf_looks", "usdbrdf_look"
+
+
+class UsdBrdfImport(bpy.types.USDHook):
+    """Runs at the end of every USD import, ours or File > Import."""
+
+    bl_idname = "usdbrdf_import"
+    bl_label = "usdbrdf"
+
+    @staticmethod
+    def on_import(context):
+        stage = context.get_stage()
+        file = stage.GetRootLayer().realPath
+        for path, imported in context.get_prim_map().items():
+            prim = stage.GetPrimAtPath(path)
+            root = usd_asset.look_prim(prim)
+            if root is None:
+                continue
+            for item in imported:
+                if isinstance(item, bpy.types.Object | bpy.types.Material):
+                    item[FILE], item[PRIM] = file, str(path)
+                if isinstance(item, bpy.types.Object):
+                    _keep_facts(item, prim, root)
+        return True
+
+
+def _keep_facts(item, prim, root):
+    for name, value in usd_asset.facts_of(prim).items():
+        item[name] = value
+    looks = root.GetVariantSet(usd_asset.LOOK)
+    item[ROOT], item[SHOWN] = str(root.GetPath()), looks.GetVariantSelection()
+    item[LOOKS] = list(looks.GetVariantNames())
+
+
+CLASSES = (UsdBrdfImport,)

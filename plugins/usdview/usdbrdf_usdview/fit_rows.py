@@ -1,0 +1,77 @@
+"""What was found about one object, as rows of (label, value) for a person to read.
+
+The usdview and the Blender plug-in are installed apart: each has its copy of this file.
+"""
+
+_STATUS = {
+    "measured": "MEASURED in the photographs",
+    "prior": "PRIOR, not measured: values of the object's class, with what the photographs say",
+    "unseen": "UNSEEN, not measured: no photograph shows the object",
+    "failed": "FAILED, not measured: the photograph does not determine the values",
+}
+_RADIANCE = {
+    "measured": "measured in the photographs",
+    "estimated": "estimated from the light that it casts",
+    "lowerBound": "a LOWER BOUND: clipped in every photograph",
+}
+
+
+def fit_rows(facts):
+    """Rows for a mapping of attribute names (``usdBrdf:fit:phi``, ...) to their values.
+
+    Facts that are absent are not known, and are told so; they are not replaced by defaults.
+    """
+    rows = [("Object", _object(facts)), ("Status", _status(facts))]
+    rows += [
+        ("Roughness phi", _parameter(facts, "phi")),
+        ("Specular psi", _parameter(facts, "psi")),
+        ("Evidence", _number(facts, "usdBrdf:fit:evidence", "of the highlights explained")),
+        ("Loss", _number(facts, "usdBrdf:fit:cost", "at its minimum")),
+        ("Method", _method(facts)),
+        ("Target frame", _target_frame(facts)),
+    ]
+    if "usdBrdf:emitter:radiance" in facts:
+        rows.append(("Emits", _emission(facts)))
+    return rows
+
+
+def _object(facts):
+    label, kind = facts.get("usdBrdf:label", ""), facts.get("usdBrdf:class", "")
+    return f"{label} ({kind})" if kind else label or "without a name"
+
+
+def _status(facts):
+    status = facts.get("usdBrdf:fit:status", "")
+    return _STATUS.get(status, f"{status or 'not fitted'}, not measured")
+
+
+def _parameter(facts, name):
+    value = facts.get(f"usdBrdf:fit:{name}")
+    if value is None:
+        return "not known"
+    error = facts.get(f"usdBrdf:fit:{name}Error")
+    deviation = "error not known" if error is None else f"± {error:.2g}"
+    confidence = facts.get(f"usdBrdf:fit:{name}Confidence", "none")
+    return f"{value:.3g} {deviation} (confidence {confidence})"
+
+
+def _number(facts, name, what):
+    return f"{facts[name]:.3g} {what}" if name in facts else "not known"
+
+
+def _method(facts):
+    method = facts.get("usdBrdf:fit:method") or "none"
+    return f"{method}, {facts.get('usdBrdf:fit:numPixels', 0)} pixels"
+
+
+def _target_frame(facts):
+    frame = facts.get("usdBrdf:fit:targetFrame", -1)
+    return f"{frame} (time code {frame + 1})" if frame >= 0 else "none"
+
+
+def _emission(facts):
+    red, green, blue = facts["usdBrdf:emitter:radiance"]
+    how = _RADIANCE.get(facts.get("usdBrdf:emitter:radianceStatus"), "origin not known")
+    error = facts.get("usdBrdf:emitter:radianceError")
+    deviation = "" if error is None else f" ± {error:.0%}"
+    return f"({red:.3g}, {green:.3g}, {blue:.3g}){deviation}, {how}"

@@ -1,0 +1,155 @@
+"""The example adapter, installed as a stranger would, on a COLMAP capture with known cameras."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pxr import Usd
+from scipy.spatial.transform import Rotation
+
+from tests.scenes import make_capture
+from usdbrdf.errors import InputRefused
+from usdbrdf.scan.adapters import IngestOptions, read_scan
+from usdbrdf.stage.frames_from_stage import frames_from_stage
+
+
+@pytest.fixture(scope="module")
+def installed(plugins, tmp_path_factory):
+    """A folder for PYTHONPATH with the package and the metadata that pip would write."""
+    tomllib = pytest.importorskip("tomllib", reason="part of Python from 3.11 on")
+    source = plugins / "example_adapter"
+    project = tomllib.loads((source / "pyproject.toml").read_text("utf-8"))
+    name, version = project["project"]["name"].replace("-", "_"), project["project"]["version"]
+    site = tmp_path_factory.mktemp("site é")
+    for package in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        shutil.copytree(source / package, site / package)
+    metadata = site / f"{name}-{version}.dist-info"
+    metadata.mkdir()
+    head = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+    (metadata / "METADATA").write_text(head, "utf-8")
+    points = "".join(
+        f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in entries.items())
+        for group, entries in project["project"]["entry-points"].items()
+    )
+    (metadata / "entry_points.txt").write_text(points, "utf-8")
+    return site
+
+
+@pytest.fixture
+def usdbrdf(installed, tmp_path):
+    """The command line with the package installed."""
+
+    def run(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
+            env={**os.environ, "PYTHONPATH": str(installed)},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+
+    return run
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """The box room as COLMAP writes it: two cameras, images in no order, points or none."""
+    made = make_capture(tmp_path / "Zimmer é (1)")
+    made.manifest.unlink()
+    (made.folder / "frames").rename(made.folder / "images")
+    sparse = made.folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    fx, fy, cx, cy = made.intrinsics
+    (sparse / "cameras.txt").write_text(
+        "# Camera list with one line of data per camera:\n"
+        f"1 PINHOLE 32 24 {fx} {fy} {cx} {cy}\n"
+        f"7 SIMPLE_RADIAL 32 24 {fx} {cx} {cy} 0\n"
+    )
+    lines = ["# Image list with two lines of data per image:"]
+    for i in reversed(range(len(made.world_from_camera))):
+        # COLMAP's camera sees y down and looks along +z.
+        opencv = made.world_from_camera[i] @ np.diag([1.0, -1.0, -1.0, 1.0])
+        camera_from_world = np.linalg.inv(opencv)
+        x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat()
+        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *camera_from_world[:3, 3]))
+        lines += [f"{i + 1} {pose} {1 if i % 2 else 7} {i:04d}.exr", "1.5 2.5 -1" if i % 3 else ""]
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    return made
+
+
+def test_it_is_listed(usdbrdf):
+    done = usdbrdf("adapters")
+    assert done.returncode == 0
+    [line] = [x for x in done.stdout.splitlines() if x.startswith("colmap ")]
+    assert "COLMAP text model" in line
+    assert "(usdbrdf_colmap)" in line
+
+
+def test_the_cameras_are_the_true_ones(usdbrdf, capture, tmp_path):
+    asset = tmp_path / "asset é"
+    done = usdbrdf("ingest", capture.folder, "-o", asset)
+    assert done.returncode == 0, done.stderr
+    assert "[colmap.scale]" in done.stderr
+    [root] = [p for p in asset.glob("*.usda") if p.name != "edits.usda"]
+    stage = Usd.Stage.Open(str(root))
+    frames = frames_from_stage(stage)
+    assert [p.name for p in frames.image_paths] == [f"{i:04d}.exr" for i in range(12)]
+    np.testing.assert_allclose(frames.world_from_camera, capture.world_from_camera, atol=1e-5)
+    np.testing.assert_allclose(frames.intrinsics, np.tile(capture.intrinsics, (12, 1)), atol=1e-5)
+    meshes = [prim.GetName() for prim in stage.Traverse() if prim.IsA("Mesh")]
+    assert sorted(meshes) == sorted(capture.names)
+
+
+def test_scale_and_axis_are_the_users(installed, capture, monkeypatch):
+    monkeypatch.syspath_prepend(installed)
+    scan = read_scan(capture.folder, IngestOptions(meters_per_unit=0.01, up_axis="Y"))
+    assert (scan.adapter, scan.meters_per_unit, scan.up_axis) == ("colmap", 0.01, "Y")
+    assert not any("[colmap.scale]" in warning for warning in scan.warnings)
+
+
+def _bend(made):
+    path = made.folder / "sparse" / "0" / "cameras.txt"
+    path.write_text(path.read_text().replace("SIMPLE_RADIAL 32 24", "SIMPLE_RADIAL 32 24 1 "))
+
+
+def _images(change):
+    def edit(made):
+        path = made.folder / "sparse" / "0" / "images.txt"
+        path.write_text(change(path.read_text()))
+
+    return edit
+
+
+def _binary(made):
+    for path in (made.folder / "sparse" / "0").glob("*.txt"):
+        path.rename(path.with_suffix(".bin"))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (_bend, ["cameras.txt: line 3", "image_undistorter", "[colmap.camera]"]),
+        (_images(lambda t: t.replace(" 7 0010", " 8 0010")), ["names camera 8", "[colmap.camera]"]),
+        (_images(lambda t: t[:60]), ["images.txt: line 2 is not IMAGE_ID", "[colmap.model]"]),
+        (_images(lambda t: t.replace("0010.exr", "../../x.exr")), ["x.exr", "[paths.outside]"]),
+        (_images(lambda t: t.replace("00", "99")), ["the image file does not exist"]),
+        (_binary, ["model_converter --output_type TXT", "[colmap.model]"]),
+        (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[colmap.mesh]"]),
+    ],
+    ids=["lens", "camera", "cut off", "outside", "no images", "binary", "no mesh"],
+)
+def test_what_is_refused(installed, capture, monkeypatch, edit, words):
+    monkeypatch.syspath_prepend(installed)
+    edit(capture)
+    with pytest.raises(InputRefused) as refusal:
+        read_scan(capture.folder, IngestOptions())
+    for word in words:
+        assert word in str(refusal.value)
+    # That would be a fault of the adapter.
+    assert "[adapter.read]" not in str(refusal.value)
