@@ -12,6 +12,7 @@ from pxr import Sdf, Tf, UsdGeom, Vt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.scan.scan import Scan
+from usdbrdf.stage.schema import schema_version
 
 TIME_CODES_PER_SECOND = 24.0
 
@@ -66,6 +67,7 @@ def new_layer(header: StageHeader, provenance: Provenance, **facts: Any) -> Sdf.
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, header.meters_per_unit)
     record = {
         "role": provenance.role,
+        "schemaVersion": schema_version(),
         "version": provenance.version,
         "parameters": provenance.parameters,
         "inputs": provenance.inputs,

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from pxr import Plug, Usd
 
 from usdbrdf.errors import UsdBrdfError
+from usdbrdf.files.documents import read_json
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+_PLUGIN = "usdBrdf"
+# Earlier versions of USD take validators from C++ alone.
+_PYTHON_VALIDATORS = (0, 26, 8)
 _PROBE = ("UsdBrdfMaterialFitAPI", "usdBrdf:fit:phi")
 
 
@@ -23,15 +29,41 @@ def plugin_path() -> Path:
     )
 
 
+def validators_path() -> Path:
+    """Folder of the plugInfo.json that announces our validators to USD."""
+    return _PACKAGE / "validation"
+
+
+@cache
+def schema_version() -> int:
+    """Version of the schemas that this package brings: what its layers state. Rises when an
+    attribute changes its meaning or goes away, not when one is added."""
+    return int(_plug_info()["UsdBrdf"]["schemaVersion"])
+
+
+@cache
+def schema_names() -> tuple[str, ...]:
+    """Names of the schemas, as they are applied."""
+    return tuple(_plug_info()["Types"])
+
+
+def _plug_info() -> dict[str, Any]:
+    (plugin,) = read_json(plugin_path() / "plugInfo.json")["Plugins"]
+    return dict(plugin["Info"])
+
+
 def register() -> None:
-    """Announce the schemas to USD; harmless when PXR_PLUGINPATH_NAME has done so already.
+    """Announce the schemas and the validators to USD; harmless when PXR_PLUGINPATH_NAME has done
+    so already.
 
     Asks the schema registry nothing: the first question builds it, and what is registered
     afterwards, by us or by another package, would stay unknown.
     """
     registry = Plug.Registry()
-    if not registry.GetPluginWithName("usdBrdf"):
+    if not registry.GetPluginWithName(_PLUGIN):
         registry.RegisterPlugins(str(plugin_path()))
+    if Usd.GetVersion() >= _PYTHON_VALIDATORS:
+        registry.RegisterPlugins(str(validators_path()))
 
 
 def verify() -> None:
@@ -47,4 +79,12 @@ def verify() -> None:
             "OpenUSD does not know the usdBrdf schemas: it had built its schema registry before "
             "usdbrdf was imported. Import usdbrdf before any stage is opened, or set "
             f"PXR_PLUGINPATH_NAME={plugin_path()}. [schema.unknown]"
+        )
+    # Another installation's, by PXR_PLUGINPATH_NAME.
+    metadata = Plug.Registry().GetPluginWithName(_PLUGIN).metadata
+    version = metadata.get("UsdBrdf", {}).get("schemaVersion")
+    if version != schema_version():
+        raise UsdBrdfError(
+            f"OpenUSD knows version {version} of the usdBrdf schemas, this usdbrdf writes version "
+            f"{schema_version()}. Set PXR_PLUGINPATH_NAME={plugin_path()}. [schema.version]"
         )

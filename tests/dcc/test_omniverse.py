@@ -1,0 +1,72 @@
+"""omniverse-asset-validator, an application of others, runs our rules and finds what they find."""
+
+import csv
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.validation.faults import FAULTS
+from usdbrdf.stage.schema import plugin_path
+from usdbrdf.validation.rules import RULES
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("omni") is None,
+    reason="omniverse-asset-validator is not installed (extra dcc)",
+)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def run(tmp_path):
+    """The command, in an environment where the package is installed as pyproject.toml says."""
+    group = "omni.asset_validator"
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    (entry,) = re.findall(rf'^\[project.entry-points."{group}"\]\nusdbrdf = "(.+)"$', project, re.M)
+    info = tmp_path / "installed" / "usdbrdf-0.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "entry_points.txt").write_text(f"[{group}]\nusdbrdf = {entry}\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: usdbrdf\nVersion: 0.0\n")
+
+    def command(*arguments, schemas=""):
+        path = os.pathsep.join([str(info.parent), str(ROOT)])
+        return subprocess.run(
+            [sys.executable, "-m", "omni.asset_validator", *map(str, arguments)],
+            env={**os.environ, "PYTHONPATH": path, "PXR_PLUGINPATH_NAME": schemas},
+            capture_output=True,
+            text=True,
+        )
+
+    return command
+
+
+def test_it_explains_all_our_rules(run):
+    done = run("--category", "usdbrdf", "--explain", "x.usda")
+    assert done.returncode == 0, done.stderr
+    for rule in RULES:
+        assert f"UsdBrdf{rule.name} : {rule.description}" in done.stdout
+
+
+@pytest.mark.parametrize("schemas", ["", "known"])
+def test_it_finds_nothing_in_a_sound_asset(run, built, schemas):
+    done = run(built.asset.root_layer, schemas=str(plugin_path()) if schemas else "")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_it_finds_each_fault_once_with_its_severity(run, built, tmp_path):
+    for name in ("BindingBesideLooks", "CameraExposure", "LayerHeader"):
+        FAULTS[name](built)
+    table = tmp_path / "found.csv"
+    only_ours = ("--no-init-rules", "--category", "usdbrdf")
+    done = run(*only_ours, "--csv-output", table, built.asset.root_layer)
+    assert done.returncode == 1, done.stdout + done.stderr
+    found = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    assert sorted((row["Rule"], row["Severity"]) for row in found) == [
+        ("UsdBrdfBindingBesideLooks", "Warning"),
+        ("UsdBrdfCameraExposure", "Failure"),
+        ("UsdBrdfLayerHeader", "Failure"),
+    ]

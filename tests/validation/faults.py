@@ -1,0 +1,205 @@
+"""One way to break the small asset per rule; each is named after what is wrong then."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from usdbrdf.files.images import write_exr
+from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
+
+Types = Sdf.ValueTypeNames
+CHAIR, WALL, LAMP = (f"/room/geo/{name}" for name in ("Stuhl_No_1", "wall", "lamp"))
+CAMERA = "/room/cameras/capture"
+ALBEDO_TEXTURE = "/room/mtl/Stuhl_No_1/AlbedoTexture"
+SURFACE = "/room/mtl/Stuhl_No_1/PreviewSurface"
+
+
+@contextlib.contextmanager
+def edited(path):
+    """A layer file, saved at the end."""
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    layer.Reload(force=True)
+    yield layer
+    layer.Save()
+
+
+def opinion(built, prim, name, type_name, value):
+    """What an artist says about an attribute, in edits.usda."""
+    with edited(built.asset.edits_layer) as layer:
+        spec = Sdf.CreatePrimInLayer(layer, prim)
+        Sdf.AttributeSpec(spec, name, type_name).default = value
+
+
+def edits_layer_deleted(built):
+    built.asset.edits_layer.unlink()
+
+
+def edits_below_the_measurement(built):
+    with edited(built.asset.root_layer) as layer:
+        edits, *weaker = layer.subLayerPaths
+        layer.subLayerPaths = [*weaker, edits]
+
+
+def layer_in_centimetres(built):
+    with edited(built.asset.layer("texturing")) as layer:
+        layer.pseudoRoot.SetInfo("metersPerUnit", 0.01)
+
+
+def layer_of_a_newer_schema(built):
+    with edited(built.asset.layer("material")) as layer:
+        record = layer.customLayerData["usdbrdf"]
+        layer.customLayerData = {"usdbrdf": {**record, "schemaVersion": 99}}
+
+
+def layer_edited_by_hand(built):
+    relative = "layers/material.usda"
+    stamp = stamp_of("fit", {}, {})
+    stamp.outputs[relative] = "0" * 64
+    path = stamp_path(built.asset.folder, 4, "fit")
+    path.parent.mkdir(parents=True)
+    write_stamp(path, stamp)
+
+
+def texture_by_absolute_path(built):
+    file = built.asset.folder / "textures" / "Stuhl_No_1.albedo.exr"
+    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(str(file)))
+
+
+def texture_outside_the_asset(built):
+    write_exr(built.asset.folder.parent / "wood.exr", np.zeros((2, 2, 3), np.float32))
+    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath("../wood.exr"))
+
+
+def texture_deleted(built):
+    (built.asset.folder / "textures" / "lamp.lit.exr").unlink()
+
+
+def photograph_deleted(built):
+    built.scan.frames.image_paths[2].unlink()
+
+
+def texture_that_no_layer_names(built):
+    file = built.asset.folder / "textures" / "table.lit.exr"
+    write_exr(file, np.zeros((2, 2, 3), np.float32))
+
+
+def exposure_of_two(built):
+    opinion(built, CAMERA, "exposure", Types.Float, 1.0)
+
+
+def focal_length_doubled(built):
+    opinion(built, CAMERA, "focalLength", Types.Float, 2.0)
+
+
+def texture_coordinates_in_the_next_tile(built):
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    values = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(CHAIR)).GetPrimvar("st").Get()
+    moved = Vt.Vec2fArray([value + Gf.Vec2f(1, 0) for value in values])
+    opinion(built, CHAIR, "primvars:st", Types.TexCoord2fArray, moved)
+
+
+def roughness_above_one(built):
+    with edited(built.asset.layer("material")) as layer:
+        layer.GetAttributeAtPath(f"{CHAIR}.usdBrdf:fit:phi").default = 1.5
+
+
+def measured_without_values(built):
+    opinion(built, WALL, "usdBrdf:fit:status", Types.Token, "measured")
+
+
+def status_that_is_none(built):
+    opinion(built, CHAIR, "usdBrdf:fit:status", Types.Token, "guessed")
+
+
+def misspelt_attribute(built):
+    opinion(built, CHAIR, "usdBrdf:fit:fi", Types.Float, 0.5)
+
+
+def schema_lost(built):
+    with edited(built.asset.layer("shading")) as layer:
+        prim = layer.GetPrimAtPath(CHAIR)
+        kept = [n for n in prim.GetInfo("apiSchemas").prependedItems if n != "UsdBrdfShadingAPI"]
+        prim.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=kept))
+
+
+def two_objects_of_one_identifier(built):
+    opinion(built, WALL, "usdBrdf:identifier", Types.Token, "lamp")
+
+
+def albedo_above_one(built):
+    opinion(built, CHAIR, "usdBrdf:shading:meanAlbedo", Types.Color3f, Gf.Vec3f(1.25, 0.5, 0.5))
+
+
+def texture_read_as_srgb(built):
+    opinion(built, ALBEDO_TEXTURE, "inputs:sourceColorSpace", Types.Token, "auto")
+
+
+def specular_color_beside_ior(built):
+    opinion(built, SURFACE, "inputs:specularColor", Types.Color3f, Gf.Vec3f(0.04))
+
+
+def record_edited_instead_of_material(built):
+    opinion(built, CHAIR, "usdBrdf:fit:phi", Types.Float, 0.75)
+
+
+def emitter_that_reflects(built):
+    surface = "/room/mtl/lamp/PreviewSurface"
+    opinion(built, surface, "inputs:diffuseColor", Types.Color3f, Gf.Vec3f(0.5))
+
+
+def look_that_reflects(built):
+    opinion(built, "/room/looks/lit/lamp/PreviewSurface", "inputs:ior", Types.Float, 1.5)
+
+
+def binding_beside_the_looks(built):
+    with edited(built.asset.edits_layer) as layer:
+        binding = Sdf.RelationshipSpec(
+            Sdf.CreatePrimInLayer(layer, CHAIR), "material:binding", custom=False
+        )
+        binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+
+
+def look_without_an_object(built):
+    with edited(built.asset.layer("texturing")) as layer:
+        prim = layer.GetPrimAtPath("/room{look=coverage}geo/wall")
+        prim.RemoveProperty(prim.relationships["material:binding"])
+
+
+def look_that_is_not_there(built):
+    with edited(built.asset.edits_layer) as layer:
+        layer.GetPrimAtPath("/room").variantSelections["look"] = "shadde"
+
+
+FAULTS = {
+    "LayerMissing": edits_layer_deleted,
+    "LayerOrder": edits_below_the_measurement,
+    "LayerHeader": layer_in_centimetres,
+    "SchemaVersion": layer_of_a_newer_schema,
+    "LayerEdited": layer_edited_by_hand,
+    "AnchoredPath": texture_by_absolute_path,
+    "PathOutside": texture_outside_the_asset,
+    "MissingTexture": texture_deleted,
+    "MissingPhotograph": photograph_deleted,
+    "OrphanTexture": texture_that_no_layer_names,
+    "CameraExposure": exposure_of_two,
+    "CameraLens": focal_length_doubled,
+    "TextureCoordinates": texture_coordinates_in_the_next_tile,
+    "FitRange": roughness_above_one,
+    "FitStatus": measured_without_values,
+    "AllowedTokens": status_that_is_none,
+    "UndeclaredAttribute": misspelt_attribute,
+    "SchemaNotApplied": schema_lost,
+    "ObjectIdentifier": two_objects_of_one_identifier,
+    "AlbedoRange": albedo_above_one,
+    "TextureColorSpace": texture_read_as_srgb,
+    "SpecularColor": specular_color_beside_ior,
+    "LobeMatchesFit": record_edited_instead_of_material,
+    "EmitterAlbedo": emitter_that_reflects,
+    "LookMaterial": look_that_reflects,
+    "BindingBesideLooks": binding_beside_the_looks,
+    "LookIncomplete": look_without_an_object,
+    "LookSelection": look_that_is_not_there,
+}

@@ -1,0 +1,70 @@
+"""validate --fix: cures go into a new layer and nowhere else, and work where it is put."""
+
+import pytest
+from pxr import Sdf, Usd
+
+from tests.validation.faults import FAULTS, edited
+from usdbrdf.errors import UsageError
+from usdbrdf.validation.cure_layer import write_cures
+from usdbrdf.validation.validate import own_findings
+
+CURABLE = ("CameraExposure", "SpecularColor", "LobeMatchesFit", "LookSelection", "EmitterAlbedo")
+
+
+def test_cures_of_several_faults_take_effect_as_the_first_sublayer(built):
+    for name in CURABLE:
+        FAULTS[name](built)
+    FAULTS["OrphanTexture"](built)  # has no cure
+    asset = built.asset
+    files = {p: p.read_bytes() for p in asset.folder.rglob("*") if p.is_file()}
+    cured = write_cures(asset, asset.folder / "fixes.usda")
+    assert {finding.rule for finding in cured.findings} == {f"usdbrdf.{name}" for name in CURABLE}
+    assert files == {p: p.read_bytes() for p in files}, "no other file is touched"
+    new = {p for p in asset.folder.rglob("*") if p.is_file()} - set(files)
+    assert new == {asset.folder / "fixes.usda"}
+    with edited(asset.root_layer) as root:
+        root.subLayerPaths.insert(0, "./fixes.usda")
+    remaining = own_findings(Usd.Stage.Open(str(asset.root_layer)))
+    assert [finding.rule for finding in remaining] == ["usdbrdf.OrphanTexture"]
+
+
+def test_equal_faults_give_equal_bytes(built):
+    FAULTS["LookMaterial"](built)
+    texts = []
+    for name in ("one.usda", "two.usda"):
+        write_cures(built.asset, built.asset.folder / name)
+        texts.append((built.asset.folder / name).read_bytes())
+    assert texts[0] == texts[1]
+    assert str(built.asset.folder).encode() not in texts[0]
+
+
+def test_nothing_is_written_where_nothing_can_be_cured(built):
+    FAULTS["OrphanTexture"](built)
+    before = sorted(built.asset.folder.rglob("*"))
+    assert write_cures(built.asset, built.asset.folder / "fixes.usda").findings == ()
+    assert sorted(built.asset.folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("place", "code"),
+    [
+        ("edits.usda", "[fix.exists]"),
+        ("layers/material.usda", "[fix.exists]"),
+        ("layers/fixes.usda", "[fix.place]"),
+        ("textures/fixes.usda", "[fix.place]"),
+        ("fixes.usdc", "[fix.suffix]"),
+    ],
+)
+def test_cures_are_refused_a_place_that_is_somebodys(built, place, code):
+    FAULTS["LookMaterial"](built)
+    with pytest.raises(UsageError) as refused:
+        write_cures(built.asset, built.asset.folder / place)
+    assert code in str(refused.value)
+
+
+def test_the_fault_is_the_artists_to_keep(built):
+    FAULTS["LobeMatchesFit"](built)
+    text = built.asset.edits_layer.read_text()
+    write_cures(built.asset, built.asset.folder / "fixes.usda")
+    assert built.asset.edits_layer.read_text() == text
+    assert not Sdf.Layer.FindOrOpen(str(built.asset.edits_layer)).dirty

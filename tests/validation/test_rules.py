@@ -1,0 +1,121 @@
+"""Every rule finds its fault and nothing else does; a sound asset has none."""
+
+from dataclasses import replace
+
+import pytest
+from pxr import Sdf, Usd
+
+from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
+from usdbrdf.validation.asset_stage import AssetStage
+from usdbrdf.validation.rule import Severity
+from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.validate import own_findings, validate
+
+BY_NAME = {rule.name: rule for rule in RULES}
+
+
+def own(built):
+    return own_findings(Usd.Stage.Open(str(built.asset.root_layer)))
+
+
+def test_every_rule_has_a_fault_and_a_description():
+    assert list(BY_NAME) == list(FAULTS)
+    assert len(RULES) == len(BY_NAME)
+    for rule in RULES:
+        assert len(rule.description) > 80, rule.name
+        assert len(rule.advice) > 20, rule.name
+
+
+def test_a_sound_asset_has_no_findings(built):
+    assert own(built) == []
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_exactly_the_rule_about_a_fault_finds_it(built, name):
+    FAULTS[name](built)
+    findings = own(built)
+    assert {finding.rule for finding in findings} == {f"usdbrdf.{name}"}
+    for finding in findings:
+        assert finding.severity is BY_NAME[name].severity
+        line = str(finding)
+        assert line.startswith(f"{finding.severity.value}: ")
+        assert line.endswith(f" [usdbrdf.{name}]")
+        assert "\n" not in line
+        assert finding.site.startswith("<") or finding.site.startswith("@")
+
+
+@pytest.mark.parametrize("name", sorted(n for n in FAULTS if BY_NAME[n].cure))
+def test_a_cure_cures_in_the_layer_that_is_asked_for(built, name):
+    FAULTS[name](built)
+    folder = built.asset.folder
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    cures = Sdf.Layer.CreateNew(str(folder / "cures.usda"))
+    stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
+    stage.SetEditTarget(Usd.EditTarget(cures))
+    faults = list(BY_NAME[name].check(AssetStage(stage)))
+    assert faults
+    assert all(BY_NAME[name].cure.apply(fault.site) for fault in faults)
+    assert own_findings(stage) == []
+    assert before == {p: p.read_bytes() for p in before}
+
+
+def test_what_an_artist_may_say_is_no_fault(built):
+    opinion(built, SURFACE, "inputs:roughness", Types.Float, 0.9)
+    opinion(built, SURFACE, "inputs:ior", Types.Float, 1.2)
+    opinion(built, f"{SURFACE}", "inputs:useSpecularWorkflow", Types.Int, 1)
+    opinion(built, SURFACE, "inputs:specularColor", Types.Color3f, (0.1, 0.1, 0.1))
+    with edited(built.asset.edits_layer) as layer:
+        path = "/room{look=mine}geo/lamp"
+        binding = Sdf.RelationshipSpec(
+            Sdf.CreatePrimInLayer(layer, path), "material:binding", custom=False
+        )
+        binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+        layer.GetPrimAtPath("/room").variantSelections["look"] = "mine"
+    assert own(built) == []
+
+
+@pytest.mark.parametrize("attribute", ["ior", "scale"])
+def test_a_lobe_that_was_matched_is_judged_as_such(built, attribute):
+    built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
+    built.write_layer("material")
+    assert own(built) == []
+    with edited(built.asset.layer("material")) as layer:
+        spec = layer.GetAttributeAtPath(f"{SURFACE}.inputs:ior")
+        if attribute == "scale":
+            spec = layer.GetAttributeAtPath("/room/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale")
+        spec.default = spec.default * 1.01
+    (finding,) = own(built)
+    assert finding.rule == "usdbrdf.LobeMatchesFit"
+    assert "under the mapping matched" in finding.message
+
+
+def test_a_mapping_that_is_not_known_is_not_judged_by_another(built):
+    opinion(built, CHAIR, "usdBrdf:fit:mapping", Types.Token, "of tomorrow")
+    opinion(built, CHAIR, "usdBrdf:fit:phi", Types.Float, 0.75)
+    assert {f.rule for f in own(built)} == {"usdbrdf.AllowedTokens"}
+
+
+def test_rules_have_nothing_to_say_about_stages_of_others(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "other.usda"))
+    mesh = stage.DefinePrim("/world/mesh", "Mesh")
+    mesh.CreateAttribute("texture", Sdf.ValueTypeNames.Asset).Set("/somewhere/else.exr")
+    mesh.CreateRelationship("material:binding").SetTargets(["/world/no"])
+    assert own_findings(stage) == []
+
+
+def test_records_are_checked_wherever_the_asset_is_referenced(built, tmp_path):
+    FAULTS["FitRange"](built)
+    shot = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    shot.DefinePrim("/shot").GetReferences().AddReference(str(built.asset.root_layer))
+    found = own_findings(shot)
+    assert [(f.site, f.rule) for f in found] == [
+        ("</shot/geo/Stuhl_No_1.usdBrdf:fit:phi>", "usdbrdf.FitRange")
+    ]
+
+
+def test_findings_of_an_error_and_a_warning(built):
+    FAULTS["BindingBesideLooks"](built)
+    FAULTS["MissingPhotograph"](built)
+    severities = {f.severity for f in validate(built.asset.root_layer) if "usdbrdf." in f.rule}
+    assert severities == {Severity.WARNING}

@@ -1,0 +1,88 @@
+"""Sound assets have no findings; unsound ones say what is wrong."""
+
+import pytest
+from pxr import Sdf
+
+from tests.validation.faults import edited, opinion
+from usdbrdf.stage.asset import ROLES
+from usdbrdf.validation.rule import Severity
+from usdbrdf.validation.validate import has_errors, listed_rules, validate
+
+
+@pytest.mark.parametrize("upto", ROLES)
+@pytest.mark.parametrize("folder", ["room", "Zimmer é 椅子 (1)", 'a @ # ; [1] "x% <UDIM>'])
+def test_an_asset_has_no_findings_after_any_stage(tmp_path, synthetic, upto, folder):
+    scan = synthetic.make_scan(tmp_path / f"capture {folder}", unit=0.01, up_axis="Y")
+    built = synthetic.build(tmp_path / folder, scan, upto=upto)
+    assert validate(built.asset.root_layer) == []
+
+
+def test_a_missing_texture_and_photograph_are_named(built):
+    (built.asset.folder / "textures" / "lamp.lit.exr").unlink()
+    built.scan.frames.image_paths[2].unlink()
+    findings = "\n".join(map(str, validate(built.asset.root_layer)))
+    assert "lamp.lit.exr@ does not exist. It is named 2 times. [usdbrdf.MissingTexture]" in findings
+    assert "frame 02 é.exr@ does not exist. [usdbrdf.MissingPhotograph]" in findings
+
+
+def test_usds_own_validators_are_asked(built):
+    edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
+    prim = Sdf.CreatePrimInLayer(edits, "/room/geo/wall")
+    binding = Sdf.RelationshipSpec(prim, "material:binding:mine", custom=False)
+    binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall"), Sdf.Path("/room/mtl/lamp")]
+    edits.Save()
+    findings = validate(built.asset.root_layer)
+    assert any("</room/geo/wall" in f.site and "usdShadeValidators:" in f.rule for f in findings)
+
+
+def test_a_missing_sublayer_is_a_finding(built):
+    built.asset.layer("shading").unlink()
+    findings = "\n".join(map(str, validate(built.asset.root_layer)))
+    assert "shading.usda" in findings
+    assert "[usd.Composition]" in findings
+
+
+def test_what_is_no_layer_is_a_finding(tmp_path):
+    (tmp_path / "x.usda").write_text("nonsense")
+    (finding,) = validate(tmp_path / "x.usda")
+    assert str(finding).endswith("[usd.Open]")
+    assert has_errors([finding])
+
+
+def test_a_missing_file_is_found_once(built):
+    (built.asset.folder / "textures" / "lamp.lit.exr").unlink()
+    (finding,) = validate(built.asset.root_layer)
+    assert finding.severity is Severity.ERROR
+
+
+def test_findings_are_those_of_the_files_as_they_are_now(built):
+    edits = built.asset.edits_layer
+    text = edits.read_text()
+    opened = Sdf.Layer.FindOrOpen(str(edits))
+    assert validate(built.asset.root_layer) == []
+    edits.write_text(text.replace('over "room"', 'over "room" (variants = {string look = "no"})'))
+    assert [f.rule for f in validate(built.asset.root_layer)] == ["usdbrdf.LookSelection"]
+    edits.write_text(text)
+    assert validate(built.asset.root_layer) == []
+    assert opened
+
+
+def test_rules_are_listed_once_each_with_a_description():
+    rules = listed_rules()
+    names = [rule.name for rule in rules]
+    assert len(set(names)) == len(names)
+    assert "usdbrdf.LookSelection" in names
+    assert "usdShadeValidators:ShaderSdrCompliance" in names
+    assert all(rule.description for rule in rules)
+
+
+@pytest.mark.parametrize(("identifier", "known"), [("ND_image_color3", True), ("nonsense", False)])
+def test_nodes_of_materialx_count_as_known(built, identifier, known):
+    shader = "/room/mtl/wall/Node"
+    opinion(built, shader, "info:id", Sdf.ValueTypeNames.Token, identifier)
+    with edited(built.asset.edits_layer) as layer:
+        prim = layer.GetPrimAtPath(shader)
+        prim.specifier, prim.typeName = Sdf.SpecifierDef, "Shader"
+    found = [f.rule for f in validate(built.asset.root_layer)]
+    name = "usdShadeValidators:ShaderSdrCompliance.MissingShaderIdInRegistry"
+    assert found == ([] if known else [name])

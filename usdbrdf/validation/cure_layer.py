@@ -1,0 +1,83 @@
+"""Cures of an asset's faults, written as a new layer that an artist may add, or not."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from pxr import Sdf, Usd
+
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.atomic import environment_failures, temporary_beside
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.header import Provenance, new_layer, read_header
+from usdbrdf.validation.asset_stage import AssetStage
+from usdbrdf.validation.rule import Fault, Finding, Rule, finding_of
+from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.standard import open_or_finding
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cured:
+    """Which findings the layer cures; it is written only if there are any."""
+
+    layer: Path
+    findings: tuple[Finding, ...]
+
+
+def write_cures(asset: Asset, layer: Path) -> Cured:
+    """Write ``layer``, a new .usda file, with what sets faults right beyond doubt.
+
+    No other file is touched: it takes effect where somebody makes it the first sublayer of
+    NAME.usda. Only those findings count as cured that are gone once it is.
+    """
+    path = layer.absolute()
+    _check_place(asset, path)
+    stage = open_or_finding(asset.root_layer)
+    if isinstance(stage, Finding):
+        raise InputRefused(f"{stage.site}: {stage.message} [{stage.rule}]")
+    with environment_failures(str(path)), temporary_beside(path) as written:
+        header = new_layer(read_header(asset.root_layer), Provenance(role="cures", version="1"))
+        header.documentation = (
+            "Cures by usdbrdf validate --fix. They take effect as the first sublayer of "
+            f"{asset.root_layer.name}."
+        )
+        header.Export(str(written))
+        cures = Sdf.Layer.FindOrOpen(str(written))
+        # Stronger than all other layers, in memory alone.
+        stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
+        stage.SetEditTarget(Usd.EditTarget(cures))
+        before = _curable(stage)
+        applied = [
+            finding_of(rule, fault)
+            for rule, fault in before
+            if rule.cure is not None and rule.cure.apply(fault.site)
+        ]
+        after = {finding_of(rule, fault) for rule, fault in _curable(stage)}
+        cured = tuple(finding for finding in dict.fromkeys(applied) if finding not in after)
+        if cured:
+            cures.Save()
+            os.replace(written, path)
+    return Cured(layer=path, findings=cured)
+
+
+def _check_place(asset: Asset, path: Path) -> None:
+    if path.suffix != ".usda":
+        raise UsageError(f"{path}: the cures are written as text; name a .usda file. [fix.suffix]")
+    if os.path.lexists(path):
+        raise UsageError(
+            f"{path}: the file exists, and cures never go into a layer that somebody wrote. Name a "
+            "new file. [fix.exists]"
+        )
+    reserved = [asset.folder / name for name in ("layers", "textures", ".usdbrdf")]
+    if any(path.is_relative_to(folder) for folder in reserved):
+        raise UsageError(
+            f"{path}: the folder is the pipeline's own. Name a file beside "
+            f"{asset.root_layer.name}. [fix.place]"
+        )
+
+
+def _curable(stage: Usd.Stage) -> list[tuple[Rule, Fault]]:
+    scene = AssetStage(stage)
+    return [(rule, fault) for rule in RULES if rule.cure for fault in rule.check(scene)]

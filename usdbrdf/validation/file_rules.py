@@ -1,0 +1,152 @@
+"""Rules about files: named so that the asset can move, there, and needed."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+from pxr import Sdf, Usd
+
+from usdbrdf.stage.frames_from_stage import asset_file
+from usdbrdf.validation.asset_stage import AssetStage, located, record_of
+from usdbrdf.validation.rule import Fault, Rule, Severity, Site
+
+_UDIM = "<UDIM>"
+
+
+def _anchored(scene: AssetStage) -> Iterator[Fault]:
+    if scene.asset:
+        for layer, path, value in scene.asset_paths:
+            if not value.startswith(("./", "../")):
+                yield Fault(
+                    site=_site(scene.stage, layer, path),
+                    message=f"@{value}@ in @{layer.realPath}@ does not begin with ./ or ../ .",
+                )
+
+
+def _site(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> Site:
+    """The property where the stage has it; else the layer that names the file."""
+    found = stage.GetPropertyAtPath(path) if path.IsPropertyPath() else None
+    return found if found else layer
+
+
+def _outside(scene: AssetStage) -> Iterator[Fault]:
+    if not scene.asset:
+        return
+    folder = Path(os.path.realpath(scene.asset.folder))
+    scan = scene.asset.layer("scan")
+    for layer, path, value in scene.asset_paths:
+        # The photographs, and geometry that came as USD, stay where the capture has them.
+        if value.startswith(("./", "../")) and Path(layer.realPath) != scan:
+            file = Path(os.path.realpath(located(layer, value)))
+            if not file.is_relative_to(folder):
+                yield Fault(
+                    site=_site(scene.stage, layer, path),
+                    message=f"@{value}@ in @{layer.realPath}@ leads out of the asset's folder.",
+                )
+
+
+def _missing_textures(scene: AssetStage) -> Iterator[Fault]:
+    for file, sites in sorted(_missing(scene).items()):
+        if not any(_of_camera(scene, site) for site in sites):
+            more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
+            yield Fault(site=sites[0], message=f"@{file}@ does not exist.{more}")
+
+
+def _missing_photographs(scene: AssetStage) -> Iterator[Fault]:
+    for file, sites in sorted(_missing(scene).items()):
+        if any(_of_camera(scene, site) for site in sites):
+            yield Fault(site=sites[0], message=f"@{file}@ does not exist.")
+
+
+def _of_camera(scene: AssetStage, site: Site) -> bool:
+    return isinstance(site, Usd.Attribute) and site.GetPrim() in scene.cameras
+
+
+def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
+    """Files that are not there, and where the composed stage, or a variant, names them."""
+    missing: dict[Path, list[Site]] = defaultdict(list)
+    for prim in scene.stage.Traverse() if scene.asset else ():
+        for attribute in prim.GetAuthoredAttributes():
+            if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
+                continue
+            times = [Usd.TimeCode.Default(), *attribute.GetTimeSamples()]
+            for file in {asset_file(attribute, time) for time in times}:
+                if file is not None and not _is_there(file):
+                    missing[file].append(attribute)
+    for layer, path, value in scene.asset_paths:
+        file = located(layer, value)
+        if path.ContainsPrimVariantSelection() and file not in missing and not _is_there(file):
+            missing[file].append(layer)
+    return missing
+
+
+def _is_there(file: Path) -> bool:
+    if _UDIM not in file.name or file.is_file():
+        return file.is_file()
+    tiles = re.compile(re.escape(file.name).replace(re.escape(_UDIM), r"\d{4}"))
+    folder = file.parent
+    return folder.is_dir() and any(tiles.fullmatch(name) for name in os.listdir(folder))
+
+
+def _orphans(scene: AssetStage) -> Iterator[Fault]:
+    folder = scene.asset.folder / "textures" if scene.asset else None
+    if folder is None or scene.asset_root is None or not folder.is_dir():
+        return
+    if any(record_of(layer).get("state") == "pending" for layer in scene.own_layers):
+        return  # the textures of a stage that runs again may be there before its layer
+    named = {located(layer, value).name for layer, _, value in scene.asset_paths}
+    tiled = [re.escape(name).replace(re.escape(_UDIM), r"\d{4}") for name in named if _UDIM in name]
+    for file in sorted(folder.iterdir()):
+        known = file.name in named or any(re.fullmatch(tile, file.name) for tile in tiled)
+        if not known and file.is_file() and not file.name.startswith("."):
+            yield Fault(site=scene.asset_root, message=f"no layer names @{file}@.")
+
+
+RULES = (
+    Rule(
+        name="AnchoredPath",
+        severity=Severity.ERROR,
+        description="Every path in a layer begins with ./ or ../ . Absolute paths lead nowhere on "
+        "another machine; paths without a dot are looked up wherever a site's resolver is set up "
+        "to, and packages rename them.",
+        advice="Bring the file into the asset's folder and name it relative to the layer.",
+        check=_anchored,
+    ),
+    Rule(
+        name="PathOutside",
+        severity=Severity.WARNING,
+        description="What the layers name lies in the asset's folder, apart from the photographs "
+        "and from geometry that came as USD. An asset that is copied or packed leaves the rest "
+        "behind.",
+        advice="Bring the file into the asset's folder.",
+        check=_outside,
+    ),
+    Rule(
+        name="MissingTexture",
+        severity=Severity.ERROR,
+        description="Every texture that the composed stage names exists. Renderers show the "
+        "fallback, or black, in place of one that does not.",
+        advice="Run usdbrdf convert again, which makes missing textures anew; or restore the file.",
+        check=_missing_textures,
+    ),
+    Rule(
+        name="MissingPhotograph",
+        severity=Severity.WARNING,
+        description="The photographs that the capture camera names exist. They are not needed to "
+        "render the asset, but to evaluate it and to measure anything anew.",
+        advice="Put the capture back where it was; ignore it where the asset is only shown.",
+        check=_missing_photographs,
+    ),
+    Rule(
+        name="OrphanTexture",
+        severity=Severity.WARNING,
+        description="Every file in the folder textures is named by some layer. One that is not is "
+        "left over from an earlier run or from another tool, and makes packages larger.",
+        advice="Remove the file, or name it in edits.usda.",
+        check=_orphans,
+    ),
+)

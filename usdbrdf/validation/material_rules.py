@@ -1,0 +1,225 @@
+"""Rules about materials: what renderers would show otherwise than it was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+from typing import Any
+
+from pxr import Gf, Sdf, Usd, UsdShade
+
+from usdbrdf.stage.preview_surface import PreviewLobe, preview_surface_from_fit
+from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+
+Types = Sdf.ValueTypeNames
+
+_LINEAR_FORMATS = frozenset({".exr", ".hdr"})
+_SCOPES = ("materials", "looks")
+_BLACK = Gf.Vec3f(0.0)
+# Of numbers that a layer holds as 32-bit floats.
+_TOLERANCE = 1e-4
+
+# Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
+_MEASURED = "measured"
+_MAPPINGS = (_MEASURED, "matched")
+
+
+def _colour_space(scene: AssetStage) -> Iterator[Fault]:
+    for scope in _SCOPES:
+        for shader in scene.shaders(scope, "UsdUVTexture"):
+            file = _input_value(shader, "file")
+            suffix = PurePosixPath(file.path).suffix.lower() if file else ""
+            space = _input_value(shader, "sourceColorSpace") or "auto"
+            if suffix in _LINEAR_FORMATS and space != "raw":
+                yield Fault(
+                    site=shader.GetPrim(),
+                    message=f"sourceColorSpace is {space}, but @{file.path}@ holds linear values.",
+                )
+
+
+def _read_raw(site: Site) -> bool:
+    UsdShade.Shader(site).CreateInput("sourceColorSpace", Types.Token).Set("raw")
+    return True
+
+
+def _specular_color(scene: AssetStage) -> Iterator[Fault]:
+    for scope in _SCOPES:
+        for shader in scene.shaders(scope, "UsdPreviewSurface"):
+            colour = shader.GetInput("specularColor")
+            if colour and _has_opinion(colour) and not _input_value(shader, "useSpecularWorkflow"):
+                yield Fault(
+                    site=colour.GetAttr(),
+                    message="specularColor is authored, but useSpecularWorkflow is 0: some "
+                    "applications multiply it onto the reflectance that ior gives.",
+                )
+
+
+def _block(site: Site) -> bool:
+    site.SetConnections([])
+    site.Block()
+    return True
+
+
+def _lobe(scene: AssetStage) -> Iterator[Fault]:
+    for item in scene.objects:
+        wanted, surface = _recorded_lobe(item), scene.surface_of(item)
+        if wanted is None or surface is None:
+            continue
+        for shown, value in _shown(surface, wanted):
+            # What an artist changes on purpose is theirs.
+            if scene.is_measured(shown) and abs(_first(shown.Get()) - value) > _TOLERANCE:
+                yield Fault(
+                    site=item,
+                    message=f"<{shown.GetPath()}> is {_first(shown.Get()):.4g}, but by "
+                    f"usdBrdf:fit:phi and psi under the mapping {_mapping(item)} it is "
+                    f"{value:.4g}.",
+                )
+
+
+def _recorded_lobe(item: Usd.Prim) -> PreviewLobe | None:
+    """What an object's record stands for; None where it tells nothing."""
+    phi, psi = (authored(item, f"usdBrdf:fit:{name}") for name in ("phi", "psi"))
+    if _mapping(item) not in _MAPPINGS or phi is None or psi is None:
+        return None
+    in_range = 0 <= phi <= 1 and 0 <= psi <= 1
+    return preview_surface_from_fit(phi, psi, _mapping(item)) if in_range else None
+
+
+def _mapping(item: Usd.Prim) -> str:
+    return str(authored(item, "usdBrdf:fit:mapping") or _MEASURED)
+
+
+def _shown(surface: UsdShade.Shader, wanted: PreviewLobe) -> Iterator[tuple[Usd.Attribute, float]]:
+    """The attributes that show a lobe, as far as they are authored, and what they should be."""
+    for name, value in (("roughness", wanted.roughness), ("ior", wanted.ior)):
+        shown = surface.GetInput(name)
+        if shown and not shown.HasConnectedSource():
+            yield shown.GetAttr(), value
+    diffuse = surface.GetInput("diffuseColor")
+    sources = diffuse.GetConnectedSources()[0] if diffuse else []
+    scale = UsdShade.Shader(sources[0].source.GetPrim()).GetInput("scale") if sources else None
+    if scale:
+        yield scale.GetAttr(), wanted.diffuse
+
+
+def _first(value: Any) -> float:
+    """A number, or the first of the equal ones of a colour."""
+    return float(value[0] if isinstance(value, Gf.Vec4f) else value)
+
+
+def _show_record(site: Site) -> bool:
+    surface, wanted = AssetStage(site.GetStage()).surface_of(site), _recorded_lobe(site)
+    if surface is None or wanted is None:
+        return False
+    for shown, value in _shown(surface, wanted):
+        scale = shown.GetTypeName() == Types.Float4
+        shown.Set(Gf.Vec4f(value, value, value, 1.0) if scale else value)
+    return True
+
+
+def _emitter_albedo(scene: AssetStage) -> Iterator[Fault]:
+    for item in scene.objects:
+        surface = scene.surface_of(item)
+        if authored(item, "usdBrdf:emitter:radiance") is not None and surface:
+            diffuse = surface.GetInput("diffuseColor")
+            if not diffuse or diffuse.HasConnectedSource() or diffuse.Get() != _BLACK:
+                yield Fault(
+                    site=surface.GetPrim(),
+                    message=f"<{item.GetPath()}> emits light, and its emission map is all that "
+                    "leaves it, but its material has a diffuseColor as well.",
+                )
+
+
+def _look_materials(scene: AssetStage) -> Iterator[Fault]:
+    for shader in scene.shaders("looks", "UsdPreviewSurface"):
+        diffuse, ior = shader.GetInput("diffuseColor"), shader.GetInput("ior")
+        lit = not diffuse or diffuse.HasConnectedSource() or diffuse.Get() != _BLACK
+        shiny = not ior or ior.Get() is None or abs(float(ior.Get()) - 1.0) > _TOLERANCE
+        if lit or shiny:
+            what = "diffuseColor is not black" if lit else "ior is not 1"
+            yield Fault(
+                site=shader.GetPrim(),
+                message=f"{what}: light of the scene falls into the picture of the map.",
+            )
+
+
+def _blacken(site: Site) -> bool:
+    diffuse = UsdShade.Shader(site).CreateInput("diffuseColor", Types.Color3f)
+    diffuse.GetAttr().SetConnections([])
+    diffuse.Set(_BLACK)
+    return True
+
+
+def _reflect_nothing(site: Site) -> bool:
+    shader = UsdShade.Shader(site)
+    shader.CreateInput("ior", Types.Float).Set(1.0)
+    shader.CreateInput("roughness", Types.Float).Set(1.0)
+    return _blacken(site)
+
+
+def _input_value(shader: UsdShade.Shader, name: str) -> Any:
+    """The value that arrives at an input, also through a material's interface; None without."""
+    wanted = shader.GetInput(name)
+    sources = wanted.GetValueProducingAttributes() if wanted else []
+    return sources[0].Get() if sources else None
+
+
+def _has_opinion(wanted: UsdShade.Input) -> bool:
+    return bool(wanted.GetAttr().HasAuthoredValue() or wanted.HasConnectedSource())
+
+
+RULES = (
+    Rule(
+        name="TextureColorSpace",
+        severity=Severity.ERROR,
+        description="Textures in OpenEXR or Radiance files hold linear values and are read as such "
+        "(sourceColorSpace = raw). With auto or sRGB several applications decode them as sRGB, and "
+        "every colour comes out darker.",
+        advice="Author inputs:sourceColorSpace = raw on the texture, or remove the opinion that "
+        "says otherwise.",
+        check=_colour_space,
+        cure=Cure(name="ReadRaw", description="sourceColorSpace = raw", apply=_read_raw),
+    ),
+    Rule(
+        name="SpecularColor",
+        severity=Severity.ERROR,
+        description="Materials of ours state their reflectance by ior and have no specularColor. "
+        "The specification ignores it while useSpecularWorkflow is 0; Blender and three.js do not, "
+        "and show a highlight of half the strength.",
+        advice="Remove or block inputs:specularColor; or set useSpecularWorkflow to 1, if the "
+        "measured reflectance is to be replaced.",
+        check=_specular_color,
+        cure=Cure(name="Block", description="block inputs:specularColor", apply=_block),
+    ),
+    Rule(
+        name="LobeMatchesFit",
+        severity=Severity.ERROR,
+        description="Roughness, ior and the factor on the colour of an object's material are those "
+        "that its recorded phi and psi stand for under the recorded mapping. Where they differ, "
+        "the file contradicts itself: somebody edited the record, which changes no picture, or a "
+        "layer of ours. What an artist's layer says about the material is not judged.",
+        advice="To change how a surface looks author roughness and ior of its material; leave the "
+        "record of the measurement as it is.",
+        check=_lobe,
+        cure=Cure(name="ShowRecord", description="roughness, ior, factor", apply=_show_record),
+    ),
+    Rule(
+        name="EmitterAlbedo",
+        severity=Severity.ERROR,
+        description="The emission map of an emitter is all the light that was seen to leave it. A "
+        "diffuseColor beside it adds what the other lamps would cast on it, a second time.",
+        advice="Author diffuseColor black without a connection, or edit the emission instead.",
+        check=_emitter_albedo,
+        cure=Cure(name="Blacken", description="diffuseColor = black", apply=_blacken),
+    ),
+    Rule(
+        name="LookMaterial",
+        severity=Severity.ERROR,
+        description="Materials of the looks that show maps only glow: black diffuseColor, ior 1. "
+        "Anything else mixes the light of the scene into the map that is looked at.",
+        advice="Remove the opinions on the materials below the scope of the looks.",
+        check=_look_materials,
+        cure=Cure(name="OnlyGlow", description="black, ior 1", apply=_reflect_nothing),
+    ),
+)

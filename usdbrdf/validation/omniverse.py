@@ -1,0 +1,58 @@
+"""Our rules in omniverse-asset-validator, which finds this module by its entry point.
+
+Its engine looks at stages once per combination of variants where a rule asks for prims. Ours look
+at whole stages, and at every look by themselves. They offer it no fixes: it would write them into
+the layers where the faults are, and those are written again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import omni.asset_validator as validator
+from pxr import Sdf, Usd
+
+from usdbrdf.validation.asset_stage import AssetStage
+from usdbrdf.validation.rule import Fault, Rule, Severity
+from usdbrdf.validation.rules import RULES
+
+CATEGORY = "usdbrdf"
+
+
+class Plugin:
+    """What the entry point names: adds the rules when the validator starts."""
+
+    def __init__(self) -> None:
+        self._checkers = [_checker(rule) for rule in RULES]
+
+    def on_startup(self) -> None:
+        for checker in self._checkers:
+            validator.register_rule(CATEGORY)(checker)
+
+    def on_shutdown(self) -> None:
+        for checker in self._checkers:
+            validator.unregister_rule(checker)
+
+
+def _checker(rule: Rule) -> type[Any]:
+    """A rule as a class; its name begins with UsdBrdf, as all names share one namespace."""
+
+    def check_stage(self: Any, stage: Usd.Stage) -> None:
+        for fault in rule.check(AssetStage(stage)):
+            _report(self, rule, fault)
+
+    body = {"__doc__": f"{rule.description} {rule.advice}", "CheckStage": check_stage}
+    return type(f"UsdBrdf{rule.name}", (validator.BaseRuleChecker,), body)
+
+
+def _report(checker: Any, rule: Rule, fault: Fault) -> None:
+    adders = {
+        # "failed check" is its word for a rule that is broken; "error" for one that cannot run.
+        Severity.ERROR: checker._AddFailedCheck,
+        Severity.WARNING: checker._AddWarning,
+        Severity.INFO: checker._AddInfo,
+    }
+    layer = isinstance(fault.site, Sdf.Layer)
+    message = f"@{fault.site.realPath}@: {fault.message}" if layer else fault.message
+    at = None if layer else fault.site
+    adders[fault.severity or rule.severity](message=message, at=at)

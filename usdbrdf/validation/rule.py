@@ -1,0 +1,95 @@
+"""What a rule is, and what it finds. The rules themselves know of no framework that runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
+
+from pxr import Sdf, Usd
+
+from usdbrdf.validation.asset_stage import AssetStage
+
+Site: TypeAlias = "Usd.Prim | Usd.Property | Sdf.Layer"
+
+# Before the name of a rule of ours, where it stands among those of others.
+PREFIX = "usdbrdf"
+
+
+class Severity(str, Enum):
+    """An error shows in pictures or numbers; a warning is likely not what was meant."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """One thing that a rule does not accept; ``severity`` only where it is not the rule's own."""
+
+    site: Site
+    message: str
+    severity: Severity | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cure:
+    """What sets a fault right beyond doubt.
+
+    ``apply`` authors at the edit target of the site's stage and returns whether it could. It never
+    chooses a layer: whoever calls it does.
+    """
+
+    name: str
+    description: str
+    apply: Callable[[Site], bool]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """A rule about stages of ours.
+
+    description  what is wrong, and what comes of it
+    advice       what to do
+    check        the faults of a stage; none for a stage that the rule is not about
+    """
+
+    name: str
+    severity: Severity
+    description: str
+    advice: str
+    check: Callable[[AssetStage], Iterable[Fault]]
+    cure: Cure | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """A fault in words: ``site`` is a prim or property in <>, or a layer in @@."""
+
+    severity: Severity
+    site: str
+    message: str
+    rule: str
+
+    def __str__(self) -> str:
+        where = f"{self.site}: " if self.site else ""
+        return f"{self.severity.value}: {where}{self.message} [{self.rule}]"
+
+
+def finding_of(rule: Rule, fault: Fault) -> Finding:
+    """A fault of one of our rules in words."""
+    return Finding(
+        severity=fault.severity or rule.severity,
+        site=site_in_words(fault.site),
+        message=fault.message,
+        rule=f"{PREFIX}.{rule.name}",
+    )
+
+
+def site_in_words(site: Site) -> str:
+    """<path> of a prim or a property, @file@ of a layer."""
+    if isinstance(site, Sdf.Layer):
+        return f"@{site.realPath or site.identifier}@"
+    return f"<{site.GetPath()}>"

@@ -1,0 +1,97 @@
+"""The checks of OpenUSD itself: does the stage open and compose, and what do its validators say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pxr import Tf, Usd, UsdShade, UsdValidation
+
+from usdbrdf.stage.usd_errors import in_one_line
+from usdbrdf.validation.rule import Finding, Severity
+
+OPEN, COMPOSITION = "usd.Open", "usd.Composition"
+
+# The plug-ins of usd-core itself: others that are installed may need a network, or a licence.
+_BUILT_IN = frozenset(
+    ["usdValidation", "usdPhysicsValidators"]
+    + [f"usd{name}Validators" for name in ("Geom", "Lux", "Media", "Shade", "Skel", "Utils")]
+)
+# Ours tell textures from photographs, and where a missing file is named.
+_REPLACED = frozenset({"usdUtilsValidators:MissingReferenceValidator"})
+_SEVERITIES = {
+    UsdValidation.ValidationErrorType.Warn: Severity.WARNING,
+    UsdValidation.ValidationErrorType.Info: Severity.INFO,
+}
+
+
+def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
+    """The stage, from the files as they are now; or why USD cannot open it."""
+    try:
+        stage = Usd.Stage.Open(str(root_layer))
+        for layer in stage.GetUsedLayers():
+            # Another stage of this process may hold a layer from before it was written anew.
+            if not layer.anonymous:
+                layer.Reload()
+    except Tf.ErrorException as error:
+        return Finding(
+            severity=Severity.ERROR,
+            site=f"@{root_layer}@",
+            message=f"USD cannot open it: {in_one_line(error)}.",
+            rule=OPEN,
+        )
+    return stage
+
+
+def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
+    """Errors of composition, and those that usd-core's validators find."""
+    for problem in stage.GetCompositionErrors():
+        yield Finding(
+            severity=Severity.ERROR, site="", message=f"{in_one_line(problem)}.", rule=COMPOSITION
+        )
+    registry = UsdValidation.ValidationRegistry()
+    names = [metadata.name for metadata in _built_in()]
+    context = UsdValidation.ValidationContext(validators=registry.GetOrLoadValidatorsByName(names))
+    for error in context.Validate(stage):
+        if _is_materialx_unknown(error):
+            continue
+        yield Finding(
+            severity=_SEVERITIES.get(error.GetType(), Severity.ERROR),
+            site=", ".join(_site(site) for site in error.GetSites()),
+            message=in_one_line(error.GetMessage()),
+            rule=error.GetIdentifier(),
+        )
+
+
+def standard_rules() -> Iterator[tuple[str, str]]:
+    """(name, description) of all that ``standard_findings`` looks for."""
+    yield OPEN, "USD can open the root layer."
+    yield COMPOSITION, "All layers, references and payloads of the stage compose."
+    for metadata in _built_in():
+        yield metadata.name, " ".join(metadata.doc.split())
+
+
+def _built_in() -> list[UsdValidation.ValidatorMetadata]:
+    found = [
+        metadata
+        for metadata in UsdValidation.ValidationRegistry().GetAllValidatorMetadata()
+        if metadata.name.split(":")[0] in _BUILT_IN and not metadata.isSuite
+    ]
+    kept = [metadata for metadata in found if metadata.name not in _REPLACED]
+    return sorted(kept, key=lambda metadata: str(metadata.name))
+
+
+def _is_materialx_unknown(error: UsdValidation.ValidationError) -> bool:
+    """usd-core is built without MaterialX: it calls every one of its nodes unknown."""
+    if error.GetName() != "MissingShaderIdInRegistry":
+        return False
+    prims = [(s.GetProperty() if s.IsProperty() else s).GetPrim() for s in error.GetSites()]
+    return all(str(UsdShade.Shader(prim).GetShaderId()).startswith("ND_") for prim in prims)
+
+
+def _site(site: UsdValidation.ValidationErrorSite) -> str:
+    if site.IsPrim():
+        return f"<{site.GetPrim().GetPath()}>"
+    if site.IsProperty():
+        return f"<{site.GetProperty().GetPath()}>"
+    return f"@{site.GetLayer().identifier}@" if site.GetLayer() else "stage"
