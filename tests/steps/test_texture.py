@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import usdbrdf
 from tests.scenes import make_capture, ring_of_poses, write_ply
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
 from usdbrdf.geometry.scene import SceneObject
 from usdbrdf.job.stage import StageRun
@@ -42,6 +45,35 @@ def test_a_capture_that_shows_little_of_the_mesh_is_warned_about(capsys):
     assert capsys.readouterr().err == ""
     with pytest.raises(InputRefused, match="unseen"):
         module._check_seen(np.zeros(3, bool), np.zeros(3, bool))
+
+
+def test_passes_for_lack_of_memory_change_no_byte(tmp_path, monkeypatch, capsys):
+    made = make_capture(tmp_path / "scan", frames=9, subdivisions=1)
+    once, thrice = tmp_path / "once", tmp_path / "thrice"
+    _textured(once, made)
+
+    def three(texels, *_):
+        ends = [0, len(texels) // 3, len(texels) // 2, len(texels)]
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    monkeypatch.setattr(module, "groups_of_texels", three)
+    capsys.readouterr()
+    _textured(thrice, made)
+    assert "3 passes over the frames" in capsys.readouterr().err
+    files = sorted((once / "asset" / "textures").iterdir())
+    assert len(files) == 25
+    for file in files:
+        assert (thrice / "asset" / "textures" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_the_memory_is_no_parameter_of_the_result(tmp_path):
+    made = make_capture(tmp_path / "scan", frames=9, subdivisions=1)
+    _textured(tmp_path, made)
+    with usdbrdf.working_on(tmp_path / "asset") as asset:
+        again = usdbrdf.texture(asset, replace(OPTIONS, memory=2.0))
+    assert not again.reran
+    with pytest.raises(UsageError, match="memory"):
+        replace(OPTIONS, memory=0.0)
 
 
 class _Picture:

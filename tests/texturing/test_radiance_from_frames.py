@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import pytest
 
@@ -134,6 +135,34 @@ def test_going_on_from_a_saved_state_changes_no_bit(room: Room):
     assert _observe(room.world, room.frames, second, start=5) == list(range(5, 12))
     for name, values in whole.arrays().items():
         np.testing.assert_array_equal(second.arrays()[name], values)
+
+
+def test_texels_in_groups_get_what_they_get_together(room: Room):
+    world, count = room.world, len(room.world.texels)
+    whole = Observation.empty(count)
+    _observe(world, room.frames, whole)
+    for part in (slice(0, 333), slice(333, count // 2), slice(count // 2, count)):
+        own = Observation.empty(part.stop - part.start)
+        steps = radiance_from_frames(
+            world.texels, world.scene, world.rays, room.frames, own, 0.5, part=part
+        )
+        assert len(list(steps)) == 12
+        for name, values in whole.arrays().items():
+            np.testing.assert_array_equal(own.arrays()[name], values[part])
+
+
+def test_the_number_of_threads_changes_no_bit(room: Room):
+    many = Observation.empty(len(room.world.texels))
+    _observe(room.world, room.frames, many)
+    threads = numba.get_num_threads()
+    one = Observation.empty(len(room.world.texels))
+    try:
+        numba.set_num_threads(1)
+        _observe(room.world, room.frames, one)
+    finally:
+        numba.set_num_threads(threads)
+    for name, values in many.arrays().items():
+        np.testing.assert_array_equal(one.arrays()[name], values)
 
 
 def test_the_texel_size_is_the_pixel_on_the_surface(room: Room):

@@ -58,7 +58,9 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
             f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
             "beauty pass as R, G, B. [image.channels]"
         )
-    pixels = _pixels(path, source)[..., channels]
+    pixels = _pixels(path, source)
+    if channels != list(range(len(names))):
+        pixels = pixels[..., channels]
     return _in_display_window(source.spec(), np.ascontiguousarray(pixels))
 
 
@@ -109,6 +111,17 @@ def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
             )
         publish(staged, path)
     return clamped
+
+
+def resized(pixels: Float, width: int, height: int) -> Float:
+    """(H, W, C) float32 pixels at another size, each the mean of what it covers."""
+    image = np.ascontiguousarray(pixels, np.float32)
+    source = oiio.ImageBuf(image)
+    region = oiio.ROI(0, width, 0, height, 0, 1, 0, image.shape[2])
+    target = oiio.ImageBufAlgo.resize(source, filtername="box", roi=region)
+    if target.has_error:
+        raise UsdBrdfError(f"{image.shape=}: resizing failed ({_message(target)}). [image.resize]")
+    return np.asarray(target.get_pixels(oiio.FLOAT), np.float32).reshape(height, width, -1)
 
 
 def write_preview_png(path: Path, rgb8: Byte) -> None:

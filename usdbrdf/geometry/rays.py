@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ Bool = npt.NDArray[np.bool_]
 # embreex traces one ray at a time and releases the GIL: chunks this long keep every core busy
 # while the Python overhead of a call stays far below a per cent.
 _CHUNK = 1 << 16
+BOX_FACES = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,10 @@ class Hits:
 
 
 class RayScene:
-    """A committed Embree scene. Results do not depend on the number of threads."""
+    """A committed Embree scene. Results do not depend on the number of threads.
+
+    points (V, 3) float32, triangles (F, 3) int32: what it was made of
+    """
 
     def __init__(self, points: Float, triangles: Int) -> None:
         """points (V, 3) float32 finite; triangles (F, 3) int32 inside [0, V).
@@ -51,15 +56,25 @@ class RayScene:
             raise UsdBrdfError("a ray scene needs at least one triangle")
         if triangles.min() < 0 or triangles.max() >= len(points) or not np.isfinite(points).all():
             raise UsdBrdfError("a ray scene got a face index out of range or a non-finite vertex")
+        self.points: Float = np.ascontiguousarray(points, np.float32)
+        self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
         self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(
-            self._scene,
-            np.ascontiguousarray(points, np.float32),
-            np.ascontiguousarray(triangles, np.int32),
-        )
+        self._mesh = TriangleMesh(self._scene, self.points, self.triangles)
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
         # Embree commits lazily inside the first query, which is not safe from two threads at once.
         self.closest(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+
+    @cached_property
+    def boxes(self) -> Float:
+        """Low and high corner of the box around every BOX_FACES triangles in turn, (B, 2, 3)."""
+        first = np.arange(0, len(self.triangles), BOX_FACES)
+        low = np.full((len(first), 3), np.inf, np.float32)
+        high = -low
+        for corner in range(3):
+            at = self.points[self.triangles[:, corner]]
+            low = np.minimum(low, np.minimum.reduceat(at, first))
+            high = np.maximum(high, np.maximum.reduceat(at, first))
+        return np.stack([low, high], axis=1)
 
     def closest(self, origins: Float, directions: Float) -> Hits:
         """First hit of each ray; origins and directions (R, 3) float32 in the world frame."""

@@ -22,6 +22,8 @@ Number = TypeVar("Number", bound=np.generic)
 _BORDER = 0.75
 # How far from its triangle's edges a texel's point stays, in texels (less in slivers).
 _INSET = 0.01
+# Texels computed at a time.
+_AT_A_TIME = 1 << 18
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,33 +112,51 @@ def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
     pixel = np.flatnonzero(owner >= 0)
     face = owner[pixel]
     interior = distance[pixel] <= 0
-    first_texel = np.searchsorted(pixel, first_pixel)
-
-    width = resolution[scene.face_object[face], 0]
-    local = pixel - first_pixel[scene.face_object[face]]
-    centre = np.stack([local % width, local // width], axis=-1) + np.float32(0.5)
-    barycentric = _barycentric(corner_pixel[face], centre)
-    corners = scene.points[scene.triangles[face]]
-    geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal = np.einsum("tc,tcd->td", barycentric, scene.corner_normals[face])
-    step_x, step_y = _surface_steps(corners, corner_pixel[face])
+    del distance
     return Texels(
         pixel=pixel,
         face=face,
-        barycentric=barycentric,
-        position=np.einsum("tc,tcd->td", barycentric, corners).astype(np.float32),
-        normal=_unit(normal, otherwise=geometric),
-        geometric_normal=_unit(geometric, otherwise=normal),
-        step_x=step_x,
-        step_y=step_y,
-        area=np.linalg.norm(np.cross(step_x, step_y), axis=-1).astype(np.float32),
+        **_surface_points(scene, corner_pixel, pixel, face, resolution, first_pixel),
         interior=interior,
         resolution=resolution,
         first_pixel=first_pixel,
-        first_texel=first_texel,
+        first_texel=np.searchsorted(pixel, first_pixel),
         nearest_texel=_nearest_texel(owner, pixel, resolution, first_pixel),
         corner_pixel=corner_pixel,
     )
+
+
+def _surface_points(
+    scene: Scene,
+    corner_pixel: Float,
+    pixel: npt.NDArray[np.int64],
+    face: Int,
+    resolution: Int,
+    first_pixel: npt.NDArray[np.int64],
+) -> dict[str, Float]:
+    """What ``Texels`` says of each texel's point, some at a time: on the way there are hundreds of
+    bytes per texel."""
+    names = ("barycentric", "position", "normal", "geometric_normal", "step_x", "step_y")
+    points: dict[str, Float] = {name: np.empty((len(pixel), 3), np.float32) for name in names}
+    points["area"] = np.empty(len(pixel), np.float32)
+    for start in range(0, len(pixel), _AT_A_TIME):
+        some = slice(start, min(start + _AT_A_TIME, len(pixel)))
+        own = face[some]
+        width = resolution[scene.face_object[own], 0]
+        local = pixel[some] - first_pixel[scene.face_object[own]]
+        centre = np.stack([local % width, local // width], axis=-1) + np.float32(0.5)
+        barycentric = _barycentric(corner_pixel[own], centre)
+        corners = scene.points[scene.triangles[own]]
+        geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = np.einsum("tc,tcd->td", barycentric, scene.corner_normals[own])
+        step_x, step_y = _surface_steps(corners, corner_pixel[own])
+        points["barycentric"][some] = barycentric
+        points["position"][some] = np.einsum("tc,tcd->td", barycentric, corners)
+        points["normal"][some] = _unit(normal, otherwise=geometric)
+        points["geometric_normal"][some] = _unit(geometric, otherwise=normal)
+        points["step_x"][some], points["step_y"][some] = step_x, step_y
+        points["area"][some] = np.linalg.norm(np.cross(step_x, step_y), axis=-1)
+    return points
 
 
 @kernel

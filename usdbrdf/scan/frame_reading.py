@@ -64,19 +64,19 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     if frames.encoding == PHOTOGRAPH_ENCODING:
         scale = np.float32(radiance_scale(frames)[i])
         recorded = to_working_space(recorded, frames.encoding) * scale
-    finite = np.asarray(np.isfinite(recorded).all(axis=2), np.bool_)
-    negative = finite & (recorded < 0).any(axis=2)
+    finite = ~_in_any_channel(~np.isfinite(recorded))
+    negative = finite & _in_any_channel(recorded < 0)
     unknown, ringing = ~finite, negative
     if negative.any():
         lowest = -_RINGING * max(float(np.median(recorded[finite])), 0.0)
-        ringing = negative & (recorded >= lowest).all(axis=2)
+        ringing = negative & ~_in_any_channel(recorded < lowest)
         unknown = ~finite | (negative & ~ringing)
     recorded[ringing] = np.maximum(recorded[ringing], 0)
     recorded[unknown] = np.nan
     known = ~unknown
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
-    clipped = (recorded >= _CLIPPED_SHARE * frames.saturation_radiance[i]).any(axis=2)
-    dark = (recorded < frames.noise_floor_radiance[i]).any(axis=2)
+    clipped = _in_any_channel(recorded >= _CLIPPED_SHARE * frames.saturation_radiance[i])
+    dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
     radiance = recorded
     if frames.encoding != PHOTOGRAPH_ENCODING:
         radiance = to_working_space(recorded, frames.encoding)
@@ -88,6 +88,11 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         unknown=unknown,
         num_clamped=int(ringing.sum()),
     )
+
+
+def _in_any_channel(true: Bool) -> Bool:
+    """(H, W) of (H, W, 3). NumPy's own any() over so short an axis takes eight times as long."""
+    return true[..., 0] | true[..., 1] | true[..., 2]
 
 
 def radiance_scale(frames: Frames) -> Double:

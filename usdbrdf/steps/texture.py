@@ -23,8 +23,8 @@ from usdbrdf.stage.texturing_layer import write_texturing_layer
 from usdbrdf.steps.atlas import MapWriter, TexelMap
 from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
-from usdbrdf.texturing import psquare
 from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.passes import Measured, groups_of_texels, measured_arrays
 from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
@@ -35,16 +35,20 @@ Bool = npt.NDArray[np.bool_]
 MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
+# Frames between saved states: of many texels these are large.
+_SMALL, _SAVE_SMALL, _SAVE_LARGE = 500_000, 16, 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class TextureOptions:
     """texel_size in metres (None: the frames' own median pixel footprint); quantile of the
-    observations that becomes L_d; max_texels: a chosen texel size is coarsened to stay below."""
+    observations that becomes L_d; max_texels: a chosen texel size is coarsened to stay below;
+    memory in GiB (None: three quarters of the machine's), on which no result depends."""
 
     texel_size: float | None = None
     quantile: float = 0.5
     max_texels: int = 1_000_000
+    memory: float | None = None
 
     def __post_init__(self) -> None:
         if self.texel_size is not None and not self.texel_size > 0:
@@ -55,6 +59,8 @@ class TextureOptions:
             raise UsageError(
                 f"--max-texels {self.max_texels}: at least 1 is needed. [usage.option]"
             )
+        if self.memory is not None and not self.memory > 0:
+            raise UsageError(f"--memory {self.memory}: not above 0. [usage.option]")
         if not 0 < self.quantile < 1:
             raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
 
@@ -68,7 +74,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         asset=asset,
         name="texture",
         role="texturing",
-        parameters=asdict(options),
+        parameters={k: v for k, v in asdict(options).items() if k != "memory"},
         inputs={**layers, "frames": hash_of_files(frames.image_paths)},
     )
 
@@ -80,8 +86,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         scene = replace(scene, corner_uv=charts["corner_uv"])
         texels = texels_from_atlas(scene, charts["resolution"])
         say(f"texture: {len(texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames")
-        observed = _observe(run, texels, scene, rays, frames, options.quantile)
-        found = _found(texels, observed, options.quantile)
+        found = _found(texels, _measure(run, texels, scene, rays, frames, options))
         summary = _write(run, step, scene, texels, found, size, options.quantile)
         view = overview(scene, rays, frames)
         view.write(run.output("previews/lit.png"), texels, found.maps["lit"].values)
@@ -95,6 +100,31 @@ def _charts(scene: Scene, texel_size: float) -> dict[str, npt.NDArray[Any]]:
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 
+def _measure(
+    run: StageRun,
+    texels: Texels,
+    scene: Scene,
+    rays: RayScene,
+    frames: Frames,
+    options: TextureOptions,
+) -> Measured:
+    """All frames, in as many passes as memory asks for."""
+    groups = groups_of_texels(texels, scene, frames, options.memory)
+    if len(groups) > 1:
+        say(f"texture: {len(groups)} passes over the frames, for lack of memory")
+    measured = Measured.empty(len(texels))
+    for part in groups:
+
+        def observe(part: slice = part) -> dict[str, npt.NDArray[Any]]:
+            observed = _observe(run, texels, scene, rays, frames, options.quantile, part)
+            return measured_arrays(observed, options.quantile)
+
+        if len(groups) == 1:
+            return Measured(**observe())
+        measured.put(part, run.checkpoint(f"texels-{part.start}-{part.stop}", observe))
+    return measured
+
+
 def _observe(
     run: StageRun,
     texels: Texels,
@@ -102,16 +132,19 @@ def _observe(
     rays: RayScene,
     frames: Frames,
     quantile: float,
+    part: slice,
 ) -> Observation:
-    """All frames, going on from the last saved state of an interrupted run."""
-    saved = run.latest("frames")
-    start, observed = 0, Observation.empty(len(texels))
+    """Some texels in all frames, going on from the last saved state of an interrupted run."""
+    name = f"frames-{part.start}-{part.stop}"
+    saved = run.latest(name)
+    start, observed = 0, Observation.empty(part.stop - part.start)
     if saved is not None:
         start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
-    steps = radiance_from_frames(texels, scene, rays, frames, observed, quantile, start)
+    steps = radiance_from_frames(texels, scene, rays, frames, observed, quantile, start, part=part)
+    every = _SAVE_SMALL if len(observed.clipped) <= _SMALL else _SAVE_LARGE
     for done in progress(steps, total=len(frames) - start, label="texture", unit="frames"):
-        if done % 16 == 15:
-            run.save_latest("frames", done, observed.arrays())
+        if done % every == every - 1:
+            run.save_latest(name, done, observed.arrays())
     return observed
 
 
@@ -124,22 +157,18 @@ class _Found:
     maps: dict[str, TexelMap]
 
 
-def _found(texels: Texels, observed: Observation, quantile: float) -> _Found:
+def _found(texels: Texels, seen: Measured) -> _Found:
     """The maps of all objects; refuses a capture that shows nothing of the mesh."""
-    measured = observed.quantiles.count > 0
-    clipped = ~measured & (observed.clipped > 0)
+    measured = seen.count > 0
+    clipped = ~measured & (seen.clipped > 0)
     _check_seen(measured, clipped)
-    median = psquare.quantile(observed.quantiles, quantile)
-    lit = _with_lower_bounds(texels, median, measured, clipped, observed.lower_bound)
-    mean = inpaint(texels, observed.quantiles.mean, measured)
+    lit = _with_lower_bounds(texels, seen.median, measured, clipped, seen.lower_bound)
     coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
-    spread = np.nan_to_num(psquare.spread(observed.quantiles, quantile))
-    samples = observed.quantiles.count.astype(np.float32)
     maps = {
         "lit": TexelMap(lit, 1.0, "W/(m^2 sr)", exact=True),
-        "mean": TexelMap(mean, 1.0, "W/(m^2 sr)"),
-        "spread": TexelMap(spread, 1.0, "W/(m^2 sr)"),
-        "samples": TexelMap(samples, 1 / 32, "1"),
+        "mean": TexelMap(inpaint(texels, seen.mean, measured), 1.0, "W/(m^2 sr)"),
+        "spread": TexelMap(np.nan_to_num(seen.spread), 1.0, "W/(m^2 sr)"),
+        "samples": TexelMap(seen.count.astype(np.float32), 1 / 32, "1"),
         "coverage": TexelMap(coverage, 1.0, "1"),
     }
     return _Found(measured=measured, clipped=clipped, maps=maps)

@@ -17,6 +17,8 @@ _NEIGHBOURS = 8
 _NORMAL_WEIGHT = 0.25
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
+# Texels filled at a time, which bounds what their neighbours take.
+_AT_A_TIME = 1 << 18
 
 
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
@@ -30,10 +32,11 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
     filled = np.where(known[:, None], values, 0).astype(np.float32)
     if not known.any():
         return filled
-    positive = values[known][values[known] > 0]
+    positive = filled[filled > 0]
     if not len(positive):
         return filled
-    floor = float(_ZERO * np.median(positive))
+    floor = float(_ZERO * np.median(positive, overwrite_input=True))
+    del positive
     orphans = []
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
@@ -68,7 +71,11 @@ def _nearest_mean(
 
     tree = cKDTree(feature(source))
     k = min(_NEIGHBOURS, len(source))
-    _, nearest = tree.query(feature(missing), k=k, workers=-1)
-    neighbours = values[source][nearest.reshape(len(missing), k)]
-    logarithm = np.log(np.maximum(neighbours, floor))
-    return np.asarray(np.exp(logarithm.mean(axis=1)), np.float32)
+    means = np.empty((len(missing), 3), np.float32)
+    for start in range(0, len(missing), _AT_A_TIME):
+        some = missing[start : start + _AT_A_TIME]
+        _, nearest = tree.query(feature(some), k=k, workers=-1)
+        neighbours = values[source[nearest.reshape(len(some), k)]]
+        logarithm = np.log(np.maximum(neighbours, floor))
+        means[start : start + _AT_A_TIME] = np.exp(logarithm.mean(axis=1))
+    return means

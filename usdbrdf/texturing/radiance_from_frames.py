@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,19 +14,23 @@ import numpy.typing as npt
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels
-from usdbrdf.scan.frame_reading import read_frame
+from usdbrdf.scan.frame_reading import FramePixels, read_frame
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.psquare import QuantileState
 from usdbrdf.texturing.samples_from_frame import (
     CLIPPED,
+    MIN_COSINE,
     SAMPLE,
     first_surfaces,
-    samples_from_frame,
+    samples_of_texels,
 )
+from usdbrdf.texturing.texel_blocks import blocks_of_texels
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+# Threads that decode, and frames in memory besides the one that is projected.
+_READERS, _AHEAD = 2, 3
 # (frame, texels) -> what to take off their radiance, (len(texels), 3).
 Specular = Callable[[int, Int], Float]
 
@@ -80,34 +85,49 @@ def radiance_from_frames(
     quantile: float,
     start: int = 0,
     specular: Specular | None = None,
+    part: slice | None = None,
 ) -> Iterator[int]:
     """Add frames start.. to ``observed``, in order; yields each frame's index once it is in.
 
     specular  the light that a frame's samples hold besides the diffuse
+    part      the texels that ``observed`` is of; None: all
 
-    The next frame is read and decoded while this one is projected.
+    The next frames are read and decoded while one is projected.
     """
+    part = part or slice(0, len(texels))
     owner = texels.object_index()
-    with ThreadPoolExecutor(max_workers=1) as reader:
-        coming = reader.submit(read_frame, frames, start) if start < len(frames) else None
-        for i in range(start, len(frames)):
-            assert coming is not None
-            pixels = coming.result()
-            if i + 1 < len(frames):
-                coming = reader.submit(read_frame, frames, i + 1)
-            pose, lens = frames.world_from_camera[i], frames.intrinsics[i]
-            surfaces = first_surfaces(rays, scene.face_object, pose, lens, frames.resolution[i])
-            kind, radiance = samples_from_frame(
-                texels, owner, surfaces, np.nan_to_num(pixels.radiance), pixels.valid,
-                pixels.clipped, pose, lens,
-            )  # fmt: skip
-            sampled = np.flatnonzero(kind == SAMPLE).astype(np.int32)
-            values = radiance[sampled]
-            if specular is not None:
-                values = values - specular(i, sampled)
-            psquare.update(observed.quantiles, sampled, values, quantile)
-            saturated = kind == CLIPPED
-            observed.clipped[saturated] += 1
-            limit = np.float32(frames.saturation_radiance[i])
-            observed.lower_bound[saturated] = np.maximum(observed.lower_bound[saturated], limit)
-            yield i
+    blocks = blocks_of_texels(texels, part)
+    for i, pixels in enumerate(_read_ahead(frames, start), start):
+        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
+        which = blocks.texels_in_view(pose, lens, size, MIN_COSINE)
+        kind, radiance = samples_of_texels(
+            texels, which, owner, first_surfaces(rays, scene.face_object, pose, lens, size),
+            pixels.radiance, pixels.valid, pixels.clipped, pose, lens,
+        )  # fmt: skip
+        sampled, values = which[kind == SAMPLE], radiance[kind == SAMPLE]
+        if specular is not None:
+            values = values - specular(i, sampled)
+        psquare.update(observed.quantiles, sampled - np.int32(part.start), values, quantile)
+        saturated = which[kind == CLIPPED] - part.start
+        observed.clipped[saturated] += 1
+        limit = np.float32(frames.saturation_radiance[i])
+        observed.lower_bound[saturated] = np.maximum(observed.lower_bound[saturated], limit)
+        yield i
+
+
+def _read_ahead(frames: Frames, start: int) -> Iterator[FramePixels]:
+    """The pixels of frames start.., of which some are in memory before they are asked for."""
+    with ThreadPoolExecutor(max_workers=_READERS) as readers:
+        coming = deque(
+            readers.submit(read_frame, frames, i)
+            for i in range(start, min(start + _AHEAD, len(frames)))
+        )
+        try:
+            for i in range(start, len(frames)):
+                pixels = coming.popleft().result()
+                if i + _AHEAD < len(frames):
+                    coming.append(readers.submit(read_frame, frames, i + _AHEAD))
+                yield pixels
+        finally:
+            for job in coming:
+                job.cancel()

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from numba import prange
-from scipy import ndimage
 
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.texels import Texels
+from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.texturing.glare import brightest_glare
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -27,13 +27,12 @@ Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
 # Seen flatter than this a texel's footprint is smeared over its neighbours.
-_MIN_COSINE = 0.1
+MIN_COSINE = 0.1
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
 
-# Glare: pixels this many times brighter than the frame's median, within this many pixels, and this
-# many times brighter than the sample itself. Of such light some per cent arrive two pixels off.
-_GLARING, _GLARE_REACH, _GLARE_CONTRAST = 10.0, 3, 3.0
+# Light this many times brighter than a sample spoils it (see ``brightest_glare``).
+_GLARE_CONTRAST = 3.0
 
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 
@@ -54,16 +53,11 @@ def first_surfaces(
     intrinsics: Double,
     resolution: Int,
 ) -> FirstSurfaces:
-    """Trace one ray through every pixel's centre."""
-    width, height = int(resolution[0]), int(resolution[1])
-    origins, directions = camera_rays(world_from_camera, intrinsics, pixel_centres(width, height))
-    hits = rays.closest(origins, directions)
-    seen = np.where(hits.face >= 0, face_object[hits.face], -1).astype(np.int32)
-    point = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
-    return FirstSurfaces(
-        object=seen.reshape(height, width),
-        point=point.reshape(height, width, 3).astype(np.float32),
-    )
+    """The first hits of the rays through all pixels' centres."""
+    face, point = visible_faces(rays, world_from_camera, intrinsics, resolution)
+    seen = face_object[face]
+    seen[face < 0] = -1
+    return FirstSurfaces(object=seen, point=point)
 
 
 def samples_from_frame(
@@ -83,10 +77,34 @@ def samples_from_frame(
     radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
     intrinsics fx, fy, cx, cy. beside_glare: take samples there too, for whom highlights matter.
     """
+    return samples_of_texels(
+        texels, np.arange(len(texels), dtype=np.int32), texel_object, surfaces, radiance, valid,
+        clipped, world_from_camera, intrinsics, beside_glare,
+    )  # fmt: skip
+
+
+def samples_of_texels(
+    texels: Texels,
+    which: Int,
+    texel_object: Int,
+    surfaces: FirstSurfaces,
+    radiance: Float,
+    valid: Bool,
+    clipped: Bool,
+    world_from_camera: Double,
+    intrinsics: Double,
+    beside_glare: bool = False,
+) -> tuple[npt.NDArray[np.int8], Float]:
+    """The same for some texels, ``which`` (M,) int32: (M,) int8 and (M, 3) float32."""
     camera_from_world = np.linalg.inv(world_from_camera).astype(np.float64, copy=False)
-    kind = np.zeros(len(texels), np.int8)
-    values = np.zeros((len(texels), 3), np.float32)
+    if beside_glare:
+        glare = np.zeros(valid.shape, np.float32)
+    else:
+        glare = brightest_glare(radiance, valid, clipped)
+    kind = np.zeros(len(which), np.int8)
+    values = np.zeros((len(which), 3), np.float32)
     _sample(
+        which,
         texels.position,
         texels.geometric_normal,
         texels.step_x,
@@ -100,20 +118,11 @@ def samples_from_frame(
         camera_from_world,
         world_from_camera[:3, 3].copy(),
         np.asarray(intrinsics, np.float64),
-        np.zeros_like(valid, np.float32) if beside_glare else _glare(radiance, valid, clipped),
+        glare,
         kind,
         values,
     )
     return kind, values
-
-
-def _glare(radiance: Float, valid: Bool, clipped: Bool) -> Float:
-    """(H, W) float32: the brightest glaring pixel nearby, in any channel; 0 where there is none."""
-    level = radiance.max(axis=2)
-    usual = float(np.median(level[valid])) if valid.any() else 0.0
-    glaring = np.where((valid | clipped) & (level > _GLARING * usual), level, 0)
-    brightest: Float = ndimage.maximum_filter(glaring, 2 * _GLARE_REACH + 1, mode="nearest")
-    return brightest
 
 
 @kernel
@@ -134,6 +143,7 @@ def _project(
 
 @parallel_kernel
 def _sample(
+    which: Int,
     position: Float,
     normal: Float,
     step_x: Float,
@@ -152,14 +162,15 @@ def _sample(
     values: Float,
 ) -> None:
     height, width = valid.shape
-    for t in prange(len(position)):
+    for m in prange(len(which)):
+        t = which[m]
         p = position[t]
         n = normal[t]
         wx = eye[0] - p[0]
         wy = eye[1] - p[1]
         wz = eye[2] - p[2]
         distance = np.sqrt(wx * wx + wy * wy + wz * wz)
-        if n[0] * wx + n[1] * wy + n[2] * wz < _MIN_COSINE * distance:
+        if n[0] * wx + n[1] * wy + n[2] * wz < MIN_COSINE * distance:
             continue
         sx = step_x[t]
         sy = step_y[t]
@@ -184,7 +195,7 @@ def _sample(
             row, column, reach, p, n, texel_object[t], pixel_size, seen_object, seen_point
         ):
             continue
-        total = np.zeros(3)
+        red, green, blue = 0.0, 0.0, 0.0
         num_valid = 0
         num_clipped = 0
         for a in range(taps_x):
@@ -192,18 +203,22 @@ def _sample(
                 dx = (a + 0.5) / taps_x - 0.5
                 dy = (b + 0.5) / taps_y - 0.5
                 su, sv, _ = _project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
-                good, saturated = _bilinear(su, sv, radiance, valid, clipped, total)
+                good, saturated, red, green, blue = _bilinear(
+                    su, sv, radiance, valid, clipped, red, green, blue
+                )
                 num_valid += good
                 num_clipped += saturated
         # Partly saturated is no bound: a lamp's neighbour catches some of its light.
         if num_valid == 4 * taps_x * taps_y:
-            if glare[row, column] * (taps_x * taps_y) > _GLARE_CONTRAST * total.max():
+            brightest = max(red, green, blue)
+            if glare[row, column] * (taps_x * taps_y) > _GLARE_CONTRAST * brightest:
                 continue
-            kind[t] = SAMPLE
-            for c in range(3):
-                values[t, c] = total[c] / (taps_x * taps_y)
+            kind[m] = SAMPLE
+            values[m, 0] = red / (taps_x * taps_y)
+            values[m, 1] = green / (taps_x * taps_y)
+            values[m, 2] = blue / (taps_x * taps_y)
         elif num_clipped == 4 * taps_x * taps_y:
-            kind[t] = CLIPPED
+            kind[m] = CLIPPED
 
 
 @kernel
@@ -235,9 +250,17 @@ def _shows_surface(
 
 @kernel
 def _bilinear(
-    u: float, v: float, radiance: Float, valid: Bool, clipped: Bool, total: Double
-) -> tuple[int, int]:
-    """Add the image at (u, v) to ``total``; how many of the four pixels are valid, and clipped."""
+    u: float,
+    v: float,
+    radiance: Float,
+    valid: Bool,
+    clipped: Bool,
+    red: float,
+    green: float,
+    blue: float,
+) -> tuple[int, int, float, float, float]:
+    """How many of the four pixels around (u, v) are valid, and clipped; and the image there added
+    to red, green and blue."""
     height, width = valid.shape
     x = min(max(u - 0.5, 0.0), width - 1.001)
     y = min(max(v - 0.5, 0.0), height - 1.001)
@@ -252,6 +275,7 @@ def _bilinear(
             w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
             num_valid += valid[j + b, i + a]
             num_clipped += clipped[j + b, i + a]
-            for c in range(3):
-                total[c] += w * radiance[j + b, i + a, c]
-    return num_valid, num_clipped
+            red += w * radiance[j + b, i + a, 0]
+            green += w * radiance[j + b, i + a, 1]
+            blue += w * radiance[j + b, i + a, 2]
+    return num_valid, num_clipped, red, green, blue

@@ -1,0 +1,189 @@
+"""Speed and memory of texturing: frames per second, its parts, and against stored samples.
+
+    python benchmarks/texturing.py ASSET [--frames N] [--json FILE]
+
+ASSET has been textured, for instance from benchmarks/generated_capture.py:
+
+    python benchmarks/generated_capture.py CAPTURE
+    usdbrdf ingest CAPTURE -o ASSET && usdbrdf texture ASSET --texel-size 0.0168
+
+Printed are JSON and one row of a Markdown table. CPU seconds are of all threads; on a machine that
+others use too they, and ratios, say more than the clock. `late_to_early` is the CPU time of the
+same frames with all of them in the state already, over that with an empty one. The reference keeps
+every sample and takes NumPy's median of each texel. Threads that wait for work burn CPU time unless
+OMP_WAIT_POLICY=PASSIVE is in the environment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.scan.frame_reading import read_frame
+from usdbrdf.scan.scan import Frames
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.read import frames_from_stage, open_measured
+from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.texturing import psquare
+from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
+from usdbrdf.texturing.samples_from_frame import (
+    MIN_COSINE,
+    SAMPLE,
+    first_surfaces,
+    samples_of_texels,
+)
+from usdbrdf.texturing.texel_blocks import blocks_of_texels
+
+QUANTILE = 0.5
+T = TypeVar("T")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("asset", type=Path)
+    parser.add_argument("--frames", type=int, help="only the first N")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+
+    stage = open_measured(Asset.at(options.asset))
+    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
+    count = min(options.frames or len(frames), len(frames))
+    rays = RayScene(atlas.scene.points, atlas.scene.triangles)
+    streamed(atlas, rays, frames, Observation.empty(len(atlas.texels)), 2)  # compiles
+
+    observed = Observation.empty(len(atlas.texels))
+    early, wall = streamed(atlas, rays, frames, observed, count)
+    median = psquare.quantile(observed.quantiles, QUANTILE)
+    late, _ = streamed(atlas, rays, frames, observed, count)
+    spent, samples = by_parts(atlas, rays, frames, count)
+    exact = stored_median(samples)
+    results: dict[str, Any] = {
+        "frames": count,
+        "resolution": frames.resolution[0].tolist(),
+        "texels": len(atlas.texels),
+        "triangles": len(atlas.scene.triangles),
+        "cores": os.cpu_count(),
+        "frames_per_second": count / wall,
+        "cpu_s_per_frame": early / count,
+        "frames_per_second_of_two_cores": 2 * count / early,
+        "late_to_early": late / early,
+        "state_bytes_per_texel": sum(a.nbytes for a in observed.arrays().values())
+        / len(atlas.texels),
+        "share": {name: used / sum(spent.values()) for name, used in spent.items()},
+        "psquare_cpu_s": spent["psquare"],
+        "stored": {
+            "cpu_s": exact["cpu_s"],
+            "bytes_per_texel": exact["bytes"] / len(atlas.texels),
+            "median_abs_difference": difference(median, exact),
+        },
+    }
+    text = json.dumps(results, indent=2)
+    print(text)
+    print(row(results))
+    if options.json:
+        options.json.write_text(text + "\n")
+    return 0
+
+
+def streamed(
+    atlas: Atlas, rays: RayScene, frames: Frames, observed: Observation, count: int
+) -> tuple[float, float]:
+    """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
+    steps = radiance_from_frames(atlas.texels, atlas.scene, rays, frames, observed, QUANTILE)
+    cpu, wall = time.process_time(), time.perf_counter()
+    for done in steps:
+        if done == count - 1:
+            break
+    return time.process_time() - cpu, time.perf_counter() - wall
+
+
+def by_parts(
+    atlas: Atlas, rays: RayScene, frames: Frames, count: int
+) -> tuple[dict[str, float], list[tuple[np.ndarray, np.ndarray]]]:
+    """CPU seconds of each part, one after the other; and every frame's texels and radiances."""
+    spent: dict[str, float] = defaultdict(float)
+
+    def timed(name: str, work: Callable[..., T], *arguments: Any) -> T:
+        start = time.process_time()
+        result = work(*arguments)
+        spent[name] += time.process_time() - start
+        return result
+
+    texels, owner = atlas.texels, atlas.texels.object_index()
+    blocks = blocks_of_texels(texels, slice(0, len(texels)))
+    observed = Observation.empty(len(texels))
+    samples = []
+    for i in range(count):
+        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
+        pixels = timed("read", read_frame, frames, i)
+        which = timed("cull", blocks.texels_in_view, pose, lens, size, MIN_COSINE)
+        face_object = atlas.scene.face_object
+        surfaces = timed("occlusion", first_surfaces, rays, face_object, pose, lens, size)
+        kind, radiance = timed(
+            "sample", samples_of_texels, texels, which, owner, surfaces, pixels.radiance,
+            pixels.valid, pixels.clipped, pose, lens,
+        )  # fmt: skip
+        taken = which[kind == SAMPLE], radiance[kind == SAMPLE]
+        timed("psquare", psquare.update, observed.quantiles, *taken, QUANTILE)
+        samples.append(taken)
+    return dict(spent), samples
+
+
+def stored_median(samples: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
+    """NumPy's median of every texel's samples, all of them kept: texels and medians, CPU seconds
+    and bytes."""
+    start = time.process_time()
+    texel = np.concatenate([index for index, _ in samples])
+    radiance = np.concatenate([values for _, values in samples])
+    order = np.argsort(texel, kind="stable")
+    texel, radiance = texel[order], radiance[order]
+    first = np.flatnonzero(np.diff(texel, prepend=-1))
+    seen = np.diff(np.append(first, len(texel)))
+    median = np.empty((len(first), 3), np.float32)
+    for count in np.unique(seen):
+        own = seen == count
+        rows = first[own, None] + np.arange(count)
+        median[own] = np.median(radiance[rows], axis=1)
+    return {
+        "texel": texel[first],
+        "count": seen,
+        "median": median,
+        "cpu_s": time.process_time() - start,
+        "bytes": texel.nbytes + radiance.nbytes,
+    }
+
+
+def difference(median: np.ndarray, exact: dict[str, Any]) -> float:
+    """Median relative difference of the streaming median from the exact one, of texels with more
+    than the five samples up to which it is exact."""
+    many = exact["count"] > 5
+    known = np.maximum(exact["median"][many], 1e-9)
+    return float(np.median(np.abs(median[exact["texel"][many]] / known - 1)))
+
+
+def row(results: dict[str, Any]) -> str:
+    width, height = results["resolution"]
+    share = ", ".join(f"{name} {100 * part:.0f} %" for name, part in results["share"].items())
+    return (
+        f"| {width} x {height} | {results['texels']:,} | {results['triangles']:,} "
+        f"| {results['frames_per_second']:.1f} ({results['frames_per_second_of_two_cores']:.1f}) "
+        f"| {1000 * results['cpu_s_per_frame']:.0f} ms | {share} | {results['late_to_early']:.2f} "
+        f"| {results['state_bytes_per_texel']:.0f} B | "
+        f"{results['stored']['cpu_s'] / results['psquare_cpu_s']:.1f} x time, "
+        f"{results['stored']['bytes_per_texel']:.0f} B |"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

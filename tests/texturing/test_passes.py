@@ -1,0 +1,66 @@
+"""Groups of texels that fit into memory."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, quad, world_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.scan.scan import Frames
+from usdbrdf.texturing import passes
+from usdbrdf.texturing.passes import groups_of_texels
+
+
+@pytest.fixture(scope="module")
+def square() -> World:
+    return world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size=(1000, 1200))])
+
+
+def _frames(width: int = 64, height: int = 48) -> Frames:
+    return Frames(
+        image_paths=(Path("0.exr"),),
+        world_from_camera=np.eye(4)[None],
+        intrinsics=np.array([[50.0, 50, 32, 24]]),
+        resolution=np.array([[width, height]], np.int32),
+        exposure_time=np.ones(1),
+        saturation_radiance=np.ones(1),
+        noise_floor_radiance=np.zeros(1),
+    )
+
+
+def _groups(world: World, memory: float | None) -> list[slice]:
+    return groups_of_texels(world.texels, world.scene, _frames(), memory)
+
+
+def test_one_group_where_memory_suffices(square: World):
+    assert _groups(square, 4.0) == [slice(0, 1_200_000)]
+
+
+def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World):
+    counts = []
+    for memory in (1.0, 0.9, 0.85, 0.8, 0.78):
+        groups = _groups(square, memory)
+        assert groups[0].start == 0
+        assert groups[-1].stop == 1_200_000
+        assert all(a.stop == b.start for a, b in pairwise(groups))
+        counts.append(len(groups))
+    assert counts == sorted(counts)
+    assert counts[0] == 1
+    assert counts[-1] >= 4
+
+
+def test_too_little_memory_is_refused_with_what_is_needed(square: World):
+    with pytest.raises(InputRefused, match=r"need 0.\d GiB, the limit is 0.5.*--memory"):
+        _groups(square, 0.5)
+
+
+def test_the_machines_memory_is_the_default(square: World, monkeypatch):
+    monkeypatch.setattr(passes, "_machine_gib", lambda: 1.2)
+    assert _groups(square, None) == _groups(square, 0.9)
+    monkeypatch.setattr(passes, "_machine_gib", lambda: 0.5)
+    with pytest.raises(InputRefused, match=r"limit is 0\.4"):
+        _groups(square, None)

@@ -1,0 +1,295 @@
+"""Which triangle each pixel of a pinhole camera sees: the first hits of all its rays, by drawing.
+
+A pixel's ray and a triangle's three planes through the eye (J. Olano and T. Greer, "Triangle scan
+conversion using 2D homogeneous coordinates", Graphics Hardware 1997): nothing is clipped, and the
+answer is a ray tracer's, at a fraction of its time. Where rounding could decide otherwise than a
+ray would (at an edge, or where two surfaces meet) the pixel is left to a ray.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.cameras import camera_rays
+from usdbrdf.geometry.rays import BOX_FACES, RayScene
+from usdbrdf.kernel import kernel, parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Vector = tuple[float, float, float]
+
+# Rays decide within this many pixels of an edge, and where two depths differ by less than this
+# share: single precision, in which rays are traced, errs by a tenth of both.
+_EDGE, _DEPTH = 4e-3, 2e-5
+# Bands of rows, drawn in any order by any thread.
+_BANDS = 32
+_BEHIND = 1e-9
+
+
+class Camera(NamedTuple):
+    """eye (3,); rotation (3, 3), world to x right, y down, z ahead; intrinsics fx, fy, cx, cy."""
+
+    eye: Double
+    rotation: Double
+    intrinsics: Double
+
+
+def visible_faces(
+    rays: RayScene, world_from_camera: Double, intrinsics: Double, resolution: Int
+) -> tuple[Int, Float]:
+    """(H, W) int32 triangle, -1 where there is none, and (H, W, 3) float32 the point on it (zero
+    where there is none), seen through each pixel's centre."""
+    width, height = int(resolution[0]), int(resolution[1])
+    axes = np.asarray(world_from_camera, np.float64)[:3, :3]
+    camera = Camera(
+        eye=np.array(world_from_camera[:3, 3], np.float64),
+        rotation=np.ascontiguousarray((axes * [1.0, -1.0, -1.0]).T),
+        intrinsics=np.asarray(intrinsics, np.float64),
+    )
+    boxes = np.flatnonzero(_boxes_in_view(rays.boxes, camera, width, height))
+    faces = np.full((len(boxes), BOX_FACES), -1, np.int32)
+    rows = np.zeros((len(boxes), BOX_FACES, 2), np.int32)
+    _faces_in_view(rays.points, rays.triangles, boxes, camera, width, height, faces, rows)
+    kept = faces >= 0
+    face = np.full((height, width), -1, np.int32)
+    nearness, doubt = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    _draw(rays.points, rays.triangles, faces[kept], rows[kept], camera, face, nearness, doubt)
+    point = np.empty((height, width, 3), np.float32)
+    _points(camera, nearness, point)
+    _trace_doubtful(rays, world_from_camera, intrinsics, nearness, doubt, face, point)
+    return face, point
+
+
+def _trace_doubtful(
+    rays: RayScene,
+    world_from_camera: Double,
+    intrinsics: Double,
+    nearness: Float,
+    doubt: Float,
+    face: Int,
+    point: Float,
+) -> None:
+    row, column = np.nonzero((doubt > 0) & (doubt >= nearness * np.float32(1 - _DEPTH)))
+    if not len(row):
+        return
+    pixels = np.stack([column + 0.5, row + 0.5], axis=-1)
+    origins, directions = camera_rays(world_from_camera, intrinsics, pixels)
+    hits = rays.closest(origins, directions)
+    reached = origins + directions * hits.distance[:, None]
+    face[row, column] = hits.face
+    point[row, column] = np.where(hits.face[:, None] >= 0, reached, 0)
+
+
+@parallel_kernel
+def _boxes_in_view(boxes: Float, camera: Camera, width: int, height: int) -> npt.NDArray[np.bool_]:
+    """Does any part of a box (low, high) lie ahead of the camera, between its image's borders?"""
+    inside = np.zeros(len(boxes), np.bool_)
+    fx, fy, cx, cy = camera.intrinsics
+    # Inward normals of the planes through the image's borders, and of the one through the eye.
+    sides = np.array([
+        [fx, 0.0, cx + 1], [-fx, 0.0, width - cx + 1],
+        [0.0, fy, cy + 1], [0.0, -fy, height - cy + 1],
+        [0.0, 0.0, 1.0],
+    ])  # fmt: skip
+    planes = sides @ camera.rotation
+    for b in prange(len(boxes)):
+        seen = True
+        for k in range(5):
+            far = 0.0
+            for a in range(3):
+                end = boxes[b, 1, a] if planes[k, a] > 0 else boxes[b, 0, a]
+                far += planes[k, a] * (end - camera.eye[a])
+            seen = seen and far >= 0
+        inside[b] = seen
+    return inside
+
+
+@kernel
+def _in_camera(points: Float, vertex: int, camera: Camera) -> Vector:
+    x = points[vertex, 0] - camera.eye[0]
+    y = points[vertex, 1] - camera.eye[1]
+    z = points[vertex, 2] - camera.eye[2]
+    m = camera.rotation
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+
+
+@kernel
+def _extent(
+    a: Vector,
+    b: Vector,
+    c: Vector,
+    camera: Camera,
+    width: int,
+    height: int,
+) -> tuple[int, int, int, int]:
+    """First and last column and row whose pixels' centres a triangle can cover; first > last if
+    there are none."""
+    fx, fy, cx, cy = camera.intrinsics
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    corners = (a, b, c)
+    for k in range(3):
+        p = corners[k]
+        q = corners[(k + 1) % 3]
+        if p[2] > _BEHIND:
+            u, v = fx * p[0] / p[2], fy * p[1] / p[2]
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+        if (p[2] > _BEHIND) != (q[2] > _BEHIND):
+            t = (_BEHIND - p[2]) / (q[2] - p[2])
+            u = fx * (p[0] + t * (q[0] - p[0])) / _BEHIND
+            v = fy * (p[1] + t * (q[1] - p[1])) / _BEHIND
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    if left > right:
+        return 0, -1, 0, -1
+    # Clamped before they become integers: a point beside the eye is anywhere.
+    return (
+        int(np.ceil(min(max(left + cx - 0.5 - _EDGE, 0.0), width))),
+        int(np.floor(max(min(right + cx - 0.5 + _EDGE, width - 1.0), -1.0))),
+        int(np.ceil(min(max(top + cy - 0.5 - _EDGE, 0.0), height))),
+        int(np.floor(max(min(bottom + cy - 0.5 + _EDGE, height - 1.0), -1.0))),
+    )
+
+
+@parallel_kernel
+def _faces_in_view(
+    points: Float,
+    triangles: Int,
+    boxes: npt.NDArray[np.int64],
+    camera: Camera,
+    width: int,
+    height: int,
+    faces: Int,
+    rows: Int,
+) -> None:
+    """Of each box the triangles that can cover a pixel's centre, and in which rows."""
+    for i in prange(len(boxes)):
+        first = boxes[i] * BOX_FACES
+        for k in range(min(BOX_FACES, len(triangles) - first)):
+            f = first + k
+            a = _in_camera(points, triangles[f, 0], camera)
+            b = _in_camera(points, triangles[f, 1], camera)
+            c = _in_camera(points, triangles[f, 2], camera)
+            left, right, top, bottom = _extent(a, b, c, camera, width, height)
+            if left <= right and top <= bottom:
+                faces[i, k] = f
+                rows[i, k, 0] = top
+                rows[i, k, 1] = bottom
+
+
+@parallel_kernel
+def _draw(
+    points: Float,
+    triangles: Int,
+    faces: Int,
+    rows: Int,
+    camera: Camera,
+    face: Int,
+    nearness: Float,
+    doubt: Float,
+) -> None:
+    height = len(face)
+    for i in prange(_BANDS):
+        # Neighbouring bands, which are similarly full, go to different threads.
+        band = i * 13 % _BANDS
+        low = band * height // _BANDS
+        high = (band + 1) * height // _BANDS
+        for j in range(len(faces)):
+            if rows[j, 0] < high and rows[j, 1] >= low:
+                _draw_face(points, triangles, faces[j], low, high, camera, face, nearness, doubt)
+
+
+@kernel
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def _on_image(n: Vector, camera: Camera, scale: float) -> Vector:
+    """n . d of the ray d through pixel (column, row), as coefficients of column, row and 1."""
+    fx, fy, cx, cy = camera.intrinsics
+    a = scale * n[0] / fx
+    b = scale * n[1] / fy
+    return a, b, scale * n[2] + a * (0.5 - cx) + b * (0.5 - cy)
+
+
+@kernel
+def _side(p: Vector, q: Vector, camera: Camera, sign: float) -> Vector:
+    """Distance in pixels from the edge p q, positive inside."""
+    a, b, c = _on_image(_cross(p, q), camera, sign)
+    length = np.sqrt(a * a + b * b)
+    if length == 0:
+        return 0.0, 0.0, 0.0  # no edge at all: in doubt
+    return a / length, b / length, c / length
+
+
+@kernel
+def _draw_face(
+    points: Float,
+    triangles: Int,
+    f: int,
+    low: int,
+    high: int,
+    camera: Camera,
+    face: Int,
+    nearness: Float,
+    doubt: Float,
+) -> None:
+    """One triangle into the rows low to high. nearness is 1 / depth."""
+    height, width = face.shape
+    a = _in_camera(points, triangles[f, 0], camera)
+    b = _in_camera(points, triangles[f, 1], camera)
+    c = _in_camera(points, triangles[f, 2], camera)
+    left, right, top, bottom = _extent(a, b, c, camera, width, height)
+    n = _cross((b[0] - a[0], b[1] - a[1], b[2] - a[2]), (c[0] - a[0], c[1] - a[1], c[2] - a[2]))
+    volume = n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
+    sign = 1.0 if volume >= 0 else -1.0
+    ax, ay, a1 = _side(b, c, camera, sign)
+    bx, by, b1 = _side(c, a, camera, sign)
+    cx, cy, c1 = _side(a, b, camera, sign)
+    wx, wy, w1 = 0.0, 0.0, 0.0
+    if volume != 0:
+        wx, wy, w1 = _on_image(n, camera, 1 / volume)
+    nearest = min(a[2], b[2], c[2])
+    at_most = 1 / nearest if nearest > _BEHIND else np.inf
+    for row in range(max(top, low), min(bottom + 1, high)):
+        in_a = a1 + ay * row
+        in_b = b1 + by * row
+        in_c = c1 + cy * row
+        in_w = w1 + wy * row
+        for column in range(left, right + 1):
+            inside = min(in_a + ax * column, in_b + bx * column, in_c + cx * column)
+            if inside < -_EDGE:
+                continue
+            if inside < _EDGE:
+                doubt[row, column] = max(doubt[row, column], np.float32(at_most))
+                continue
+            w = np.float32(in_w + wx * column)
+            known = nearness[row, column]
+            if abs(w - known) <= _DEPTH * known:
+                doubt[row, column] = max(doubt[row, column], w)
+            if w > known:
+                nearness[row, column] = w
+                face[row, column] = f
+
+
+@parallel_kernel
+def _points(camera: Camera, nearness: Float, point: Float) -> None:
+    """The world points at 1 / nearness ahead; zero where that is zero."""
+    fx, fy, cx, cy = camera.intrinsics
+    m = camera.rotation
+    for row in prange(len(nearness)):
+        y = (row + 0.5 - cy) / fy
+        for column in range(nearness.shape[1]):
+            x = (column + 0.5 - cx) / fx
+            w = nearness[row, column]
+            for k in range(3):
+                d = m[0, k] * x + m[1, k] * y + m[2, k]
+                point[row, column, k] = camera.eye[k] + d / w if w > 0 else 0.0

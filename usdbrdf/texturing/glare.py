@@ -1,0 +1,114 @@
+"""Where a lamp is so near in the image that some of its light lies on other things' pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.kernel import kernel, parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+Int = npt.NDArray[np.int32]
+Count = npt.NDArray[np.int64]
+
+# Pixels this many times brighter than the frame's median reach this many pixels far. Of such light
+# some per cent arrive two pixels off.
+_GLARING, _REACH = 10.0, 3
+
+
+def brightest_glare(radiance: Float, valid: Bool, clipped: Bool) -> Float:
+    """(H, W) float32: the brightest glaring pixel nearby, in any channel; 0 where there is none."""
+    level = np.empty(valid.shape, np.float32)
+    _levels(radiance, valid, clipped, level)
+    brightest = np.zeros(valid.shape, np.float32)
+    glares = np.zeros(len(level), np.bool_)
+    _keep_above(np.float32(_GLARING * _median(level, valid)), level, glares)
+    if glares.any():
+        _spread(level, glares, brightest)
+    return brightest
+
+
+@parallel_kernel
+def _levels(radiance: Float, valid: Bool, clipped: Bool, level: Float) -> None:
+    """The brightest channel; 0 where a pixel is neither valid nor clipped."""
+    height, width = valid.shape
+    for j in prange(height):
+        for i in range(width):
+            known = valid[j, i] or clipped[j, i]
+            brightest = max(radiance[j, i, 0], radiance[j, i, 1], radiance[j, i, 2])
+            level[j, i] = brightest if known else np.float32(0)
+
+
+def _median(level: Float, valid: Bool) -> float:
+    """np.median of the valid levels; 0 if there are none.
+
+    A histogram over the upper half of the floats' bits, in the order of the numbers, leaves few of
+    them to sort.
+    """
+    bits = level.view(np.int32)
+    upto = np.cumsum(_histogram(bits, valid))
+    total = int(upto[-1])
+    if not total:
+        return 0.0
+    ranks = np.array([(total - 1) // 2, total // 2])
+    low, high = np.searchsorted(upto, ranks, side="right")
+    before = int(upto[low - 1]) if low else 0
+    among = _of_bins(bits, valid, low, high, int(upto[high]) - before)
+    return float(np.mean(np.sort(among.view(np.float32))[ranks - before]))
+
+
+@kernel
+def _bin(bits: int) -> int:
+    """The upper 16 bits of a float, as a number from 0 to 65535 that grows with it."""
+    return ((bits if bits >= 0 else bits ^ 0x7FFFFFFF) >> 16) + (1 << 15)
+
+
+@kernel
+def _histogram(bits: Int, valid: Bool) -> Count:
+    histogram = np.zeros(1 << 16, np.int64)
+    height, width = valid.shape
+    for j in range(height):
+        for i in range(width):
+            if valid[j, i]:
+                histogram[_bin(bits[j, i])] += 1
+    return histogram
+
+
+@kernel
+def _of_bins(bits: Int, valid: Bool, low: int, high: int, count: int) -> Int:
+    found = np.empty(count, np.int32)
+    k = 0
+    height, width = valid.shape
+    for j in range(height):
+        for i in range(width):
+            if valid[j, i] and low <= _bin(bits[j, i]) <= high:
+                found[k] = bits[j, i]
+                k += 1
+    return found
+
+
+@parallel_kernel
+def _keep_above(limit: np.float32, level: Float, glares: Bool) -> None:
+    """Zero what glares not; ``glares`` (H,): rows where anything is left."""
+    height, width = level.shape
+    for j in prange(height):
+        for i in range(width):
+            if level[j, i] > limit:
+                glares[j] = True
+            else:
+                level[j, i] = 0
+
+
+@parallel_kernel
+def _spread(level: Float, glares: Bool, brightest: Float) -> None:
+    """The largest level within _REACH pixels to all sides."""
+    height, width = level.shape
+    for j in prange(height):
+        for k in range(max(0, j - _REACH), min(height, j + _REACH + 1)):
+            if not glares[k]:
+                continue
+            for i in range(width):
+                for n in range(max(0, i - _REACH), min(width, i + _REACH + 1)):
+                    brightest[j, i] = max(brightest[j, i], level[k, n])

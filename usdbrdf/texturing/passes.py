@@ -1,0 +1,117 @@
+"""Texels in groups whose running statistics fit into memory; each group is one pass over the
+frames. What a texel gets does not depend on its group."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.scene import Scene
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.scan.scan import Frames
+from usdbrdf.texturing import psquare
+from usdbrdf.texturing.radiance_from_frames import Observation
+
+Float = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+_GIB = 1 << 30
+# Without --memory this share of the machine's.
+_SHARE = 0.75
+# Bytes. Of a texel in the present group: its running statistics (120), and its place among the
+# blocks of texels while these are sorted out. Of every texel: its results, and what becomes of
+# them when the maps are made. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what
+# the present one sees. Of the process: interpreter, libraries and compiled code.
+_PER_GROUPED_TEXEL, _PER_TEXEL, _PER_TRIANGLE, _PER_PIXEL = 180, 100, 200, 200
+_PROCESS = _GIB // 2
+# A pass costs reading all frames: groups smaller than this are not worth it.
+_SMALLEST_GROUP = 250_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What all frames say of T texels: radiance in W/(m^2 sr), NaN where no frame measured it.
+
+    median       (T, 3) float32, the quantile that was asked for
+    mean         (T, 3) float32, 0 where no frame measured it
+    spread       (T, 3) float32, see ``psquare.spread``
+    count        (T,) int32, samples
+    clipped      (T,) int32, frames in which the texel was visible but saturated
+    lower_bound  (T,) float32, the largest radiance at which it still saturated
+    """
+
+    median: Float
+    mean: Float
+    spread: Float
+    count: Int
+    clipped: Int
+    lower_bound: Float
+
+    @classmethod
+    def empty(cls, num_texels: int) -> Measured:
+        colour, number = (num_texels, 3), num_texels
+        return cls(
+            median=np.empty(colour, np.float32),
+            mean=np.empty(colour, np.float32),
+            spread=np.empty(colour, np.float32),
+            count=np.empty(number, np.int32),
+            clipped=np.empty(number, np.int32),
+            lower_bound=np.empty(number, np.float32),
+        )
+
+    def put(self, part: slice, arrays: dict[str, npt.NDArray[Any]]) -> None:
+        """Set the texels of ``part``."""
+        for field in fields(self):
+            getattr(self, field.name)[part] = arrays[field.name]
+
+
+def measured_arrays(observed: Observation, quantile: float) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of ``Measured``, of the texels that were observed."""
+    return {
+        "median": psquare.quantile(observed.quantiles, quantile),
+        "mean": observed.quantiles.mean,
+        "spread": psquare.spread(observed.quantiles, quantile),
+        "count": observed.quantiles.count,
+        "clipped": observed.clipped,
+        "lower_bound": observed.lower_bound,
+    }
+
+
+def groups_of_texels(
+    texels: Texels, scene: Scene, frames: Frames, memory: float | None
+) -> list[slice]:
+    """As few groups of consecutive texels as fit, with scene and texels, into ``memory`` GiB
+    (None: three quarters of the machine's).
+
+    Raises InputRefused where not even the smallest groups do.
+    """
+    limit = (memory or _SHARE * _machine_gib()) * _GIB
+    held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
+    held += _PER_TEXEL * len(texels) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
+    smallest = min(len(texels), _SMALLEST_GROUP)
+    needed = held + _PER_GROUPED_TEXEL * smallest
+    if needed > limit:
+        raise InputRefused(
+            f"{len(texels):,} texels and {len(scene.triangles):,} triangles need "
+            f"{needed / _GIB:.1f} GiB, the limit is {limit / _GIB:.1f}. Allow more with --memory, "
+            "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
+        )
+    most = max(smallest, int((limit - held) / _PER_GROUPED_TEXEL), 1)
+    count = -(-len(texels) // most)
+    ends = [k * len(texels) // count for k in range(count + 1)]
+    return [slice(low, high) for low, high in pairwise(ends)]
+
+
+def _bytes(table: Scene | Texels) -> int:
+    return sum(a.nbytes for a in vars(table).values() if isinstance(a, np.ndarray))
+
+
+def _machine_gib() -> float:
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / _GIB

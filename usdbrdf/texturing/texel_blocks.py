@@ -1,0 +1,172 @@
+"""Bounds around patches of texels, by which a frame passes over most of those it cannot see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.geometry.unwrap import MAX_SIDE
+from usdbrdf.kernel import parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+# Texels to a side of a patch.
+_SIDE = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class TexelBlocks:
+    """B patches of texels and what bounds their points and normals.
+
+    order   (T,) int32, texels; block b holds order[first[b]:first[b + 1]], first (B + 1,) int64
+    centre  (B, 3) float32, radius (B,) float32: a sphere around their points
+    axis    (B, 3) float32, spread (B,) float32: all normals lie within ``spread`` radians of it
+    """
+
+    order: Int
+    first: npt.NDArray[np.int64]
+    centre: Float
+    radius: Float
+    axis: Float
+    spread: Float
+
+    def texels_in_view(
+        self,
+        world_from_camera: Double,
+        intrinsics: Double,
+        resolution: Int,
+        min_cosine: float,
+    ) -> Int:
+        """All texels, by block, that lie before the camera, project into the image and
+        face the eye at ``min_cosine`` or more, and of few others."""
+        width, height = (int(side) for side in resolution)
+        fx, fy, cx, cy = (float(value) for value in intrinsics)
+        # Inward normals, in camera axes, of the planes through the image's borders and the eye.
+        planes = np.array([
+            [fx, 0, -cx], [-fx, 0, cx - width], [0, -fy, -cy], [0, fy, cy - height], [0, 0, -1],
+        ])  # fmt: skip
+        planes /= np.linalg.norm(planes, axis=1, keepdims=True)
+        normals = np.ascontiguousarray(planes @ np.asarray(world_from_camera)[:3, :3].T)
+        eye = np.array(world_from_camera[:3, 3], np.float64)
+        seen = np.flatnonzero(
+            _in_view(
+                self.centre, self.radius, self.axis, self.spread, normals, eye,
+                float(np.arccos(min_cosine)),
+            )
+        )  # fmt: skip
+        count = self.first[seen + 1] - self.first[seen]
+        ends = np.cumsum(count)
+        shift = np.repeat(self.first[seen] - (ends - count), count)
+        which: Int = self.order[np.arange(len(shift)) + shift]
+        return which
+
+
+def blocks_of_texels(texels: Texels, part: slice) -> TexelBlocks:
+    """Blocks of the texels of ``part``, each of one object and, as far as _SIDE allows, one side of
+    a chart: patches of the atlas, split by the axis along which the normal is longest."""
+    owner = texels.object_index()[part]
+    local = texels.pixel[part] - texels.first_pixel[owner]
+    width = texels.resolution[owner, 0]
+    patch = (local // width // _SIDE) * (MAX_SIDE // _SIDE) + local % width // _SIDE
+    key = (owner.astype(np.int64) * (MAX_SIDE // _SIDE) ** 2 + patch) * 6
+    key += _longest_axis(texels.geometric_normal[part])
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    order = (order + part.start).astype(np.int32)
+    count = len(first)
+    bounds = TexelBlocks(
+        order=order,
+        first=np.append(first, len(order)),
+        centre=np.zeros((count, 3), np.float32),
+        radius=np.zeros(count, np.float32),
+        axis=np.zeros((count, 3), np.float32),
+        spread=np.zeros(count, np.float32),
+    )
+    _bounds(
+        texels.position, texels.geometric_normal, bounds.order, bounds.first, bounds.centre,
+        bounds.radius, bounds.axis, bounds.spread,
+    )  # fmt: skip
+    return bounds
+
+
+def _longest_axis(normal: Float) -> npt.NDArray[np.int64]:
+    """0 to 5: x, y, z and their opposites."""
+    axis = np.abs(normal).argmax(axis=1)
+    along = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0]
+    longest: npt.NDArray[np.int64] = axis + 3 * (along < 0)
+    return longest
+
+
+@parallel_kernel
+def _bounds(
+    position: Float,
+    normal: Float,
+    order: Int,
+    first: npt.NDArray[np.int64],
+    centre: Float,
+    radius: Float,
+    axis: Float,
+    spread: Float,
+) -> None:
+    for b in prange(len(first) - 1):
+        low, high = position[order[first[b]]].copy(), position[order[first[b]]].copy()
+        total = np.zeros(3)
+        for t in order[first[b] : first[b + 1]]:
+            for k in range(3):
+                low[k] = min(low[k], position[t, k])
+                high[k] = max(high[k], position[t, k])
+                total[k] += normal[t, k]
+        length = np.sqrt((total**2).sum())
+        away, least = 0.0, 1.0
+        for k in range(3):
+            centre[b, k] = (low[k] + high[k]) / 2
+            axis[b, k] = total[k] / length if length > 0 else 0.0
+        for t in order[first[b] : first[b + 1]]:
+            squared, cosine = 0.0, 0.0
+            for k in range(3):
+                squared += (np.float64(position[t, k]) - centre[b, k]) ** 2
+                cosine += np.float64(normal[t, k]) * axis[b, k]
+            away, least = max(away, squared), min(least, cosine)
+        # Rounded outwards: single precision, in which the bounds are kept, has seven digits.
+        radius[b] = 1.00001 * np.sqrt(away) + 1e-6 * (np.abs(centre[b]).max() + 1e-3)
+        spread[b] = np.arccos(max(least, -1.0)) + 2e-3
+
+
+@parallel_kernel
+def _in_view(
+    centre: Float,
+    radius: Float,
+    axis: Float,
+    spread: Float,
+    planes: Double,
+    eye: Double,
+    widest: float,
+) -> Bool:
+    seen = np.zeros(len(centre), np.bool_)
+    for b in prange(len(centre)):
+        x = eye[0] - centre[b, 0]
+        y = eye[1] - centre[b, 1]
+        z = eye[2] - centre[b, 2]
+        inside = True
+        for k in range(len(planes)):
+            inside = inside and (
+                planes[k, 0] * x + planes[k, 1] * y + planes[k, 2] * z <= radius[b]
+            )
+        if not inside:
+            continue
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance <= radius[b]:
+            seen[b] = True
+            continue
+        # The eye, seen from any point of the sphere, and any of the normals.
+        cosine = (axis[b, 0] * x + axis[b, 1] * y + axis[b, 2] * z) / distance
+        least = np.arccos(min(max(cosine, -1.0), 1.0)) - spread[b]
+        seen[b] = least - np.arcsin(radius[b] / distance) <= widest
+    return seen
