@@ -32,7 +32,6 @@ from usdbrdf.evaluation.truth import (
     scored_texels,
     true_albedo,
 )
-from usdbrdf.evaluation.viewed_asset import has_map
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.scan.frame_reading import read_frame
@@ -71,7 +70,7 @@ def main() -> int:
         **{
             name: albedo_error(atlas, scored, atlas.map_where_present(name, 3), albedo)
             for name in ("albedo", "base_color")
-            if has_map(atlas, name)
+            if atlas.has(name)
         },
         "emitters": emitter_error(atlas, shines, owner),
         "material": material_error(atlas, truth, shines),

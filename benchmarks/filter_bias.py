@@ -27,7 +27,6 @@ import numpy as np
 from against_reference import MIN_SAMPLES, Array, near_others, weighted_median
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.evaluation.viewed_asset import has_map
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.stage.asset import Asset
@@ -46,7 +45,7 @@ def main() -> int:
     options = parser.parse_args()
 
     atlas = atlas_from_stage(open_measured(Asset.at(options.asset)))
-    if not has_map(atlas, "irradiance_raw"):
+    if not atlas.has("irradiance_raw"):
         raise SystemExit(f"{options.asset}: not filtered. Run `usdbrdf shade --denoise oidn`")
     raw, filtered = (atlas.map(name).mean(axis=1) for name in ("irradiance_raw", "irradiance"))
     emissive = (atlas.map_where_present("emission", 3) > 0).any(axis=1)

@@ -65,16 +65,19 @@ def room(make) -> Made:
 
 @pytest.fixture(scope="session")
 def separated(room, tmp_path_factory) -> Made:
-    """The room with ``diffuse`` and ``base_color``, half of what ``lit`` and ``albedo`` are."""
+    """The room with ``diffuse`` and ``base_color``, half of ``lit`` and ``albedo``, and with its
+    irradiance again as ``refined_irradiance``."""
     folder = tmp_path_factory.mktemp("separated") / "room"
     shutil.copytree(room.asset, folder)
     asset, atlas = measured_atlas(folder)
     layer = Sdf.Layer.FindOrOpen(str(asset.layer("material")))
-    for name, of in (("diffuse", "lit"), ("base_color", "albedo")):
-        half = (0.5 * atlas.map(of)).astype(np.float32)
+    maps = {"diffuse": ("lit", 0.5), "base_color": ("albedo", 0.5)}
+    maps["refined_irradiance"] = ("irradiance", 1.0)
+    for name, (of, factor) in maps.items():
+        values = (factor * atlas.map(of)).astype(np.float32)
         for i, obj in enumerate(atlas.scene.objects):
             file = asset.texture(obj.identifier, name)
-            write_exr(folder / file, atlas.texels.image(i, half))
+            write_exr(folder / file, atlas.texels.image(i, values))
             prim = Sdf.CreatePrimInLayer(layer, obj.prim_path)
             attribute = Sdf.AttributeSpec(
                 prim, f"usdBrdf:aov:{name}:file", Sdf.ValueTypeNames.Asset

@@ -42,7 +42,8 @@ def test_an_asset_agrees_with_itself_exactly(room, itself):
 def test_own_albedo_under_own_light_gives_the_radiance_back(room):
     _, atlas = measured_atlas(room.asset)
     same, scored = matched(atlas, atlas)
-    back = relit(atlas, atlas, same, scored, MapNames(radiance="lit", albedo="albedo"))
+    maps = MapNames(radiance="lit", irradiance="irradiance", albedo="albedo")
+    back = relit(atlas, atlas, same, scored, maps)
     # Albedos above 1, of which this room has many, were cut off; the rest is half floats.
     whole = scored & (back.albedo < 0.99).all(axis=1)
     assert whole.sum() > 100

@@ -75,7 +75,7 @@ def test_a_lobe_narrower_than_its_footprint_is_unresolved():
     for phi in (0.5, 0.1, 0.02):
         terms, without = _normal(phi, 0.5, 0.02, 0.05, 50)
         widths.append(lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.03).unresolved)
-    assert widths == pytest.approx([math.hypot(phi, 0.06) - phi for phi in (0.5, 0.1, 0.02)])
+    assert widths == pytest.approx([math.hypot(phi, 1.5 * 0.03) - phi for phi in (0.5, 0.1, 0.02)])
 
 
 def test_noise_of_the_rays_widens_the_errors():

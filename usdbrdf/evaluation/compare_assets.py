@@ -11,7 +11,7 @@ from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
 from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit
 from usdbrdf.evaluation.relit_pictures import write_pictures
 from usdbrdf.evaluation.report import table_text
-from usdbrdf.evaluation.viewed_asset import has_map, measured_atlas
+from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 from usdbrdf.job.progress import say
@@ -21,8 +21,8 @@ from usdbrdf.steps.atlas import Atlas
 DOCUMENT = "comparison.json"
 # As textured, and after the specular light was taken out of it.
 _SETS = {
-    "lit": MapNames(radiance="lit", albedo="albedo"),
-    "diffuse": MapNames(radiance="diffuse", albedo="base_color"),
+    "lit": MapNames(radiance="lit", irradiance="irradiance", albedo="albedo"),
+    "diffuse": MapNames(radiance="diffuse", irradiance="refined_irradiance", albedo="base_color"),
 }
 
 
@@ -90,7 +90,7 @@ def _percent(value: float | None) -> str:
 
 
 def _in_both(a: Atlas, b: Atlas, maps: MapNames) -> bool:
-    return all(has_map(x, name) for x in (a, b) for name in (maps.radiance, maps.albedo))
+    return all(x.has(name) for x in (a, b) for name in vars(maps).values())
 
 
 def _figures(forth: Relit, back: Relit) -> dict[str, Any]:

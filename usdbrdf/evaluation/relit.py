@@ -21,9 +21,10 @@ Bool = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class MapNames:
-    """Which maps are the diffuse radiance and the albedo."""
+    """Which maps are the diffuse radiance, the irradiance and the albedo."""
 
     radiance: str
+    irradiance: str
     albedo: str
 
 
@@ -52,7 +53,7 @@ def relit(atlas: Atlas, other: Atlas, same: Correspondence, scored: Bool, maps: 
     """Predict the radiance of ``atlas`` with the albedo of ``other``."""
     theirs = same.interpolated(other.map_where_present(maps.albedo, 3))
     measured = atlas.map_where_present(maps.radiance, 3)
-    reflected = atlas.map("irradiance") * theirs / np.pi
+    reflected = atlas.map(maps.irradiance) * theirs / np.pi
     # Lamps are given: what is predicted is what they light.
     emits = atlas.map_where_present("emission", 3).any(axis=1, keepdims=True)
     return Relit(

@@ -11,7 +11,7 @@ from usdbrdf.evaluation.render_view import ViewedAsset
 from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.header import read_header
-from usdbrdf.stage.read import aov_path, open_measured, read_fit
+from usdbrdf.stage.read import open_measured, read_fit
 from usdbrdf.steps.atlas import Atlas, atlas_from_stage
 from usdbrdf.steps.lit import lit_scene
 from usdbrdf.steps.surroundings import environment_from_file
@@ -25,14 +25,9 @@ def measured_atlas(folder: Path) -> tuple[Asset, Atlas]:
     return asset, atlas_from_stage(open_measured(asset))
 
 
-def has_map(atlas: Atlas, aov: str) -> bool:
-    """Whether any object has the map."""
-    return any(aov_path(atlas.stage, obj.prim_path, aov) for obj in atlas.scene.objects)
-
-
 def map_or(atlas: Atlas, aov: str, otherwise: str) -> str:
     """The name of the first map where the asset has it, else of the second."""
-    return aov if has_map(atlas, aov) else otherwise
+    return aov if atlas.has(aov) else otherwise
 
 
 def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> ViewedAsset:

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.material.lobe_posterior import LobeEstimate, lobe_from_costs
+from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, lobe_from_costs
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 Float = npt.NDArray[np.float32]
@@ -65,32 +65,39 @@ class _Search:
 
 
 def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstimate:
-    """The lobe, and the footprint, that explain the samples best.
+    """The lobe that explains the samples best, averaged over the footprints that may be theirs.
 
-    The errors' variances are found with the first candidate. With them fixed all candidates are
-    compared, and the best one is fitted.
+    The errors' variances are found with the first candidate, and improved with the one that is best
+    with these. With them fixed all candidates are fitted and compared.
     """
     model = ViewModel(samples)
     tables = [_Table(candidate) for candidate in candidates]
-    best = 0
     for _ in range(_UPDATES):
         _improve(model, samples, tables[0])
-    if len(tables) > 1:
-        costs = [_search(model, samples.radiance, table, _LEVEL_1).least[0] for table in tables]
-        best = int(np.argmin(costs))
+    costs = [_search(model, samples.radiance, table, _LEVEL_1).least[0] for table in tables]
+    best = int(np.argmin(costs))
     if best > 0:
         for _ in range(_MORE):
             _improve(model, samples, tables[best])
-    coarse = _search(model, samples.radiance, tables[best], _LEVEL_1)
-    fine = _search(model, samples.radiance, tables[best], _with_level_2(coarse.least[1]))
-    whole = model.reduced(samples.radiance)
+    estimates = [
+        _estimate(model, samples.radiance, table, candidate.blur)
+        for table, candidate in zip(tables, candidates, strict=True)
+    ]
+    return averaged(estimates, model.degrees_of_freedom)
+
+
+def _estimate(model: ViewModel, radiance: Float, table: _Table, blur: float) -> LobeEstimate:
+    """One candidate's lobe, with the variances as they are."""
+    coarse = _search(model, radiance, table, _LEVEL_1)
+    fine = _search(model, radiance, table, _with_level_2(coarse.least[1]))
+    whole = model.reduced(radiance)
     return lobe_from_costs(
         np.array(fine.phis),
         fine.terms,
         model.product(whole, whole),
-        _cost_with_noise(model, samples.radiance, tables[best], fine),
+        _cost_with_noise(model, radiance, table, fine),
         model.degrees_of_freedom,
-        candidates[best].blur,
+        blur,
     )
 
 
@@ -109,12 +116,14 @@ def _improve(model: ViewModel, samples: ViewSamples, table: _Table) -> None:
 
 
 def _search(model: ViewModel, radiance: Float, table: _Table, phis: Sequence[float]) -> _Search:
+    bases = [basis for phi in phis for basis in table.at(phi)]
+    rest = model.all_reduced([radiance - base for base, _ in bases])
+    slopes = model.all_reduced([slope for _, slope in bases])
     terms = np.zeros((len(phis), 3))
-    for k, phi in enumerate(phis):
-        rest = [model.reduced(radiance - base) for base, _ in table.at(phi)]
-        slopes = [model.reduced(slope) for _, slope in table.at(phi)]
-        crossed = model.product(slopes[0], rest[1]) + model.product(slopes[1], rest[0])
-        terms[k] = model.product(*rest), crossed / 2, model.product(*slopes)
+    for k in range(len(phis)):
+        pair, slope = rest[2 * k : 2 * k + 2], slopes[2 * k : 2 * k + 2]
+        crossed = model.product(slope[0], pair[1]) + model.product(slope[1], pair[0])
+        terms[k] = model.product(*pair), crossed / 2, model.product(*slope)
     return _Search(phis=phis, terms=terms)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,11 @@ _PSI_GRID = np.linspace(0, 1, 201)
 # on captures with known materials, errors of the model explained 0.2 to 3 % of the cost of objects
 # that show no lobe.
 _MODEL_DISCREPANCY = 0.01
+# The same between fits with different footprints, which have their errors in common.
+_FOOTPRINT_DISCREPANCY = 0.0025
+# How much pictures are smoothed is known badly: a footprint this many times as wide may be the true
+# one, and what it would add to phi is left open.
+_BADLY_KNOWN = 1.5
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 
@@ -63,8 +69,7 @@ def lobe_from_costs(
     phi_error = _deviation(density.sum(axis=1), phis, phi)
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
-    # How much pictures are smoothed is known badly: what twice the footprint would add to phi.
-    footprint = math.hypot(phi, 2 * blur) - phi
+    footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
     return LobeEstimate(
         phi=phi,
         psi=best_psi,
@@ -73,6 +78,33 @@ def lobe_from_costs(
         unresolved=footprint,
         cost=least / max(freedom, 1),
         evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
+    )
+
+
+def averaged(estimates: Sequence[LobeEstimate], freedom: int) -> LobeEstimate:
+    """Estimates of one lobe from different models, weighted by how likely these are; cost and
+    evidence are the best one's."""
+    costs = np.array([estimate.cost * max(freedom, 1) for estimate in estimates])
+    least = float(costs.min())
+    weight = np.exp(-0.5 * (costs - least) / max(1.0, _FOOTPRINT_DISCREPANCY * least))
+    weight /= weight.sum()
+
+    def mean(name: str) -> tuple[float, Double]:
+        values = np.array([getattr(estimate, name) for estimate in estimates])
+        return float(weight @ values), values
+
+    errors = {}
+    for name in ("phi", "psi"):
+        middle, values = mean(name)
+        within = mean(f"{name}_error")[1]
+        error = math.sqrt(float(weight @ (within**2 + (values - middle) ** 2)))
+        errors[f"{name}_error"] = min(error, float(NOTHING_KNOWN))
+    return replace(
+        estimates[int(costs.argmin())],
+        phi=mean("phi")[0],
+        psi=mean("psi")[0],
+        unresolved=mean("unresolved")[0],
+        **errors,
     )
 
 

@@ -20,7 +20,7 @@ from usdbrdf.material.lobe_kernels import SampleArrays, draw_directions, integra
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.lights import Lights
-from usdbrdf.shading.warps import patch_shifts, sobol_points
+from usdbrdf.shading.warps import patch_shifts, shifts_of, sobol_points
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -92,9 +92,7 @@ def trace_lobe_samples(
     total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
     origin = lift_from_surface(points.position, points.normal, scene_size)
     sequence = sobol_points(int(np.ceil(np.log2(total))), 2)
-    shift = patch_shifts(count, 3, seed, first)
-    if stream is not None:
-        shift = shift[stream]
+    shift = patch_shifts(count, 3, seed, first) if stream is None else shifts_of(stream, 3, seed)
     directions = np.zeros((count * total, 3), np.float32)
     chosen = np.full((count, total), -1, np.int32)
     counts = mixture.per_lobe, mixture.lights

@@ -21,13 +21,19 @@ _RAYS_AT_ONCE = 1 << 20
 
 
 def non_diffuse_radiance(
-    lit: LitScene, points: SurfacePoints, phi: Float, psi: Float, rays: int, seed: int
+    lit: LitScene,
+    points: SurfacePoints,
+    phi: Float,
+    psi: Float,
+    rays: int,
+    seed: int,
+    stream: Long | None = None,
 ) -> Float:
     """I_nd (R, 3) at surface points with lobes phi, psi (R,), from ``rays`` rays each.
 
     Of the rays, 5/8 follow the point's own lobe and the rest go to the lights, both weighted by the
     balance heuristic. All ``points`` must lie on the surface. Every point draws its own random
-    numbers, from ``seed`` and its place in the array.
+    numbers, from ``seed`` and its number in ``stream`` (R,), else its place in the array.
     """
     mixture = Mixture(per_lobe=rays - 3 * rays // 8, lights=3 * rays // 8, cosine=0)
     alphas = np.maximum(phi, MIN_ALPHA).astype(np.float64)[:, None]
@@ -37,7 +43,7 @@ def non_diffuse_radiance(
         part = np.arange(start, min(start + step, len(phi)))
         samples = trace_lobe_samples(
             lit.rays, points.take(part), lit.radiance, lit.lights, lit.environment, mixture,
-            lit.size, seed, first=start, alphas=alphas[part],
+            lit.size, seed, None if stream is None else stream[part], alphas[part], start,
         )  # fmt: skip
         base, slope = non_diffuse(samples, phi[part].astype(np.float32))
         result[part] = base + psi[part, None] * slope

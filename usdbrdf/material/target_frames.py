@@ -22,8 +22,8 @@ Bool = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class SurfacePoints:
-    """What R camera rays see: face (R,) int32 (-1: nothing), position, shading normal turned to
-    the camera, and direction to the camera, each (R, 3) float32, the latter two unit."""
+    """What R rays meet: face (R,) int32 (-1: nothing), position, shading normal turned to where the
+    ray came from (a camera), and direction there, each (R, 3) float32, the latter two unit."""
 
     face: Int
     u: Float
@@ -58,7 +58,13 @@ def visible_points(
     rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
 ) -> SurfacePoints:
     """The surface under pixel coordinates (R, 2)."""
-    origins, directions = camera_rays(world_from_camera, intrinsics, pixels)
+    return points_of_rays(rays, scene, *camera_rays(world_from_camera, intrinsics, pixels))
+
+
+def points_of_rays(
+    rays: RayScene, scene: Scene, origins: Float, directions: Float
+) -> SurfacePoints:
+    """The surface that rays (R, 3) meet first, seen from where they come."""
     hits = rays.closest(origins, directions)
     face = np.maximum(hits.face, 0)
     weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)

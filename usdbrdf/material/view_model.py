@@ -19,6 +19,7 @@ outliers lose weight as under Student's t distribution.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,19 +58,12 @@ class ViewSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced:
-    """(P, 3) values freed of the texels' means, the same weighted, and projected on the shared
-    errors."""
+    """(P, 3) values freed of the texels' means, the same weighted, and their part along the shared
+    errors, whitened."""
 
     values: Double
     weighted: Double
     shared: Double
-
-    def __sub__(self, other: Reduced) -> Reduced:
-        return Reduced(
-            values=self.values - other.values,
-            weighted=self.weighted - other.weighted,
-            shared=self.shared - other.shared,
-        )
 
 
 class ViewModel:
@@ -100,22 +94,29 @@ class ViewModel:
 
     def reduced(self, values: npt.NDArray[np.floating]) -> Reduced:
         """Prepare (P, 3) values for ``product``."""
-        weighted = self._weigh(values)
-        mean = self._texel_means(weighted)
-        rest = values - mean[self._texel]
-        weighted = self._weigh(rest)
-        return Reduced(values=rest, weighted=weighted, shared=self._design.T @ weighted.reshape(-1))
+        return self.all_reduced([values])[0]
+
+    def all_reduced(self, many: Sequence[npt.NDArray[np.floating]]) -> list[Reduced]:
+        """The same for many at once, which is faster."""
+        means = [self._texel_means(self._weigh(values)) for values in many]
+        rest = [values - mean[self._texel] for values, mean in zip(many, means, strict=True)]
+        weighted = [self._weigh(values) for values in rest]
+        along = self._design.T @ np.stack([values.reshape(-1) for values in weighted], axis=1)
+        shared = linalg.solve_triangular(self._factor, along, trans="T", check_finite=False)
+        return [
+            Reduced(values=values, weighted=its, shared=own)
+            for values, its, own in zip(rest, weighted, shared.T, strict=True)
+        ]
 
     def product(self, a: Reduced, b: Reduced) -> float:
         """a' C^-1 b, C being the covariance of the samples with the diffuse parts left free."""
-        inside = float((a.values * b.weighted).sum())
-        return inside - float(a.shared @ linalg.cho_solve(self._factor, b.shared))
+        return float((a.values * b.weighted).sum()) - float(a.shared @ b.shared)
 
     def update(self, non_diffuse: npt.NDArray[np.floating]) -> None:
         """One step of expectation maximisation, given I_nd (P, 3) of the best lobe so far."""
         rest = self._radiance - non_diffuse
-        reduced = self.reduced(rest)
-        effect = linalg.cho_solve(self._factor, reduced.shared)
+        white = self.reduced(rest).shared
+        effect = linalg.solve_triangular(self._factor, white, check_finite=False)
         square = effect**2 + _diagonal_of_inverse(self._factor)
         self._deviation = np.array(
             [
@@ -164,7 +165,7 @@ class ViewModel:
         sums = [np.bincount(self._texel, w, self._num_texels) for w in weight.reshape(-1, 9).T]
         self._texel_covariance = np.linalg.inv(np.stack(sums, axis=-1).reshape(-1, 3, 3))
         self._design, self._first = _design(self._effects, self._level)
-        self._factor = linalg.cho_factor(self._normal_matrix(weight))
+        self._factor = linalg.cholesky(self._normal_matrix(weight), check_finite=False)
 
     def _normal_matrix(self, weight: Double) -> Double:
         """The shared errors' normal equations, texel means eliminated, with their priors."""
@@ -230,11 +231,11 @@ def _design(
     return sparse.csr_matrix((np.concatenate(values), places), shape=shape), first
 
 
-def _diagonal_of_inverse(factor: tuple[Double, bool]) -> Double:
-    """From a Cholesky factor; LAPACK itself refuses a matrix without rows."""
-    if not len(factor[0]):
+def _diagonal_of_inverse(factor: Double) -> Double:
+    """From an upper Cholesky factor; LAPACK itself refuses a matrix without rows."""
+    if not len(factor):
         return np.zeros(0)
-    diagonal: Double = np.diag(linalg.lapack.dpotri(*factor)[0])
+    diagonal: Double = np.diag(linalg.lapack.dpotri(factor)[0])
     return diagonal
 
 

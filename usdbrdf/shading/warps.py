@@ -10,6 +10,7 @@ from usdbrdf.kernel import kernel
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
+Long = npt.NDArray[np.int64]
 
 
 def sobol_points(log2_count: int, dimensions: int) -> Double:
@@ -35,15 +36,21 @@ def hashed_uniform(seed: int, index: int, draw: int) -> float:
 
 
 @kernel
-def patch_shifts(num_patches: int, dimensions: int, seed: int, first: int = 0) -> Double:
-    """The random shifts of patches ``first`` and on, (num_patches, dimensions): a patch's shift
-    depends on its number and the seed only."""
-    shifts = np.zeros((num_patches, dimensions))
-    for i in range(num_patches):
+def shifts_of(numbers: Long, dimensions: int, seed: int) -> Double:
+    """The random shifts of the patches with these ``numbers`` (N,), (N, dimensions)."""
+    shifts = np.zeros((len(numbers), dimensions))
+    for i in range(len(numbers)):
         for d in range(dimensions):
             # Other draws than a point's own ones, whose numbers are counted from 0 as well.
-            shifts[i, d] = hashed_uniform(seed, first + i, 16 + d)
+            shifts[i, d] = hashed_uniform(seed, numbers[i], 16 + d)
     return shifts
+
+
+@kernel
+def patch_shifts(num_patches: int, dimensions: int, seed: int, first: int = 0) -> Double:
+    """Those of patches ``first`` and on, (num_patches, dimensions): a patch's shift depends on its
+    number and the seed only."""
+    return shifts_of(np.arange(first, first + num_patches), dimensions, seed)
 
 
 @kernel

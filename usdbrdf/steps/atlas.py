@@ -33,6 +33,10 @@ class Atlas:
     scene: Scene
     texels: Texels
 
+    def has(self, aov: str) -> bool:
+        """Whether any object has the AOV."""
+        return any(aov_path(self.stage, obj.prim_path, aov) for obj in self.scene.objects)
+
     def map(self, aov: str) -> Float:
         """Per-texel values (T, C) float32 of an AOV that every object has."""
         own = enumerate(self.scene.objects)

@@ -7,8 +7,6 @@ tracing; the same streaming median then runs over what is left.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
@@ -21,6 +19,7 @@ from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.scan.scan import Frames
 from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, TexelMap
+from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.inpaint import inpaint
@@ -37,42 +36,46 @@ _RAYS = 16
 _QUANTILE = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lobes:
-    """phi, psi (num_objects,) float32: one lobe per object."""
-
-    phi: Float
-    psi: Float
-
-
 def refined_maps(
     run: StageRun,
     atlas: Atlas,
     lit: LitScene,
     frames: Frames,
     lobes: Lobes,
+    lightmap_filter: str,
     seed: int,
 ) -> dict[str, TexelMap]:
-    """The maps "diffuse", L_d without specular light, and "base_color", pi L_d / S of that.
+    """The maps "diffuse", L_d without specular light; "refined_irradiance", S of that and of the
+    lobes; and "base_color", pi L_d / S of these two.
 
-    Where no frame measured a texel both are filled in from its object's measured ones, as the lit
-    map is; what shines keeps the radiance with which it shines.
+    Where no frame measured a texel the base colour is filled in from its object's measured ones,
+    and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
     texels = atlas.texels
     observed = _observe(run, atlas, lit, frames, lobes, seed)
     measured = observed.quantiles.count > 0
-    median = np.maximum(psquare.quantile(observed.quantiles, _QUANTILE), 0)
     emission = atlas.map_where_present("emission", 3)
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
-    diffuse = np.where(emissive[:, None], emission, inpaint(texels, median, known))
+    diffuse = np.maximum(psquare.quantile(observed.quantiles, _QUANTILE), 0)
+    diffuse = np.where(emissive[:, None], emission, inpaint(texels, diffuse, known))
     # What clips in every frame is at least as bright as that.
     clipped = atlas.map("coverage") == CLIPPED
     diffuse = np.where(clipped, np.maximum(diffuse, atlas.map("lit")), diffuse)
     seen = atlas.map("coverage")[:, 0] != FILLED
-    base_color, _ = albedo_map(texels, diffuse, atlas.map("irradiance"), seen, emissive)
+
+    def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
+        """Base colour, and L_d with what it reflects where nobody looked."""
+        base_color, _ = albedo_map(texels, radiance, irradiance, seen, emissive)
+        filled = ~(seen | emissive)[:, None]
+        return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
+
+    _, diffuse = reflected(diffuse, atlas.map("irradiance"))
+    irradiance = refined_irradiance(run, atlas, lit, diffuse, lobes, lightmap_filter, seed)
+    base_color, diffuse = reflected(diffuse, irradiance)
     return {
         "diffuse": TexelMap(diffuse.astype(np.float32), 1.0, "W/(m^2 sr)", exact=True),
+        "refined_irradiance": TexelMap(irradiance, 1 / np.pi, "W/m^2"),
         "base_color": TexelMap(base_color, 1.0, "1"),
     }
 

@@ -44,7 +44,7 @@ def trace_irradiance(
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
     order, patch = patches_of_texels(texels)
-    tiles = list(_tiles(patch))
+    tiles = list(tiles_of_patches(patch))
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
     def tile(first: int, last: int) -> dict[str, npt.NDArray[Any]]:
@@ -66,7 +66,7 @@ def trace_irradiance(
     return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
 
 
-def _tiles(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
+def tiles_of_patches(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
     """Ranges of about _TILE texels that do not cut a patch."""
     starts = np.flatnonzero(np.diff(patch, prepend=-1))
     first = 0
