@@ -22,7 +22,7 @@ from usdbrdf.scan.adapters import Adapter
 COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 COMMANDS = (
     *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare"),
-    *("validate", "adapters", "plugin-path"),
+    *("validate", "rules", "adapters", "plugin-path"),
 )
 
 
@@ -281,6 +281,8 @@ def test_version_and_plugin_path(capsys):
     assert re.fullmatch(r"usdbrdf \S+\n", capsys.readouterr().out)
     assert main(["plugin-path"]) == 0
     assert (Path(capsys.readouterr().out.strip()) / "plugInfo.json").is_file()
+    assert main(["plugin-path", "--validators"]) == 0
+    assert (Path(capsys.readouterr().out.strip()) / "usd_plugin.py").is_file()
 
 
 def test_adapters_are_listed_one_per_line(monkeypatch, capsys):
@@ -301,14 +303,53 @@ def test_validate_prints_findings_and_exits_7(asset, capsys):
     assert main(["validate", str(asset)]) == 0
     assert capsys.readouterr().out == ""
     picture = next((asset / "textures").glob("*.lit.exr"))
-    picture.rename(picture.with_suffix(".away"))
+    away = picture.rename(asset.parent / picture.name)
     try:
         assert main(["validate", str(asset)]) == 7
     finally:
-        picture.with_suffix(".away").rename(picture)
+        away.rename(picture)
+    (line,) = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(
+        r"error: <[\w/:.]+>: @.*@ does not exist\. .* \[usdbrdf\.MissingTexture\]", line
+    )
+    assert picture.name in line
+
+
+def test_validate_with_warnings_alone_exits_0(asset, capsys):
+    orphan = asset / "textures" / "left_over.lit.exr"
+    orphan.write_bytes(b"")
+    try:
+        assert main(["validate", str(asset)]) == 0
+    finally:
+        orphan.unlink()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("warning: @")
+    assert line.endswith(f"@{orphan}@. [usdbrdf.OrphanTexture]")
+
+
+def test_validate_writes_cures_into_the_layer_that_is_named(asset, capsys):
+    edits, fixes = asset / "edits.usda", asset / "fixes.usda"
+    before = edits.read_text()
+    edits.write_text(before.replace('over "room"', 'over "room" (variants = {string look = "x"})'))
+    try:
+        assert main(["validate", str(asset), "--fix", str(fixes)]) == 7
+        assert "[usdbrdf.LookSelection]" in capsys.readouterr().out
+        assert 'string look = "shaded"' in fixes.read_text()
+        assert main(["validate", str(asset), "--fix", str(edits)]) == 2
+    finally:
+        edits.write_text(before)
+        fixes.unlink(missing_ok=True)
+
+
+def test_rules_are_listed(capsys):
+    assert main(["rules"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert any(line.endswith("does not exist. [validate.missing]") for line in lines)
-    assert all(picture.name in line and re.search(r"\[[\w:.]+\]$", line) for line in lines)
+    assert any(line.startswith("usdbrdf.LookSelection (error): ") for line in lines)
+    assert all(re.match(r"[\w.:]+( \((error|warning)\))?: .+\.$", line) for line in lines)
+    assert main(["rules", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [rule["name"] for rule in listed] == [re.split(r":? ", line)[0] for line in lines]
+    assert all(rule["advice"] for rule in listed if rule["name"].startswith("usdbrdf."))
 
 
 # Files edited by hand

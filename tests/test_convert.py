@@ -168,7 +168,8 @@ def test_all_layers_and_textures_are_there(capture, asset):
     assert asset.edits_layer.is_file()
     layers = {path.name for path in (asset.folder / "layers").iterdir()}
     assert layers == {
-        "scan.usdc", "texturing.usda", "texturing_uv.usdc", "shading.usda", "material.usda",
+        "scan.usdc", "texturing.usda", "texturing_uv.usdc", "shading.usda", "lights.usda",
+        "material.usda",
     }  # fmt: skip
     textures = {path.name for path in (asset.folder / "textures").iterdir()}
     names = [*capture.names, "hidden"]

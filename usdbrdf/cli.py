@@ -5,28 +5,34 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import NoReturn
 
 from usdbrdf import compare, evaluate, fit, ingest, options, relight, shade, texture, working_on
 from usdbrdf.command_parser import command_parser
+from usdbrdf.delivery.command_options import package_options
+from usdbrdf.delivery.package import package
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.evaluation.command_options import evaluate_options
 from usdbrdf.evaluation.compare_assets import DOCUMENT as COMPARISON
 from usdbrdf.evaluation.compare_assets import comparison_line, figures
 from usdbrdf.evaluation.evaluate_views import DOCUMENT as EVALUATION
 from usdbrdf.evaluation.report import summary_line, truth_line
+from usdbrdf.fit_options import fit_options
 from usdbrdf.job.progress import printable, say, set_quiet
 from usdbrdf.job.stage import StageResult
 from usdbrdf.relighting.command_options import relight_options
 from usdbrdf.scan.adapters import Adapter, list_adapters
 from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.schema import plugin_path
-from usdbrdf.stage.validate import validate
+from usdbrdf.stage.schema import plugin_path, validators_path
+from usdbrdf.validation.cure_layer import write_cures
+from usdbrdf.validation.validate import has_errors, listed_rules, validate
 
 Arguments = argparse.Namespace
 
@@ -117,7 +123,7 @@ def _step(name: str, chosen: Arguments) -> Callable[[Asset], StageResult]:
         return partial(texture, options=options.texture_options(chosen))
     if name == "shade":
         return partial(shade, options=options.shade_options(chosen))
-    return partial(fit, options=options.fit_options(chosen))
+    return partial(fit, options=fit_options(chosen))
 
 
 def _evaluate(chosen: Arguments) -> int:
@@ -150,16 +156,43 @@ def _relight(chosen: Arguments) -> int:
     return 0
 
 
+def _package(chosen: Arguments) -> int:
+    summary = package(chosen.asset, chosen.output, package_options(chosen))
+    if chosen.json:
+        _print(json.dumps(summary, indent=2))
+    say(f"{chosen.output}: written, {summary['bytes']:,} bytes")
+    return 0
+
+
 def _validate(chosen: Arguments) -> int:
     root = Asset.at(chosen.asset).root_layer
     if not root.is_file():
         raise InputRefused(f"{chosen.asset}: there is no asset in this folder. [asset.missing]")
     findings = validate(root)
     for finding in findings:
-        _print(printable(finding))
+        _print(printable(str(finding)))
     if not findings:
         say(f"{root}: no errors")
-    return 7 if findings else 0
+    if chosen.fix is not None:
+        cured = write_cures(Asset.at(chosen.asset), chosen.fix)
+        done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
+        say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
+    return 7 if has_errors(findings) else 0
+
+
+def _rules(chosen: Arguments) -> int:
+    rules = listed_rules()
+    if chosen.json:
+        _print(json.dumps([asdict(rule) for rule in rules], indent=2))
+        return 0
+    for rule in rules:
+        severity = f" ({rule.severity})" if rule.severity else ""
+        _print(printable(f"{rule.name}{severity}: {_first_sentence(rule.description)}"))
+    return 0
+
+
+def _first_sentence(text: str) -> str:
+    return re.split(r"(?<!\be\.g)(?<!\bi\.e)\.\s", text, maxsplit=1)[0].rstrip(".") + "."
 
 
 def _adapters(_chosen: Arguments) -> int:
@@ -176,8 +209,8 @@ def _about(adapter: Adapter) -> str:
     return " ".join(text.split())
 
 
-def _plugin_path(_chosen: Arguments) -> int:
-    _print(str(plugin_path()))
+def _plugin_path(chosen: Arguments) -> int:
+    _print(str(validators_path() if chosen.validators else plugin_path()))
     return 0
 
 
@@ -196,7 +229,9 @@ _COMMANDS = {
     "evaluate": _evaluate,
     "compare": _compare,
     "relight": _relight,
+    "package": _package,
     "validate": _validate,
+    "rules": _rules,
     "adapters": _adapters,
     "plugin-path": _plugin_path,
 }

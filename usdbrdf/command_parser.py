@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from usdbrdf import options
+from usdbrdf.delivery.command_options import add_package_options
 from usdbrdf.errors import UsageError
 from usdbrdf.evaluation.command_options import add_compare_options, add_evaluate_options
+from usdbrdf.fit_options import add_fit_options
 from usdbrdf.job.stamp import code_version
 from usdbrdf.relighting.command_options import add_relight_options
 
@@ -62,10 +64,27 @@ def command_parser() -> argparse.ArgumentParser:
     relit = command("relight", "path trace the published asset in its own or in other light")
     options.add_talk_options(relit)
     add_relight_options(relit)
-    check = command("validate", "check an asset with USD's own validators")
+    packed = command("package", "write the asset as one file: .usdz or .glb")
+    options.add_talk_options(packed)
+    add_package_options(packed)
+    check = command("validate", "check an asset by our rules and those of USD")
     check.add_argument("asset", type=Path, metavar="ASSET", help="asset folder")
+    check.add_argument(
+        "--fix",
+        type=Path,
+        metavar="LAYER",
+        help="write what can be cured beyond doubt into a new layer, such as ASSET/fixes.usda, "
+        "for you to add in front of edits.usda",
+    )
+    rules = command("rules", "list what validate looks for")
+    rules.add_argument("--json", action="store_true", help="with descriptions, as JSON")
     command("adapters", "list the capture formats that can be read")
-    command("plugin-path", "print the folder to put into PXR_PLUGINPATH_NAME")
+    plugins = command("plugin-path", "print the folder to put into PXR_PLUGINPATH_NAME")
+    plugins.add_argument(
+        "--validators",
+        action="store_true",
+        help="that of the validators instead, for applications whose Python has usdbrdf",
+    )
     return parser
 
 
@@ -94,7 +113,7 @@ def _add_step_arguments(parser: argparse.ArgumentParser, steps: list[str]) -> No
     if "shade" in steps:
         options.add_shade_options(parser)
     if "fit" in steps:
-        options.add_fit_options(parser)
+        add_fit_options(parser)
     if "shade" in steps or "fit" in steps:
         options.add_light_options(parser)
 

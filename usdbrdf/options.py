@@ -14,7 +14,6 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.shading.denoise import CHOICES
 from usdbrdf.shading.irradiance import Sampling
-from usdbrdf.steps.fit import FitOptions
 from usdbrdf.steps.shade import ShadeOptions
 from usdbrdf.steps.texture import TextureOptions
 
@@ -160,6 +159,13 @@ def add_texture_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="coarsen the default texel size so that the scene has at most N texels",
     )
+    add(
+        "--memory",
+        type=finite_number,
+        metavar="GIB",
+        help="memory for texturing, which then takes as many passes over the frames as that asks "
+        "for; default: three quarters of the machine's",
+    )
 
 
 def add_shade_options(parser: argparse.ArgumentParser) -> None:
@@ -190,26 +196,6 @@ def add_shade_options(parser: argparse.ArgumentParser) -> None:
         choices=CHOICES,
         default=known.denoise,
         help="lightmap filter for S; oidn needs usdbrdf[denoise], auto takes it where it is there",
-    )
-
-
-def add_fit_options(parser: argparse.ArgumentParser) -> None:
-    known = FitOptions()
-    add = parser.add_argument_group("fit").add_argument
-    add(
-        "--fit",
-        dest="method",
-        choices=("views", "scaled", "paper"),
-        default=known.method,
-        help="views: many views per texel, L_d free; scaled: one target frame, L_d times a free "
-        "factor; paper: one target frame, the paper's residual",
-    )
-    add(
-        "--max-pixels",
-        type=int,
-        default=known.max_pixels,
-        metavar="N",
-        help="fit to at most this many pixels of an object's target frame",
     )
 
 
@@ -250,7 +236,10 @@ def ingest_options(chosen: argparse.Namespace) -> IngestOptions:
 
 def texture_options(chosen: argparse.Namespace) -> TextureOptions:
     return TextureOptions(
-        texel_size=chosen.texel_size, quantile=chosen.quantile, max_texels=chosen.max_texels
+        texel_size=chosen.texel_size,
+        quantile=chosen.quantile,
+        max_texels=chosen.max_texels,
+        memory=chosen.memory,
     )
 
 
@@ -266,15 +255,6 @@ def shade_options(chosen: argparse.Namespace) -> ShadeOptions:
         seed=chosen.seed,
     )
     return ShadeOptions(sampling=sampling, denoise=chosen.denoise, environment=chosen.environment)
-
-
-def fit_options(chosen: argparse.Namespace) -> FitOptions:
-    return FitOptions(
-        method=chosen.method,
-        max_pixels=chosen.max_pixels,
-        environment=chosen.environment,
-        seed=chosen.seed,
-    )
 
 
 def seed_number(text: str) -> int:

@@ -9,10 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from usdbrdf.files.images import write_exr
+from usdbrdf.files.images import write_exr, write_preview_png
 from usdbrdf.scan.scan import Frames, ObjectLabel, Scan, ScanMesh
+from usdbrdf.shading.lamp_shapes import lamp_shapes
 from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.compose import open_weaker
 from usdbrdf.stage.header import Provenance, StageHeader
+from usdbrdf.stage.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.stage.material_layer import write_material_layer
 from usdbrdf.stage.records import Aov, FittedObject, ShadedObject, TexturedObject
 from usdbrdf.stage.root_layer import write_edits, write_pending_layer, write_root
@@ -128,6 +131,27 @@ class Built:
             role=role, version="0.1.0", parameters={"quantile": 0.5}, inputs={"mesh": "0" * 64}
         )
 
+    def write_lights(self):
+        """Lights for the sides of the lamp, which shines 8, 4, 2 everywhere."""
+        mesh = self.scan.mesh
+        metres = (mesh.points * self.header.meters_per_unit).astype(np.float32)
+        lamps = [
+            Lamp(
+                prim_path=item.prim_path,
+                identifier=item.identifier,
+                shapes=lamp_shapes(
+                    metres,
+                    mesh.triangles[mesh.face_object == i],
+                    np.tile(np.float32([8, 4, 2]), (np.sum(mesh.face_object == i), 1)),
+                ),
+            )
+            for i, item in enumerate(self.shaded)
+            if item.emitter
+        ]
+        common = (self.asset, self.header, self.provenance("shading"))
+        world = world_from_root(open_weaker(self.asset, "texturing"))
+        write_lights_layer(self.asset.lights_layer, *common, lamps, world)
+
     def write_layer(self, role, path=None):
         """Write (again) the layer of one stage from the kept values."""
         path = path or self.asset.layer(role)
@@ -138,6 +162,7 @@ class Built:
             write_texturing_layer(path, self.asset.uv_layer, *common, self.textured)
         elif role == "shading":
             write_shading_layer(path, *common, self.shaded)
+            self.write_lights()
         else:
             write_material_layer(path, *common, self.fitted)
 
@@ -146,6 +171,8 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
     """An asset as the pipeline leaves it after the stage ``upto``."""
     asset = Asset.at(folder)
     (folder / "layers").mkdir(parents=True)
+    (folder / "previews").mkdir()
+    write_preview_png(folder / "previews" / "lit.png", np.full((3, 4, 3), 128, np.uint8))
     header = StageHeader.of_scan(asset.name, scan)
     prims = prims or tuple(f"/{asset.name}/geo/{o.identifier}" for o in scan.objects)
     built = Built(asset, header, scan, prims)

@@ -9,12 +9,13 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 from usdbrdf.scan.scan import ObjectLabel
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.compose import open_weaker
+from usdbrdf.stage.flat_stage import flattened, stage_in_look
 from usdbrdf.stage.foreign import meshes_from_usd
 from usdbrdf.stage.frames_from_stage import frames_from_stage
 from usdbrdf.stage.naming import unique_identifiers
 from usdbrdf.stage.root_layer import write_root
 from usdbrdf.stage.scene_from_stage import scene_from_stage
-from usdbrdf.stage.validate import validate
+from usdbrdf.validation.validate import validate
 
 # Every way of binding that could win against ours, and everything stored per polygon.
 INPUT = """#usda 1.0
@@ -247,6 +248,22 @@ def test_poses_are_in_the_world_though_the_default_prim_is_moved(dressed):
 
 def test_it_validates(dressed):
     assert "\n".join(validate(dressed.asset.root_layer)) == ""
+
+
+def test_it_is_flattened_with_its_meshes_and_without_its_materials(dressed):
+    stage = stage_in_look(dressed.asset, "shaded")
+    flat = flattened(stage, dressed.asset, "shaded")
+    assert flat.GetUsedLayers(includeClipLayers=False) == [
+        flat.GetRootLayer(), flat.GetSessionLayer(),
+    ]  # fmt: skip
+    before, after = (UsdGeom.XformCache(Usd.TimeCode.EarliestTime()) for _ in range(2))
+    for prim_path in dressed.prims:
+        mesh, flat_mesh = stage.GetPrimAtPath(prim_path), flat.GetPrimAtPath(prim_path)
+        assert flat_mesh.GetAttribute("points").Get() == mesh.GetAttribute("points").Get()
+        pose = before.GetLocalToWorldTransform(mesh)
+        assert after.GetLocalToWorldTransform(flat_mesh) == pose
+    materials = {str(p.GetPath()) for p in flat.TraverseAll() if p.IsA(UsdShade.Material)}
+    assert materials == {f"/room/usdbrdf_mtl/{o.identifier}" for o in dressed.scan.objects}
 
 
 def test_a_default_prim_that_is_the_mesh_itself(tmp_path, synthetic):

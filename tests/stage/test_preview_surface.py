@@ -14,7 +14,7 @@ def test_ior(psi, ior):
 
 @pytest.mark.parametrize("psi", [0.0, 0.1, 0.5, 1.0])
 def test_ior_gives_back_the_reflectance_at_normal_incidence(psi):
-    _, ior = preview_surface_from_fit(0.5, psi)
+    ior = preview_surface_from_fit(0.5, psi).ior
     assert ((1 - ior) / (1 + ior)) ** 2 == pytest.approx(0.08 * psi)
 
 

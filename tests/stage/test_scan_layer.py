@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdMedia
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.stage.capture_camera import relative_path
@@ -190,6 +190,30 @@ def test_render_settings_show_the_capture(built):
         path.name
         for path in stage.GetPrimAtPath(product).GetRelationship("orderedVars").GetTargets()
     ]
-    assert names == ["beauty", "diffuse", "specular", "emission", "albedo"]
+    assert names == ["beauty", "diffuse", "specular", "emission", "albedo", "normal", "depth"]
+    assert settings.GetAttribute("renderingColorSpace").Get() == "lin_rec709_scene"
     (camera,) = settings.GetRelationship("camera").GetTargets()
     assert stage.GetPrimAtPath(camera) == capture_camera(stage).GetPrim()
+
+
+def test_the_photographs_are_muted_plates_of_the_camera(built):
+    stage = stage_of(built)
+    camera = capture_camera(stage).GetPrim()
+    assert "BackPlateAPI:photograph" in camera.GetMetadata("apiSchemas").GetAppliedItems()
+    plate = camera.GetAttribute("backPlate:photograph:image")
+    image = camera.GetAttribute("usdBrdf:capture:image")
+    assert plate.GetTimeSamples() == image.GetTimeSamples() == [1, 2, 3]
+    for time in (Usd.TimeCode.Default(), 1, 2, 3):
+        assert plate.Get(time) == image.Get(time)
+        assert not os.path.isabs(plate.Get(time).path)
+    assert camera.GetAttribute("backPlate:photograph:plateVisibility").Get() == "mute"
+
+
+def test_the_thumbnail_is_there(built):
+    stage = stage_of(built)
+    previews = UsdMedia.AssetPreviewsAPI(stage.GetDefaultPrim())
+    thumbnail = previews.GetDefaultThumbnails().defaultImage
+    assert thumbnail.path == "../previews/lit.png"
+    assert os.path.isfile(thumbnail.resolvedPath)
+    # What the scan layer says of the asset is not lost.
+    assert stage.GetDefaultPrim().GetAssetInfo()["name"] == "room"

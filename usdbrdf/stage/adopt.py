@@ -59,9 +59,9 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
         file = Path(os.path.normpath(path.parent / asset_path))
         return relative_path(copied.get(os.path.realpath(file), file), asset.folder)
 
-    # The tool's own texture coordinates stay where they are: they are in the stage anyway.
-    own = f"./{asset.uv_layer.name}"
-    text.subLayerPaths = [sub for sub in layer.subLayerPaths if sub != own]
+    # The tool's own sublayers stay where they are: they are in the stage anyway.
+    own = {f"./{sub.name}" for sub in (asset.uv_layer, asset.lights_layer, asset.materialx_layer)}
+    text.subLayerPaths = [sub for sub in layer.subLayerPaths if sub not in own]
     UsdUtils.ModifyAssetPaths(text, from_new_place)
     text.documentation = (
         f"Adopted from {path.absolute().relative_to(asset.folder).as_posix()}, which was edited by "

@@ -50,6 +50,16 @@ class Asset:
         """Texture coordinates: too big for text, hence a binary sublayer of texturing.usda."""
         return self.folder / "layers" / "texturing_uv.usdc"
 
+    @property
+    def lights_layer(self) -> Path:
+        """The emitters as UsdLux lights: a sublayer of shading.usda that may be muted."""
+        return self.folder / "layers" / "lights.usda"
+
+    @property
+    def materialx_layer(self) -> Path:
+        """The materials as MaterialX networks: a sublayer of material.usda, where asked for."""
+        return self.folder / "layers" / "materialx.usda"
+
     def layer(self, role: str) -> Path:
         """Path of a stage's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}

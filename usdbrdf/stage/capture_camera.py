@@ -21,6 +21,8 @@ Types = Sdf.ValueTypeNames
 APERTURE_MM = 36.0
 NEAR_M, FAR_M = 0.01, 1000.0
 
+_PLATE = "photograph"
+
 
 def author_capture_camera(
     layer: Sdf.Layer,
@@ -128,6 +130,7 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     prefix = "usdBrdf:capture"
     images = [asset_path(path, folder) for path in frames.image_paths]
     attribute(prim, f"{prefix}:image", Types.Asset, images[0], samples=_per_frame(images))
+    _author_back_plate(prim, images)
     for name, values in (
         ("exposureTime", frames.exposure_time),
         ("saturationRadiance", frames.saturation_radiance),
@@ -142,6 +145,15 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     _author_varying(prim, f"{prefix}:resolution", Types.Int2, sizes, lambda v: Gf.Vec2i(*v))
     attribute(prim, f"{prefix}:encoding", Types.Token, frames.encoding, uniform=True)
     attribute(prim, f"{prefix}:radiometric", Types.Bool, bool(frames.radiometric), uniform=True)
+
+
+def _author_back_plate(prim: Sdf.PrimSpec, images: Sequence[Sdf.AssetPath]) -> None:
+    """The photographs where applications look for plates (new in USD 26.11; older versions pass
+    over a schema that they do not know). Muted: no render may change because of them."""
+    apply_schema(prim, f"BackPlateAPI:{_PLATE}")
+    prefix = f"backPlate:{_PLATE}"
+    attribute(prim, f"{prefix}:image", Types.Asset, images[0], samples=_per_frame(images))
+    attribute(prim, f"{prefix}:plateVisibility", Types.Token, "mute")
 
 
 def _author_varying(

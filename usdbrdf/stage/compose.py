@@ -37,8 +37,9 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
     try:
         stage = Usd.Stage.Open(str(layer) if isinstance(layer, Path) else layer)
         for used in stage.GetUsedLayers():
-            # Another stage of this process may hold a layer from before it was written anew.
-            if not used.anonymous:
+            # Another stage of this process may hold a layer from before it was written anew; one
+            # that its sublayers left meanwhile is gone.
+            if not used.expired and not used.anonymous:
                 used.Reload()
         problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
     except Tf.ErrorException as error:

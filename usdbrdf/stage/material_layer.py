@@ -8,21 +8,27 @@ from pathlib import Path
 
 from pxr import Sdf
 
-from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.asset import Asset, path_in_layer
 from usdbrdf.stage.author import apply_schema, attribute, over
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
 from usdbrdf.stage.input_bindings import recorded_bindings
+from usdbrdf.stage.lights_layer import EMISSION_TEXTURE
 from usdbrdf.stage.looks import SHADED, Shown, author_look_materials, author_looks
+from usdbrdf.stage.materialx_layer import Coloured, write_materialx_layer
 from usdbrdf.stage.preview_surface import (
+    NO_LOBE,
     SURFACE,
+    PreviewLobe,
     colour_from_texture,
     lobe,
     preview_surface_from_fit,
+    scale_texture,
 )
 from usdbrdf.stage.records import FittedObject
 from usdbrdf.stage.schema import verify
 from usdbrdf.stage.scopes import Scopes
+from usdbrdf.stage.shading_layer import ALBEDO_TEXTURE
 from usdbrdf.stage.texturing_layer import aov_looks, author_aovs
 
 __all__ = ["FittedObject", "write_material_layer"]
@@ -38,17 +44,26 @@ def write_material_layer(
     header: StageHeader,
     provenance: Provenance,
     objects: Sequence[FittedObject],
+    *,
+    materialx: Path | None = None,
 ) -> None:
-    """Write material.usda to ``path``."""
+    """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
     verify()
     scopes = Scopes.of(asset)
     layer = new_layer(header, provenance)
     over(layer, scopes.root)
+    shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
+    networks = {}
     for item in objects:
+        material = scopes.path("materials", item.identifier)
         _author_facts(over(layer, item.prim_path), item)
+        shown = NO_LOBE
         if _known(item):
-            _author_lobe(layer, scopes.path("materials", item.identifier), item)
-        _author_base_color(layer, scopes.path("materials", item.identifier), item)
+            shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
+            _author_lobe(layer, material, shown)
+        texture = _author_colour(layer, material, item, shown.diffuse, shading)
+        if _known(item) and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
+            networks[material] = Coloured(shown, texture)
     looks = {
         **aov_looks(layer, scopes, objects),
         "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
@@ -56,24 +71,38 @@ def write_material_layer(
     }
     competing = recorded_bindings(asset)
     author_looks(layer, scopes, looks, selected=SHADED, competing=competing)
-    export(layer, path, folder=asset.layer("material").parent)
+    folder = asset.layer("material").parent
+    if materialx:
+        layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
+        write_materialx_layer(materialx, folder, header, provenance, networks)
+    export(layer, path, folder=folder)
 
 
-def _author_lobe(layer: Sdf.Layer, material: str, item: FittedObject) -> None:
-    lobe(layer, material, *preview_surface_from_fit(item.phi, item.psi))
+def _author_lobe(layer: Sdf.Layer, material: str, shown: PreviewLobe) -> None:
+    lobe(layer, material, shown.roughness, shown.ior)
     shader = over(layer, f"{material}/{SURFACE}")
     attribute(shader, "inputs:metallic", Types.Float, 0.0)
     attribute(shader, "inputs:useSpecularWorkflow", Types.Int, 0)
 
 
-def _author_base_color(layer: Sdf.Layer, material: str, item: FittedObject) -> None:
-    """The refined colour instead of the albedo, on what reflects."""
+def _author_colour(
+    layer: Sdf.Layer, material: str, item: FittedObject, scale: float, shading: Sdf.Layer
+) -> str:
+    """The refined colour instead of the albedo, on what reflects; without one a factor on the
+    albedo. Returns the texture's path in layers; "" where there is none, as of an emitter."""
     for aov in item.aovs:
         if aov.name == BASE_COLOR and any(item.mean_color):
             colour_from_texture(
                 layer, material, "diffuseColor", "BaseColorTexture", aov.file,
-                fallback=item.mean_color,
+                scale=scale, fallback=item.mean_color,
             )  # fmt: skip
+            return path_in_layer(aov.file)
+    albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
+    if albedo is None:
+        return ""
+    if scale != 1:
+        scale_texture(layer, material, ALBEDO_TEXTURE, scale)
+    return str(albedo.default.path)
 
 
 def _author_facts(prim: Sdf.PrimSpec, item: FittedObject) -> None:
@@ -96,6 +125,8 @@ def _author_facts(prim: Sdf.PrimSpec, item: FittedObject) -> None:
     attribute(prim, f"{prefix}:targetFrame", Types.Int, int(item.target_frame), uniform=True)
     attribute(prim, f"{prefix}:numPixels", Types.Int, int(item.num_pixels), uniform=True)
     attribute(prim, f"{prefix}:method", Types.Token, item.method, uniform=True)
+    if _known(item):
+        attribute(prim, f"{prefix}:mapping", Types.Token, item.mapping, uniform=True)
     author_aovs(prim, item.aovs)
 
 

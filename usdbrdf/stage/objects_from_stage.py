@@ -109,6 +109,7 @@ def read_fit(stage: Usd.Stage, prim_path: str) -> FittedObject | None:
         psi_error=_number(prim, "fit:psiError"),
         phi_confidence=str(_value(prim, "fit:phiConfidence") or "none"),
         psi_confidence=str(_value(prim, "fit:psiConfidence") or "none"),
+        mapping=str(_value(prim, "fit:mapping") or "measured"),
     )
 
 

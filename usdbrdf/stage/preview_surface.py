@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from pxr import Gf, Sdf
 
+from usdbrdf.material.renderer_match import measured_lobe, shown_lobe
 from usdbrdf.stage.asset import path_in_layer
 from usdbrdf.stage.author import attribute, connect, define, over
 
@@ -14,27 +16,57 @@ Types = Sdf.ValueTypeNames
 Colour = Sequence[float]
 
 SURFACE = "PreviewSurface"
+
+
+class PreviewLobe(NamedTuple):
+    """Inputs of UsdPreviewSurface, and the factor that its diffuse colour has been given."""
+
+    roughness: float
+    ior: float
+    diffuse: float
+
+
 # Without a fitted lobe there is none: index of refraction 1 reflects nothing, and shading is
 # purely diffuse. Written out, because applications differ in what they assume.
-NO_LOBE_ROUGHNESS, NO_LOBE_IOR = 1.0, 1.0
+NO_LOBE = PreviewLobe(roughness=1.0, ior=1.0, diffuse=1.0)
 
 
-def preview_surface_from_fit(phi: float, psi: float) -> tuple[float, float]:
-    """UsdPreviewSurface's (roughness, ior) for the paper's parameters.
+def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") -> PreviewLobe:
+    """UsdPreviewSurface's inputs for the paper's parameters.
 
     alpha = max(0.001, phi) and USD squares its roughness: roughness = sqrt(alpha).
-    F0 = 0.08 psi = ((ior - 1) / (ior + 1))^2: ior = (1 + sqrt(F0)) / (1 - sqrt(F0)).
+    measured  F0 = 0.08 psi
+    matched   F0 and the diffuse colour as renderers need them to show that (``renderer_match``)
+    F0 = ((ior - 1) / (ior + 1))^2: ior = (1 + sqrt(F0)) / (1 - sqrt(F0)).
     """
+    f0, diffuse = 0.08 * psi, 1.0
+    if mapping == "matched":
+        f0, diffuse = (float(value) for value in shown_lobe(phi, psi))
+    sqrt_f0 = math.sqrt(f0)
+    return PreviewLobe(math.sqrt(max(0.001, phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
+
+
+def fit_from_preview_surface(roughness: float, ior: float, mapping: str) -> PreviewLobe:
+    """The inverse, for whoever renders with the fitted lobe: the roughness, the ior that has the
+    F0 of the fit, and the factor that the diffuse colour was given.
+
+    Whatever was written over our values is understood as what renderers show of it; so an opinion
+    counts, and what nobody touched comes back as it was fitted.
+    """
+    if mapping != "matched":
+        return PreviewLobe(roughness, ior, 1.0)
+    shown = ((ior - 1) / (ior + 1)) ** 2
+    psi, diffuse = measured_lobe(roughness**2, shown)
     sqrt_f0 = math.sqrt(0.08 * psi)
-    return math.sqrt(max(0.001, phi)), (1.0 + sqrt_f0) / (1.0 - sqrt_f0)
+    return PreviewLobe(roughness, (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
 
 
 def surface(
     layer: Sdf.Layer,
     material: str,
     *,
-    roughness: float = NO_LOBE_ROUGHNESS,
-    ior: float = NO_LOBE_IOR,
+    roughness: float = NO_LOBE.roughness,
+    ior: float = NO_LOBE.ior,
 ) -> Sdf.PrimSpec:
     """A material with one UsdPreviewSurface, black until a colour is given; returns the shader.
 
@@ -96,13 +128,19 @@ def colour_from_texture(
     attribute(prim, "inputs:wrapT", Types.Token, "clamp")
     attribute(prim, "inputs:fallback", Types.Float4, Gf.Vec4f(*map(float, fallback), 1.0))
     if scale != 1.0:
-        attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(scale, scale, scale, 1.0))
+        scale_texture(layer, material, texture, scale)
     attribute(prim, "outputs:rgb", Types.Float3)
 
     shader = over(layer, f"{material}/{SURFACE}")
     source = f"{material}/{texture}.outputs:rgb"
     connected = connect(shader, f"inputs:{surface_input}", Types.Color3f, source)
     connected.ClearDefaultValue()
+
+
+def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -> None:
+    """A factor on the colour of a texture that this layer, or a weaker one, defines."""
+    prim = over(layer, f"{material}/{texture}")
+    attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(scale, scale, scale, 1.0))
 
 
 def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> None:

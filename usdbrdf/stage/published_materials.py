@@ -14,6 +14,7 @@ from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, read_exr, read_radiance
 from usdbrdf.relighting.surfaces import Float, Material, constant_map, preview_material
 from usdbrdf.stage.frames_from_stage import asset_file
+from usdbrdf.stage.preview_surface import fit_from_preview_surface
 
 # The fallbacks of UsdPreviewSurface, which also stand for a mesh without any material.
 _FALLBACKS: dict[str, tuple[float, ...]] = {
@@ -56,11 +57,31 @@ class PublishedMaterial:
         return np.asarray(moved, np.float32)
 
 
+def mappings_of_materials(stage: Usd.Stage) -> dict[str, str]:
+    """What a fit recorded of the materials that its objects are bound to (usdBrdf:fit:mapping), by
+    material path; others are not in there."""
+    found = {}
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        mapping = prim.GetAttribute("usdBrdf:fit:mapping")
+        if mapping and mapping.HasAuthoredValue():
+            bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+            if bound:
+                found[str(bound.GetPath())] = str(mapping.Get())
+    return found
+
+
 def published_material(
-    material: UsdShade.Material, time: Usd.TimeCode, warn: Callable[[str], None]
+    material: UsdShade.Material,
+    time: Usd.TimeCode,
+    warn: Callable[[str], None],
+    mapping: str = "measured",
 ) -> PublishedMaterial:
     """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks of
-    UsdPreviewSurface with the mesh's display colour."""
+    UsdPreviewSurface with the mesh's display colour.
+
+    mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
+             comes back is the lobe that was meant
+    """
     shader = _preview_surface(material)
     if shader is None:
         if material:
@@ -70,12 +91,30 @@ def published_material(
     inputs = {name: reader.read(shader.GetInput(name), value) for name, value in _FALLBACKS.items()}
     if inputs.pop("opacity").min() < 1:
         warn(f"<{material.GetPath()}>: opacity is not rendered; the surface is taken as opaque.")
+    if mapping == "matched":
+        inputs |= _as_fitted(inputs)
     return PublishedMaterial(
         material=replace(_material_of(inputs), wrap=reader.wrap or "clamp"),
         uv_primvar=reader.uv_primvar,
         colour_primvar=reader.colour_primvar,
         uv_from_st=reader.uv_from_st,
     )
+
+
+def _as_fitted(inputs: dict[str, Float]) -> dict[str, Float]:
+    """ior and diffuse colour of the fitted lobe that is shown by what the surface is told.
+
+    A map of roughness counts by its mean. Metals and the specular workflow are never ours: those
+    stay as they are.
+    """
+    if inputs["metallic"].any() or inputs["useSpecularWorkflow"].any():
+        return {}
+    roughness, ior = float(inputs["roughness"].mean()), float(inputs["ior"].flat[0])
+    fitted = fit_from_preview_surface(roughness, ior, "matched")
+    return {
+        "ior": np.array([[[fitted.ior]]]),
+        "diffuseColor": np.asarray(inputs["diffuseColor"] / fitted.diffuse, np.float32),
+    }
 
 
 def _material_of(inputs: dict[str, Float]) -> Material:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,11 @@ from pxr import Usd, UsdGeom, UsdShade
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.relighting.surfaces import Double, Float, Surface
-from usdbrdf.stage.published_materials import PublishedMaterial, published_material
+from usdbrdf.stage.published_materials import (
+    PublishedMaterial,
+    mappings_of_materials,
+    published_material,
+)
 from usdbrdf.stage.scene_from_stage import triangulation_of
 from usdbrdf.stage.triangulate import Triangulation
 
@@ -32,6 +36,7 @@ def published_surfaces(
     surfaces: list[Surface] = []
     transforms = UsdGeom.XformCache(time)
     left_out: set[str] = set()
+    mappings = mappings_of_materials(stage)
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.PointInstancer):
             continue
@@ -44,7 +49,7 @@ def published_surfaces(
             left_out.add(str(prim.GetTypeName()))
             continue
         world_from_local = np.array(transforms.GetLocalToWorldTransform(prim)).T
-        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, time, warn)
+        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, time, mappings, warn)
     if left_out:
         warn(
             f"{stage.GetRootLayer().identifier}: only meshes are rendered; left out: "
@@ -60,7 +65,11 @@ def metres_from_units(stage: Usd.Stage) -> Double:
 
 
 def _surfaces_of_mesh(
-    mesh: UsdGeom.Mesh, world_from_local: Double, time: Usd.TimeCode, warn: Callable[[str], None]
+    mesh: UsdGeom.Mesh,
+    world_from_local: Double,
+    time: Usd.TimeCode,
+    mappings: Mapping[str, str],
+    warn: Callable[[str], None],
 ) -> list[Surface]:
     points = np.asarray(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
     fans = triangulation_of(mesh)
@@ -76,7 +85,7 @@ def _surfaces_of_mesh(
     if normals is None:
         normals = corner_normals(np.asarray(points, np.float32), fans.triangles, _CREASE_ANGLE_DEG)
     parts = []
-    for faces, material in _faces_by_material(mesh, fans, time, warn):
+    for faces, material in _faces_by_material(mesh, fans, time, mappings, warn):
         colour = _primvar(mesh, material.colour_primvar, 3, fans, time)
         uv = _primvar(mesh, material.uv_primvar, 2, fans, time)
         if uv is None and material.uv_primvar:
@@ -108,7 +117,11 @@ def _tidy(part: Surface) -> Surface:
 
 
 def _faces_by_material(
-    mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode, warn: Callable[[str], None]
+    mesh: UsdGeom.Mesh,
+    fans: Triangulation,
+    time: Usd.TimeCode,
+    mappings: Mapping[str, str],
+    warn: Callable[[str], None],
 ) -> list[tuple[npt.NDArray[np.intp], PublishedMaterial]]:
     """Triangles of each bound material; what no subset claims has the mesh's own."""
     own = UsdShade.MaterialBindingAPI(mesh.GetPrim())
@@ -120,17 +133,21 @@ def _faces_by_material(
         rest &= ~chosen
         if chosen.any():
             bound = UsdShade.MaterialBindingAPI(subset.GetPrim())
-            found.append((np.flatnonzero(chosen), _bound(bound, time, warn)))
+            found.append((np.flatnonzero(chosen), _bound(bound, time, mappings, warn)))
     if rest.any():
-        found.append((np.flatnonzero(rest), _bound(own, time, warn)))
+        found.append((np.flatnonzero(rest), _bound(own, time, mappings, warn)))
     return found
 
 
 def _bound(
-    binding: UsdShade.MaterialBindingAPI, time: Usd.TimeCode, warn: Callable[[str], None]
+    binding: UsdShade.MaterialBindingAPI,
+    time: Usd.TimeCode,
+    mappings: Mapping[str, str],
+    warn: Callable[[str], None],
 ) -> PublishedMaterial:
     material, _ = binding.ComputeBoundMaterial()
-    return published_material(material, time, warn)
+    mapping = mappings.get(str(material.GetPath()), "measured") if material else "measured"
+    return published_material(material, time, warn, mapping)
 
 
 def _normals(mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode) -> Float | None:

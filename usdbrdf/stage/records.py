@@ -99,8 +99,9 @@ class FittedObject:
     status        "measured", "prior", "unseen" or "failed"
     target_frame  index of the photograph from 0; -1 for none
     num_pixels    how many the fit used
-    aovs          "diffuse" and "base_color", if the fit refined them
+    aovs          "diffuse", "refined_irradiance" and "base_color", if the fit refined them
     mean_color    area-weighted base colour, linear
+    mapping       "measured" or "matched": what UsdPreviewSurface is told of phi and psi
     """
 
     prim_path: str
@@ -119,3 +120,4 @@ class FittedObject:
     psi_confidence: str = "none"
     aovs: tuple[Aov, ...] = ()
     mean_color: Colour = (0.0, 0.0, 0.0)
+    mapping: str = "measured"

@@ -153,3 +153,4 @@ def _author_render_settings(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> Non
     width, height = (int(value) for value in scan.frames.resolution[0])
     attribute(settings, "resolution", Types.Int2, Gf.Vec2i(width, height), uniform=True)
     relationship(settings, "camera", scopes.path("cameras", "capture"))
+    attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)

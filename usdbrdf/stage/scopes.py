@@ -22,6 +22,7 @@ class Scopes:
     materials: str = "mtl"
     looks: str = "looks"
     cameras: str = "cameras"
+    lights: str = "lights"
     render: str = "render"
 
     @staticmethod
@@ -40,7 +41,9 @@ class Scopes:
         root = f"/{asset.name}"
         layer = asset.layer("scan")
         recorded = read_provenance(layer).get("scopes", {}) if layer.is_file() else {}
-        return Scopes(root=root, **{name: str(value) for name, value in recorded.items()})
+        # Versions that knew no lights did not look whether the input has some of that name.
+        names = {"lights": "usdbrdf_lights", **recorded} if recorded else {}
+        return Scopes(root=root, **{name: str(value) for name, value in names.items()})
 
     def names(self) -> dict[str, str]:
         """What the scan layer records."""

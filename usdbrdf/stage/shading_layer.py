@@ -13,6 +13,7 @@ from usdbrdf.stage.author import apply_schema, attribute, define, over, relation
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
 from usdbrdf.stage.input_bindings import recorded_bindings
+from usdbrdf.stage.lights_layer import EMISSION_TEXTURE
 from usdbrdf.stage.looks import SHADED, author_looks
 from usdbrdf.stage.preview_surface import colour_from_texture, surface
 from usdbrdf.stage.records import Aov, ShadedObject
@@ -25,6 +26,7 @@ __all__ = ["Aov", "ShadedObject", "write_shading_layer"]
 Types = Sdf.ValueTypeNames
 
 ALBEDO, EMISSION = "albedo", "emission"
+ALBEDO_TEXTURE = "AlbedoTexture"
 
 # What a renderer is asked for: name, type, source. Light path expressions say which paths count;
 # "raw" names a renderer's own output.
@@ -34,6 +36,8 @@ _RENDER_VARS = (
     ("specular", "color3f", "C<RG>.*", "lpe"),
     ("emission", "color3f", "C[<L.>O]", "lpe"),
     ("albedo", "color3f", "albedo", "raw"),
+    ("normal", "normal3f", "N", "raw"),
+    ("depth", "float", "depth", "raw"),
 )
 
 
@@ -44,10 +48,11 @@ def write_shading_layer(
     provenance: Provenance,
     objects: Sequence[ShadedObject],
 ) -> None:
-    """Write shading.usda to ``path``."""
+    """Write shading.usda to ``path``; its sublayer is ``write_lights_layer``'s."""
     verify()
     scopes = Scopes.of(asset)
     layer = new_layer(header, provenance)
+    layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
     over(layer, scopes.root)
     define(layer, scopes.path("materials"), "Scope")
     for item in objects:
@@ -74,9 +79,9 @@ def _author_material(layer: Sdf.Layer, scopes: Scopes, item: ShadedObject) -> No
             "usdbrdf; please report it. [stage.aov]"
         )
     # An emitter reflects nothing that could be measured; other objects may glow in places.
-    inputs = [("emissiveColor", "EmissionTexture", EMISSION, item.radiance)]
+    inputs = [("emissiveColor", EMISSION_TEXTURE, EMISSION, item.radiance)]
     if not item.emitter:
-        inputs.append(("diffuseColor", "AlbedoTexture", ALBEDO, item.mean_albedo))
+        inputs.append(("diffuseColor", ALBEDO_TEXTURE, ALBEDO, item.mean_albedo))
     for name, texture, aov, mean in inputs:
         if aov in files:
             colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)

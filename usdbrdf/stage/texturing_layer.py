@@ -29,6 +29,8 @@ __all__ = [
 
 Types = Sdf.ValueTypeNames
 
+THUMBNAIL = "previews/lit.png"  # in the asset folder
+
 
 def write_texturing_layer(
     path: Path,
@@ -51,6 +53,7 @@ def write_texturing_layer(
         for item in objects:
             author_texture_coordinates(over(coordinates, item.prim_path), item.corner_uv)
             _author_facts(over(layer, item.prim_path), item)
+    _author_thumbnail(layer.GetPrimAtPath(scopes.root))
     looks = aov_looks(layer, scopes, objects)
     author_looks(layer, scopes, looks, selected=LIT, competing=recorded_bindings(asset))
     export(coordinates, uv_path, folder=folder)
@@ -95,6 +98,14 @@ def aov_looks(
         ]
         looks[name] = author_look_materials(layer, scopes, name, maps)
     return looks
+
+
+def _author_thumbnail(root: Sdf.PrimSpec) -> None:
+    """What browsers of assets show: the picture that the texturing step writes beside the layer."""
+    apply_schema(root, "AssetPreviewsAPI")
+    picture = Sdf.AssetPath(path_in_layer(THUMBNAIL))
+    thumbnails = {"default": {"defaultImage": picture}}
+    root.SetInfo("assetInfo", {"previews": {"thumbnails": thumbnails}})
 
 
 def _author_facts(prim: Sdf.PrimSpec, item: TexturedObject) -> None:

@@ -31,7 +31,8 @@ from usdbrdf.stage.records import FittedObject
 from usdbrdf.steps.atlas import Atlas, MapWriter, atlas_from_stage
 from usdbrdf.steps.lit import lit_scene
 from usdbrdf.steps.preview import overview
-from usdbrdf.steps.refine import Lobes, refined_maps
+from usdbrdf.steps.refine import refined_maps
+from usdbrdf.steps.refined_irradiance import Lobes, filter_of
 from usdbrdf.steps.step import Step, hash_of_files, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
 from usdbrdf.steps.texture import FILLED, MEASURED
@@ -43,8 +44,8 @@ Bool = npt.NDArray[np.bool_]
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
-
 Method = Literal["views", "scaled", "paper"]
+Mapping = Literal["measured", "matched"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +53,13 @@ class FitOptions:
     """method "views": many views of the same texels, L_d free per texel, and L_d refined with what
     was found; "scaled": the target frame alone, L_d times a free factor per channel; "paper": the
     target frame, the paper's residual, its minimum always kept. max_pixels: of the target frame.
-    Without evidence the first two write the class prior."""
+    Without evidence the first two write the class prior. mapping: what UsdPreviewSurface is told of
+    phi and psi; materialx: whether MaterialX is told too."""
 
     method: Method = "views"
     max_pixels: int = 1500
+    mapping: Mapping = "matched"
+    materialx: bool = False
     environment: Path | None = None
     seed: int = 0
 
@@ -69,15 +73,21 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
     layers = weaker_layers(asset, "material")
     stage = open_weaker(asset, "material")
     frames = frames_from_stage(stage)
+    lightmap_filter = filter_of(asset)
     step = Step(
         asset=asset,
         name="fit",
         role="material",
-        parameters={key: value for key, value in asdict(options).items() if key != "environment"},
+        parameters={
+            **{key: value for key, value in asdict(options).items() if key != "environment"},
+            "denoise": lightmap_filter,
+        },
         inputs={
             **layers,
             **environment_hash(options.environment),
-            "maps": hash_of_maps(asset, "lit", "coverage", "irradiance", "emission"),
+            "maps": hash_of_maps(
+                asset, "lit", "coverage", "irradiance", "irradiance_raw", "emission"
+            ),
             "frames": hash_of_files(frames.image_paths),
         },
     )
@@ -99,13 +109,17 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":
-            objects = _refined(run, asset, atlas, lit, frames, objects, options)
+            objects = _refined(
+                run, asset, atlas, lit, frames, objects, lightmap_filter, options.seed
+            )
+        materialx = f"layers/{asset.materialx_layer.name}"
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
             asset,
             step.header,
             step.provenance,
             objects,
+            materialx=run.output(materialx) if options.materialx else None,
         )
         return {"objects": {item.identifier: _said(item) for item in objects}}
 
@@ -119,14 +133,15 @@ def _refined(
     lit: LitScene,
     frames: Frames,
     objects: list[FittedObject],
-    options: FitOptions,
+    lightmap_filter: str,
+    seed: int,
 ) -> list[FittedObject]:
-    """The objects with maps of L_d and base colour that are free of their specular light."""
+    """The objects with maps of L_d, S and base colour that are free of their specular light."""
     lobes = Lobes(
         phi=np.array([item.phi for item in objects], np.float32),
         psi=np.array([item.psi for item in objects], np.float32),
     )
-    maps = refined_maps(run, atlas, lit, frames, lobes, options.seed)
+    maps = refined_maps(run, atlas, lit, frames, lobes, lightmap_filter, seed)
     writer = MapWriter(run, asset, atlas.texels)
     refined = []
     for i, (obj, item) in enumerate(zip(atlas.scene.objects, objects, strict=True)):
@@ -279,5 +294,6 @@ def _record(
         target_frame=int(found["target"]) if math.isfinite(phi) else -1,
         num_pixels=int(found["used"]),
         method=options.method,
+        mapping=options.mapping,
         **vars(verdict),
     )

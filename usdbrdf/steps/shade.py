@@ -17,7 +17,9 @@ from usdbrdf.job.stage import StageResult, StageRun
 from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.irradiance import Irradiance, Sampling
+from usdbrdf.shading.lamp_shapes import LampShape, lamp_shapes
 from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.stage.read import frames_from_stage, open_weaker
 from usdbrdf.stage.records import Aov, ShadedObject
 from usdbrdf.stage.shading_layer import write_shading_layer
@@ -165,6 +167,22 @@ def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str
         step.provenance,
         objects,
     )
+    write_lights_layer(
+        run.output(f"layers/{step.asset.lights_layer.name}"),
+        step.asset,
+        step.header,
+        step.provenance,
+        [
+            Lamp(
+                prim_path=item.prim_path,
+                identifier=item.identifier,
+                shapes=_light_shapes(atlas, shines, i),
+            )
+            for i, item in enumerate(objects)
+            if item.emitter
+        ],
+        world_from_root(atlas.stage),
+    )
     writer.warn()
     _warn(atlas.scene.objects, shaded)
     return {
@@ -179,6 +197,22 @@ def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str
         },
         "albedo_over_one": shaded.over_one,
     }
+
+
+def _light_shapes(atlas: Atlas, shines: Float, i: int) -> tuple[LampShape, ...]:
+    """Lights in place of lamp i, if it has a shape for that. shines (T, 3): emitted radiance."""
+    own, faces = atlas.texels.of_object(i), atlas.scene.objects[i].faces
+    area = atlas.texels.area[own]
+    face = atlas.texels.face[own] - faces.start
+    triangles = atlas.scene.triangles[faces]
+    weight = np.bincount(face, area, len(triangles))
+    power = np.stack([np.bincount(face, area * c, len(triangles)) for c in shines[own].T], axis=1)
+    # Faces smaller than a texel may have none: they shine as the lamp does on the whole.
+    mean = power.sum(axis=0) / max(weight.sum(), 1e-12)
+    radiance = np.where(
+        weight[:, None] > 0, power / np.maximum(weight, 1e-12)[:, None], mean
+    ).astype(np.float32)
+    return lamp_shapes(atlas.scene.points, triangles, radiance)
 
 
 def _record(atlas: Atlas, shaded: _Shaded, i: int, aovs: tuple[Aov, ...]) -> ShadedObject:

@@ -1,0 +1,1 @@
+"""The asset as one file to hand over: USDZ, or glTF for what reads no USD."""

@@ -1,0 +1,225 @@
+"""Surfaces -> binary glTF 2.0: trimesh writes meshes and pictures, we the materials.
+
+trimesh knows no extensions, keeps colours as bytes and takes materials with equal pictures for one;
+so each material is written again, by its name, into the document that it is about to save:
+KHR_materials_ior holds the reflectance at normal incidence, KHR_materials_emissive_strength the
+radiance, 1 in the scene's unit being 1 here. The units and the diffuse term, which both models
+reduce by the Fresnel factor, are those of UsdPreviewSurface.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual.material import PBRMaterial
+
+from usdbrdf.delivery.textures import Byte, Float, encoded_colour, encoded_data, size_within
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.files.images import resized
+from usdbrdf.relighting.surfaces import Material, Surface
+
+IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
+_WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
+_LINEAR, _LINEAR_MIPMAP = 9729, 9987
+
+
+@dataclass(frozen=True, kw_only=True)
+class GltfMaterial:
+    """What glTF says of a material.
+
+    numbers   its JSON without textures
+    pictures  by trimesh's names of the textures, (H, W, 3) uint8
+    wrap      "clamp", "repeat" or "mirror"
+    """
+
+    numbers: dict[str, Any]
+    pictures: dict[str, Byte]
+    wrap: str
+
+
+def write_glb(
+    output: Path, surfaces: Sequence[Surface], max_size: int | None, warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """Write surfaces, in metres with y up, whole or not at all.
+
+    max_size  pixels of a texture's longer side; None for any
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise EnvironmentFailure(
+            ".glb needs Pillow, which is not installed. Run: pip install 'usdbrdf[render]'. "
+            "[package.pillow]"
+        ) from error
+    if not surfaces:
+        raise InputRefused(
+            "no mesh of the asset is visible. Look at what edits.usda hides. [package.empty]"
+        )
+    scene = trimesh.Scene()
+    materials: dict[str, GltfMaterial] = {}
+    for surface in surfaces:
+        name = _free_name(surface.name.rsplit("/", 1)[-1], materials)
+        materials[name] = gltf_material(surface, max_size, partial(_told, warn, surface.name))
+        pictures = {key: Image.fromarray(p) for key, p in materials[name].pictures.items()}
+        dressed = _NamedMaterial(name=name, **pictures)
+        scene.add_geometry(_mesh(surface, dressed), geom_name=name, node_name=name)
+    content = export_glb(
+        scene, include_normals=True, tree_postprocessor=partial(_finish, materials=materials)
+    )
+    with temporary_beside(output) as staged:
+        staged.write_bytes(content)
+        publish(staged, output)
+    return {"meshes": len(surfaces), "textures": sum(len(m.pictures) for m in materials.values())}
+
+
+def gltf_material(
+    surface: Surface, max_size: int | None, warn: Callable[[str], None]
+) -> GltfMaterial:
+    """The material of a surface; ``warn`` is told what glTF cannot say."""
+    material = surface.material
+    base = material.diffuse if material.base is None else material.base
+    colour = np.ones(3)
+    if surface.corner_colour is not None:
+        colour = surface.corner_colour.mean(axis=(0, 1))
+        warn("its display colours become their mean.")
+    pbr: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    pictures: dict[str, Byte] = {}
+    if base.shape[:2] == (1, 1):
+        colour = colour * base[0, 0]
+    else:
+        # glTF's factors end at 1, and so does what a surface can reflect.
+        small = np.minimum(_small(base, max_size), np.float32(1))
+        pictures["baseColorTexture"], _, _ = encoded_colour(small)
+    pbr["baseColorFactor"] = [*_numbers(np.clip(colour, 0, 1)), 1.0]
+    _add_roughness(material, max_size, pbr, pictures)
+    numbers: dict[str, Any] = {"pbrMetallicRoughness": pbr, "doubleSided": surface.two_sided}
+    numbers["extensions"] = {IOR: {"ior": _ior(material, warn)}}
+    if material.emits:
+        _add_emission(material.emission, max_size, numbers, pictures)
+    return GltfMaterial(numbers=numbers, pictures=pictures, wrap=material.wrap)
+
+
+def _add_roughness(
+    material: Material, max_size: int | None, pbr: dict[str, Any], pictures: dict[str, Byte]
+) -> None:
+    """glTF's texture: roughness in green, metalness in blue."""
+    metallic = np.zeros((1, 1, 1), np.float32) if material.metallic is None else material.metallic
+    if material.roughness.size == 1 and metallic.size == 1:
+        pbr["roughnessFactor"] = float(np.clip(material.roughness.flat[0], 0, 1))
+        pbr["metallicFactor"] = float(np.clip(metallic.flat[0], 0, 1))
+        return
+    height, width = np.maximum(material.roughness.shape[:2], metallic.shape[:2])
+    size = size_within(int(width), int(height), max_size)
+    channels = [np.ones((size[1], size[0], 1), np.float32)]
+    channels += [resized(channel, *size)[..., :1] for channel in (material.roughness, metallic)]
+    packed = np.clip(np.concatenate(channels, axis=2), 0, 1)
+    pictures["metallicRoughnessTexture"] = encoded_data(packed)[0]
+    pbr["metallicFactor"] = 1.0
+
+
+def _add_emission(
+    emission: Float, max_size: int | None, numbers: dict[str, Any], pictures: dict[str, Byte]
+) -> None:
+    """A colour of at most 1 and its strength: radiance = strength * factor * texture."""
+    if emission.shape[:2] == (1, 1):
+        strength = float(emission.max())
+        numbers["emissiveFactor"] = _numbers(emission[0, 0] / strength)
+    else:
+        small = _small(emission, max_size)
+        strength = float(small.max())
+        numbers["emissiveFactor"] = [1.0, 1.0, 1.0]
+        pictures["emissiveTexture"], _, _ = encoded_colour(small / np.float32(strength))
+    numbers["extensions"][STRENGTH] = {"emissiveStrength": strength}
+
+
+def _ior(material: Material, warn: Callable[[str], None]) -> float:
+    """F0 = ((ior - 1) / (ior + 1))^2, of what is no metal."""
+    if material.metallic is not None:
+        return 1.5
+    if np.ptp(material.f0) > 1e-4:
+        warn("its specular colour becomes one index of refraction.")
+    root = math.sqrt(min(float(material.f0.mean()), 0.99))
+    return round((1 + root) / (1 - root), 6)
+
+
+def _mesh(surface: Surface, material: PBRMaterial) -> Any:
+    """One vertex per distinct corner."""
+    uv = surface.corner_uv
+    if uv is None:
+        uv = np.zeros((*surface.triangles.shape, 2), np.float32)
+    points = surface.points[surface.triangles].astype(np.float32)
+    corners = np.concatenate([points, surface.corner_normals, uv], axis=2).reshape(-1, 8)
+    vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    return trimesh.Trimesh(
+        vertices=vertices[:, :3],
+        faces=index.reshape(-1, 3),
+        vertex_normals=vertices[:, 3:6],
+        visual=trimesh.visual.TextureVisuals(uv=vertices[:, 6:], material=material),
+        process=False,
+    )
+
+
+class _NamedMaterial(PBRMaterial):  # type: ignore[misc]
+    """Materials are the same only if their names are."""
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+
+def _finish(tree: dict[str, Any], *, materials: dict[str, GltfMaterial]) -> None:
+    """Everything of the materials but the places of their textures, and samplers."""
+    used: set[str] = set()
+    samplers: list[dict[str, int]] = []
+    for stored in tree["materials"]:
+        ours = materials[stored["name"]]
+        textures = {k: v for k, v in stored.items() if k.endswith("Texture")}
+        pbr = stored.get("pbrMetallicRoughness", {})
+        inner = {k: v for k, v in pbr.items() if k.endswith("Texture")}
+        numbers = ours.numbers
+        numbers["pbrMetallicRoughness"] = {**numbers["pbrMetallicRoughness"], **inner}
+        name = stored["name"]
+        stored.clear()
+        stored.update({"name": name, **numbers, **textures})
+        used.update(numbers["extensions"])
+        mode = _WRAP[ours.wrap]
+        sampler = {
+            "magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP, "wrapS": mode, "wrapT": mode,
+        }  # fmt: skip
+        for reference in (*textures.values(), *inner.values()):
+            if sampler not in samplers:
+                samplers.append(sampler)
+            tree["textures"][reference["index"]]["sampler"] = samplers.index(sampler)
+    if samplers:
+        tree["samplers"] = samplers
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), *used})
+
+
+def _small(image: Float, max_size: int | None) -> Float:
+    height, width = image.shape[:2]
+    size = size_within(width, height, max_size)
+    return image if size == (width, height) else resized(image, *size)
+
+
+def _free_name(name: str, taken: dict[str, GltfMaterial]) -> str:
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{name}_{number}", number + 1
+    return free
+
+
+def _told(warn: Callable[[str], None], name: str, sentence: str) -> None:
+    warn(f"<{name}>: in .glb {sentence}")
+
+
+def _numbers(values: npt.NDArray[Any]) -> list[float]:
+    return [float(value) for value in values]
