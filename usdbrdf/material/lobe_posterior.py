@@ -16,8 +16,6 @@ _PSI_GRID = np.linspace(0, 1, 201)
 # on captures with known materials, errors of the model explained 0.2 to 3 % of the cost of objects
 # that show no lobe.
 _MODEL_DISCREPANCY = 0.01
-# The same between fits with different footprints, which have their errors in common.
-_FOOTPRINT_DISCREPANCY = 0.0025
 # How much pictures are smoothed is known badly: a footprint this many times as wide may be the true
 # one, and what it would add to phi is left open.
 _BADLY_KNOWN = 1.5
@@ -86,7 +84,7 @@ def averaged(estimates: Sequence[LobeEstimate], freedom: int) -> LobeEstimate:
     evidence are the best one's."""
     costs = np.array([estimate.cost * max(freedom, 1) for estimate in estimates])
     least = float(costs.min())
-    weight = np.exp(-0.5 * (costs - least) / max(1.0, _FOOTPRINT_DISCREPANCY * least))
+    weight = np.exp(-0.5 * (costs - least) / max(1.0, _MODEL_DISCREPANCY * least))
     weight /= weight.sum()
 
     def mean(name: str) -> tuple[float, Double]:
