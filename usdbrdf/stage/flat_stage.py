@@ -52,6 +52,7 @@ def stage_in_look(asset: Asset, look: str) -> Usd.Stage:
 def flattened(stage: Usd.Stage, asset: Asset, look: str) -> Usd.Stage:
     """All that the stage composes to, as a new stage of one anonymous layer; its asset paths are
     absolute and have still to be replaced."""
+    _spread_instances(stage)
     layer = stage.Flatten(addSourceFileComment=False)
     flat = Usd.Stage.Open(layer)
     root = flat.GetDefaultPrim()
@@ -121,6 +122,14 @@ def _refuse_foreign_layers(stage: Usd.Stage, asset: Asset) -> None:
                 f"{asset.folder}: the layer {place} lies outside of the asset. Copy it into the "
                 "folder, or take it out of edits.usda. [package.outside]"
             )
+
+
+def _spread_instances(stage: Usd.Stage) -> None:
+    """Every instance becomes prims of its own, in the session layer: flattened, prototypes would
+    lie beside the default prim, and what is bound to an instance would be seen by nobody."""
+    while instances := [prim for prim in stage.TraverseAll() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
 
 
 def _keep_bound_materials(flat: Usd.Stage) -> None:
