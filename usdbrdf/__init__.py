@@ -4,6 +4,8 @@ from usdbrdf.stage.schema import register as _register
 
 _register()
 
+from usdbrdf.delivery.package import PackageOptions as PackageOptions  # noqa: E402
+from usdbrdf.delivery.package import package as package  # noqa: E402
 from usdbrdf.evaluation.compare_assets import compare as compare  # noqa: E402
 from usdbrdf.evaluation.evaluate_views import EvaluateOptions as EvaluateOptions  # noqa: E402
 from usdbrdf.evaluation.evaluate_views import evaluate as evaluate  # noqa: E402

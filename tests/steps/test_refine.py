@@ -27,7 +27,7 @@ from usdbrdf.scan.scan import Frames
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_measured, read_aovs, read_shading
-from usdbrdf.steps import refine
+from usdbrdf.steps import refine, trace
 from usdbrdf.steps.atlas import Atlas, atlas_from_stage
 from usdbrdf.steps.lit import lit_scene
 from usdbrdf.steps.refine import refined_maps
@@ -233,6 +233,62 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
     assert unseen.sum() > 50
     wanted = (atlas.map("base_color") * atlas.map("refined_irradiance") / np.pi)[unseen]
     np.testing.assert_allclose(atlas.map("diffuse")[unseen], wanted, rtol=4e-3, atol=1e-4)
+
+
+def _refined(room: Room, folder: Path) -> np.ndarray:
+    """Refined irradiance of the glossy room in its own lit texture."""
+    atlas = atlas_from_stage(open_measured(room.glossy))
+    run = StageRun(folder, "fit", folder / "work")
+    lit, diffuse = lit_scene(atlas, black_environment()), 0.8 * atlas.map("lit")
+    return refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)
+
+
+def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: Path, monkeypatch):
+    atlas = atlas_from_stage(open_measured(room.glossy))
+    frames, lit = frames_from_stage(atlas.stage), lit_scene(atlas, black_environment())
+    given = []
+
+    def spied(run, atlas, lit, diffuse, *others):
+        given.append(diffuse)
+        return refined_irradiance(run, atlas, lit, diffuse, *others)
+
+    monkeypatch.setattr(refine, "refined_irradiance", spied)
+    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", 0)
+    unseen = atlas.map("coverage")[:, 0] == 0
+    unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
+    # The base colour is filled in alike, whichever irradiance it is made with.
+    share = given[0][unseen] / found["diffuse"].values[unseen]
+    change = atlas.map("irradiance")[unseen] / found["refined_irradiance"].values[unseen]
+    assert np.median(np.abs(share / change - 1)) < 0.05
+    lit_there = atlas.map("lit")[unseen]
+    assert np.median(np.abs(given[0][unseen] / lit_there - 1)) > 0.1
+
+
+def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):
+    whole = _refined(room, tmp_path / "whole")
+    monkeypatch.setattr(trace, "_TILE", 300)
+    np.testing.assert_array_equal(_refined(room, tmp_path / "tiles"), whole)
+
+
+def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
+    """A lamp of which more is known than the lit texture shows has lit S already."""
+    by_name = Atlas.map_where_present
+
+    def brighter(atlas: Atlas, aov: str, channels: int) -> Float:
+        return by_name(atlas, aov, channels) * (2 if aov == "emission" else 1)
+
+    monkeypatch.setattr(Atlas, "map_where_present", brighter)
+    lobes = Lobes(phi=np.ones(5, np.float32), psi=np.zeros(5, np.float32))
+    atlas = atlas_from_stage(open_measured(room.glossy))
+    emission = atlas.map_where_present("emission", 3)
+    diffuse = np.where(emission > 0, emission, atlas.map("lit"))
+    run, lit = StageRun(tmp_path, "fit", tmp_path / "work"), lit_scene(atlas, black_environment())
+    found = refined_irradiance(run, atlas, lit, diffuse, lobes, "none", 0)
+    traced = atlas.map("irradiance")
+    reflects = _reflecting(room, atlas)
+    # No lobe but its grazing part, so nothing is added but a few per cent.
+    assert np.median(found[reflects] / traced[reflects]) < 1.1
 
 
 def test_the_base_colour_is_the_refined_radiance_over_the_refined_irradiance(fitted: Asset):

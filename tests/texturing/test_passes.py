@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import passes
 from usdbrdf.texturing.passes import groups_of_texels
@@ -40,9 +40,10 @@ def test_one_group_where_memory_suffices(square: World):
     assert _groups(square, 4.0) == [slice(0, 1_200_000)]
 
 
-def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World):
+def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World, monkeypatch):
+    monkeypatch.setattr(passes, "_PER_MAPPED_TEXEL", 50)
     counts = []
-    for memory in (1.0, 0.9, 0.85, 0.8, 0.78):
+    for memory in (1.0, 0.85, 0.78, 0.74, 0.722):
         groups = _groups(square, memory)
         assert groups[0].start == 0
         assert groups[-1].stop == 1_200_000
@@ -53,8 +54,23 @@ def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World)
     assert counts[-1] >= 4
 
 
+def test_the_maps_of_all_groups_must_fit_as_well(square: World, monkeypatch):
+    assert len(_groups(square, 0.9)) == 1
+    monkeypatch.setattr(passes, "_PER_MAPPED_TEXEL", 400)
+    with pytest.raises(EnvironmentFailure, match=r"need \d\.\d GiB"):
+        _groups(square, 0.9)
+
+
+def test_a_container_may_have_less_than_the_machine(tmp_path: Path, monkeypatch):
+    machine = passes._machine_gib()
+    monkeypatch.setattr(passes, "_CONTAINER", tmp_path / "memory.max")
+    for text, expected in (("max", machine), (str(1 << 29), 0.5)):
+        (tmp_path / "memory.max").write_text(text + "\n")
+        assert passes._machine_gib() == pytest.approx(expected, rel=0.5 if text == "max" else 1e-9)
+
+
 def test_too_little_memory_is_refused_with_what_is_needed(square: World):
-    with pytest.raises(InputRefused, match=r"need 0.\d GiB, the limit is 0.5.*--memory"):
+    with pytest.raises(EnvironmentFailure, match=r"need 0.\d GiB, the limit is 0.5.*--memory"):
         _groups(square, 0.5)
 
 
@@ -62,5 +78,5 @@ def test_the_machines_memory_is_the_default(square: World, monkeypatch):
     monkeypatch.setattr(passes, "_machine_gib", lambda: 1.2)
     assert _groups(square, None) == _groups(square, 0.9)
     monkeypatch.setattr(passes, "_machine_gib", lambda: 0.5)
-    with pytest.raises(InputRefused, match=r"limit is 0\.4"):
+    with pytest.raises(EnvironmentFailure, match=r"limit is 0\.4"):
         _groups(square, None)

@@ -10,7 +10,7 @@ from typing import Any
 from pxr import Usd, UsdGeom
 
 from usdbrdf.delivery.glb import write_glb
-from usdbrdf.delivery.textures import EXR, PNG, TextureOptions, add_file, add_texture
+from usdbrdf.delivery.textures import EXR, PNG, PictureOptions, add_file, add_texture
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.progress import say
@@ -75,7 +75,7 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
 
 
 def _write_usdz(
-    output: Path, flat: Usd.Stage, asset: Asset, textures: TextureOptions, options: PackageOptions
+    output: Path, flat: Usd.Stage, asset: Asset, textures: PictureOptions, options: PackageOptions
 ) -> dict[str, Any]:
     if options.profile == ARKIT:
         fit_for_arkit(flat, _warn)
@@ -94,7 +94,7 @@ def _write_usdz(
 
 
 def _write_glb(
-    output: Path, flat: Usd.Stage, asset: Asset, textures: TextureOptions
+    output: Path, flat: Usd.Stage, asset: Asset, textures: PictureOptions
 ) -> dict[str, Any]:
     texture_uses(flat, asset)  # refuses what lies outside
     take_materials_literally(flat)
@@ -104,7 +104,7 @@ def _write_glb(
     return write_glb(output, surfaces, textures.max_size, _warn)
 
 
-def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: TextureOptions) -> set[str]:
+def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: PictureOptions) -> set[str]:
     """Write each texture once, however many nodes read it in the same way; returns their paths."""
     done: dict[tuple[Any, ...], NewTexture] = {}
     for use in texture_uses(flat, asset):
@@ -116,7 +116,7 @@ def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: TextureO
     return {new.path for new in done.values()}
 
 
-def _texture_options(output: Path, folder: Path, options: PackageOptions) -> TextureOptions:
+def _texture_options(output: Path, folder: Path, options: PackageOptions) -> PictureOptions:
     """Everything that can be refused before the asset is opened."""
     suffix = output.suffix.lower()
     if suffix not in (USDZ, GLB):
@@ -139,7 +139,7 @@ def _texture_options(output: Path, folder: Path, options: PackageOptions) -> Tex
             "with -o. [package.output]"
         )
     chosen = options.textures or (PNG if eight_bit else EXR)
-    return TextureOptions(format=chosen, max_size=options.max_size)
+    return PictureOptions(format=chosen, max_size=options.max_size)
 
 
 def _warn(sentence: str) -> None:

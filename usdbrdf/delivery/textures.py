@@ -26,7 +26,7 @@ IMAGES = EIGHT_BIT | {".exr"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class TextureOptions:
+class PictureOptions:
     """format: "exr" keeps files as they are, "png" makes 8 bits of floats; max_size: of the longer
     side in pixels, None for any."""
 
@@ -35,7 +35,7 @@ class TextureOptions:
 
 
 def add_texture(
-    use: TextureUse, folder: Path, taken: Collection[str], options: TextureOptions
+    use: TextureUse, folder: Path, taken: Collection[str], options: PictureOptions
 ) -> NewTexture:
     """Write the texture of a node below ``folder``; returns where, and how to read it.
 

@@ -74,27 +74,31 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
     tables = [_Table(candidate) for candidate in candidates]
     for _ in range(_UPDATES):
         _improve(model, samples, tables[0])
-    costs = [_search(model, samples.radiance, table, _LEVEL_1).least[0] for table in tables]
-    best = int(np.argmin(costs))
+    coarse = [_search(model, samples.radiance, table, _LEVEL_1) for table in tables]
+    best = int(np.argmin([search.least[0] for search in coarse]))
     if best > 0:
         for _ in range(_MORE):
             _improve(model, samples, tables[best])
+        coarse = [_search(model, samples.radiance, table, _LEVEL_1) for table in tables]
+    whole = model.reduced(samples.radiance)
+    without = model.product(whole, whole)
     estimates = [
-        _estimate(model, samples.radiance, table, candidate.blur)
-        for table, candidate in zip(tables, candidates, strict=True)
+        _estimate(model, samples.radiance, table, _LEVEL_1[search.least[1]], without, blur)
+        for table, search, blur in zip(tables, coarse, [c.blur for c in candidates], strict=True)
     ]
     return averaged(estimates, model.degrees_of_freedom)
 
 
-def _estimate(model: ViewModel, radiance: Float, table: _Table, blur: float) -> LobeEstimate:
-    """One candidate's lobe, with the variances as they are."""
-    coarse = _search(model, radiance, table, _LEVEL_1)
-    fine = _search(model, radiance, table, _with_level_2(coarse.least[1]))
-    whole = model.reduced(radiance)
+def _estimate(
+    model: ViewModel, radiance: Float, table: _Table, near: float, without: float, blur: float
+) -> LobeEstimate:
+    """One candidate's lobe, searched closely about the roughness ``near``, with the variances as
+    they are. without: the cost without specular light."""
+    fine = _search(model, radiance, table, _with_level_2(near))
     return lobe_from_costs(
         np.array(fine.phis),
         fine.terms,
-        model.product(whole, whole),
+        without,
         _cost_with_noise(model, radiance, table, fine),
         model.degrees_of_freedom,
         blur,
@@ -136,8 +140,9 @@ def _cost_with_noise(model: ViewModel, radiance: Float, table: _Table, found: _S
     return sum(model.product(one, one) for one in rest) / len(rest)
 
 
-def _with_level_2(best: int) -> list[float]:
-    """Level 1, and more roughnesses on both sides of its ``best``."""
+def _with_level_2(near: float) -> list[float]:
+    """Level 1, and more roughnesses on both sides of ``near``, one of its own."""
+    best = _LEVEL_1.index(near)
     ends = [_LEVEL_1[k] for k in range(max(best - 1, 0), min(best + 2, len(_LEVEL_1)))]
     between = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
     return sorted({*_LEVEL_1, *(float(phi) for part in between for phi in part)})

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Tf, Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom, UsdSkel
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.job.child import run_child
 from usdbrdf.scan.scan import Double, Float, Int, ScanMesh
 from usdbrdf.stage.foreign_paths import check_asset_paths
+from usdbrdf.stage.input_geometry import is_deforming, is_moving
 from usdbrdf.stage.triangulate import Triangulation, triangulate
 
 # A stage of tens of millions of triangles opens in seconds; what takes longer hangs.
@@ -170,11 +171,33 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
             f"{path.name}: {cages} meshes are subdivision cages (what USD assumes where no scheme "
             "is set); the cage is taken as the surface. [stage.subdivision]"
         )
+    moving = [mesh for mesh in meshes if _is_moving(mesh, root)]
+    if moving:
+        warnings.append(
+            f"{path.name}: {len(moving)} meshes move or change with time, first "
+            f"<{moving[0].GetPath()}>; each is taken, and stays, as its first time sample has it. "
+            "The photographs must show that state. [stage.animated]"
+        )
+    skinned = sum(mesh.GetPrim().HasAPI(UsdSkel.BindingAPI) for mesh in meshes)
+    if skinned:
+        warnings.append(
+            f"{path.name}: {skinned} meshes may be bound to a skeleton, which is not applied: they "
+            "are taken in their rest pose. Bake the pose that the photographs show. "
+            "[stage.skinned]"
+        )
     if hidden:
         warnings.append(
             f"{path.name}: {hidden} invisible or guide prims are left out. [stage.hidden]"
         )
     return meshes, warnings
+
+
+def _is_moving(mesh: Any, root: Any) -> bool:
+    prim, chain = mesh.GetPrim(), []
+    while prim and prim.GetPath().HasPrefix(root.GetPath()):
+        chain.append(prim)
+        prim = prim.GetParent()
+    return is_deforming(mesh) or any(is_moving(prim) for prim in chain)
 
 
 def _is_visible(prim: Any) -> bool:

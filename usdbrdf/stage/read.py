@@ -10,12 +10,13 @@ from usdbrdf.stage.objects_from_stage import (
     read_shading,
     read_texturing,
 )
-from usdbrdf.stage.scene_from_stage import scene_from_stage
+from usdbrdf.stage.scene_from_stage import given_corner_uv, scene_from_stage
 
 __all__ = [
     "aov_path",
     "capture_camera",
     "frames_from_stage",
+    "given_corner_uv",
     "open_edited",
     "open_measured",
     "open_stage",

@@ -60,10 +60,11 @@ def write_scan_layer(
     _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
     if source and scan.usd_geometry:
         author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        for label, (path_of_mesh, mesh) in zip(scan.objects, meshes.items(), strict=True):
+        for i, (path_of_mesh, mesh) in enumerate(meshes.items()):
             weaken_bindings(layer, mesh, source, scopes.root)
-            author_overrides(layer, path_of_mesh, mesh)
-            author_label(over(layer, path_of_mesh), label)
+            normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
+            author_overrides(layer, path_of_mesh, mesh, normals)
+            author_label(over(layer, path_of_mesh), scan.objects[i])
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, Vt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
@@ -82,6 +82,22 @@ def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
     return np.ascontiguousarray(values[fans.corners])
 
 
+def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
+    """(T, 3, 2) texture coordinates that an input file's mesh came with, for the corners of the
+    object's triangles as ``scene_from_stage`` orders them; None where it has none to use."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    given = primvar.ComputeFlattened(_TIME) if primvar and primvar.HasAuthoredValue() else None
+    if not isinstance(given, Vt.Vec2fArray | Vt.Vec2dArray | Vt.Vec2hArray):
+        return None
+    values = np.asarray(given, np.float32)
+    element = triangulation_of(mesh).element_of_corner(primvar.GetInterpolation())
+    if element.max(initial=-1) >= len(values):
+        return None
+    uv = values[element]
+    return np.ascontiguousarray(uv[:, [0, 2, 1]] if _is_mirrored(mesh) else uv)
+
+
 def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
     """The mesh as triangles, counter-clockwise seen from outside, in its own frame."""
     holes = mesh.GetHoleIndicesAttr().Get(_TIME)
@@ -110,9 +126,8 @@ def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
     world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
     points = np.ascontiguousarray(world, np.float32)
     triangles, uv = fans.triangles, read_corner_uv(mesh, fans)
-    normals = _local_normals(mesh, fans)
-    mirrored = np.linalg.det(world_from_local[:3, :3]) < 0
-    if mirrored:
+    normals = authored_normals(mesh, fans)
+    if _is_mirrored(mesh):
         triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
         uv = None if uv is None else np.ascontiguousarray(uv[:, [0, 2, 1]])
         normals = None if normals is None else normals[:, [0, 2, 1]]
@@ -123,7 +138,11 @@ def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
     return _Mesh(points=points, triangles=triangles, corner_normals=in_world, corner_uv=uv)
 
 
-def _local_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.float64] | None:
+def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
+    return bool(np.linalg.det(np.array(mesh.ComputeLocalToWorldTransform(_TIME))[:3, :3]) < 0)
+
+
+def authored_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.float64] | None:
     """(T, 3, 3) authored normals in the mesh's frame; None where there are none to use."""
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")  # stronger than the attribute
     if primvar and primvar.HasAuthoredValue():

@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Vt
 
 from usdbrdf.stage.asset import Asset, path_in_layer
 from usdbrdf.stage.author import apply_schema, attribute, over
+from usdbrdf.stage.compose import open_weaker
 from usdbrdf.stage.export import export
 from usdbrdf.stage.header import Provenance, StageHeader, new_layer
 from usdbrdf.stage.input_bindings import recorded_bindings
@@ -29,6 +30,9 @@ __all__ = [
 
 Types = Sdf.ValueTypeNames
 
+# Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
+_PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
+
 THUMBNAIL = "previews/lit.png"  # in the asset folder
 
 
@@ -44,6 +48,7 @@ def write_texturing_layer(
     verify()
     scopes = Scopes.of(asset)
     folder = asset.layer("texturing").parent
+    measured = open_weaker(asset, "texturing")
     coordinates = new_layer(header, provenance)
     layer = new_layer(header, provenance)
     layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
@@ -51,7 +56,12 @@ def write_texturing_layer(
         over(coordinates, scopes.root)
         over(layer, scopes.root)
         for item in objects:
-            author_texture_coordinates(over(coordinates, item.prim_path), item.corner_uv)
+            declared = measured.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
+            author_texture_coordinates(
+                over(coordinates, item.prim_path),
+                item.corner_uv,
+                declared.GetTypeName() if declared else Types.TexCoord2fArray,
+            )
             _author_facts(over(layer, item.prim_path), item)
     _author_thumbnail(layer.GetPrimAtPath(scopes.root))
     looks = aov_looks(layer, scopes, objects)
@@ -60,14 +70,21 @@ def write_texturing_layer(
     export(layer, path, folder=folder)
 
 
-def author_texture_coordinates(prim: Sdf.PrimSpec, corner_uv: Float) -> None:
-    """primvars:st, one value per triangle corner; equal values are stored once and indexed."""
+def author_texture_coordinates(
+    prim: Sdf.PrimSpec, corner_uv: Float, declared: Sdf.ValueTypeName = Types.TexCoord2fArray
+) -> None:
+    """primvars:st, one value per triangle corner; equal values are stored once and indexed.
+
+    declared  the type that an input file gives its own, which ours must share: float2[] is usual
+    """
     corners = np.ascontiguousarray(corner_uv, np.float32).reshape(-1, 2)
     # Two floats as one integer: equal bits, much faster than rows.
     _, first, index = np.unique(corners.view(np.uint64), return_index=True, return_inverse=True)
-    values = Vt.Vec2fArray.FromNumpy(corners[first])
+    kind = declared if type(declared.defaultValue) in _PAIRS else Types.TexCoord2fArray
+    array = type(kind.defaultValue)
+    values = array.FromNumpy(corners[first].astype(_PAIRS[array]))
     indices = Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32))
-    attribute(prim, "primvars:st", Types.TexCoord2fArray, values, interpolation="faceVarying")
+    attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
     attribute(prim, "primvars:st:indices", Types.IntArray, indices)
 
 

@@ -24,6 +24,7 @@ from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, co
 from usdbrdf.material.verdict import verdict_on_frame, verdict_on_views
 from usdbrdf.scan.frame_reading import read_frame
 from usdbrdf.scan.scan import Frames
+from usdbrdf.shading.denoise import NONE
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.material_layer import write_material_layer
 from usdbrdf.stage.read import frames_from_stage, open_weaker
@@ -73,7 +74,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
     layers = weaker_layers(asset, "material")
     stage = open_weaker(asset, "material")
     frames = frames_from_stage(stage)
-    lightmap_filter = filter_of(asset)
+    lightmap_filter = filter_of(asset) if options.method == "views" else NONE
     step = Step(
         asset=asset,
         name="fit",

@@ -3,7 +3,7 @@
 The lit texture as a light has three faults: it holds the specular light that most views have in
 common, as if it went everywhere; it lacks the light that lobes send elsewhere; and where nobody
 looked it is as bright as the nearest surface that was seen, though such places are mostly dark.
-What their cure changes is small, so few rays do.
+What their cure changes is small against S, so few rays do.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ Float = npt.NDArray[np.float32]
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
 # the specular light, with so many again from where each of them ends.
-_DIFFUSE_RAYS = 64
-_SPECULAR_RAYS, _RAYS_OF_LOBE = 4, 8
+_DIFFUSE_RAYS = 16
+_SPECULAR_RAYS, _RAYS_OF_LOBE = 16, 4
 # Not the seed of the irradiance as traced: their errors must not add up.
 _SEED = 0x5EED
 
@@ -66,10 +66,9 @@ def refined_irradiance(
     """S (T, 3), W/m^2: as traced from the lit texture, with what changes if ``diffuse`` (T, 3) and
     the lobes are the light instead."""
     traced = atlas.map("irradiance_raw" if lightmap_filter == OIDN else "irradiance")
-    dark = atlas.map("irradiance").mean(axis=1)
     emits = (atlas.map_where_present("emission", 3) > 0).any(axis=1, keepdims=True)
     change = np.where(emits, 0, diffuse - atlas.map("lit")).astype(np.float32)
-    refined = np.maximum(traced + _change(run, atlas, lit, change, lobes, dark, seed), 0)
+    refined = np.maximum(traced + _change(run, atlas, lit, change, lobes, seed), 0)
     return denoised_irradiance(atlas.texels, refined) if lightmap_filter == OIDN else refined
 
 
@@ -79,11 +78,10 @@ def _change(
     lit: LitScene,
     radiance: Float,
     lobes: Lobes,
-    dark: Float,
     seed: int,
 ) -> Float:
     """What the change of the diffuse ``radiance`` (T, 3) and the lobes' light add to S, traced tile
-    by tile. dark (T,): about S, so that relative errors have a scale."""
+    by tile."""
     texels = atlas.texels
     texture = surface_texture(texels, lit.scene.face_object, radiance)
     lights = lights_from_radiance(lit.scene, texels, np.abs(radiance))
@@ -95,7 +93,7 @@ def _change(
         position, normal = texels.position[index], texels.normal[index]
         diffuse = irradiance_at(
             lit.rays, texture, lights, black_environment(), position, normal, patch[first:last],
-            sampling, lit.size, dark[index],
+            sampling, lit.size,
         )  # fmt: skip
         specular = specular_irradiance(
             lit, position, normal, index, lobes.phi, lobes.psi,

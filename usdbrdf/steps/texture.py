@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pxr import Usd
 
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.geometry.given_uv import atlas_side
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels, texels_from_atlas
@@ -17,7 +19,12 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageResult, StageRun
 from usdbrdf.scan.scan import Frames
 from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, open_weaker, scene_from_stage
+from usdbrdf.stage.read import (
+    frames_from_stage,
+    given_corner_uv,
+    open_weaker,
+    scene_from_stage,
+)
 from usdbrdf.stage.records import Aov, TexturedObject
 from usdbrdf.stage.texturing_layer import write_texturing_layer
 from usdbrdf.steps.atlas import MapWriter, TexelMap
@@ -82,7 +89,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         scene = scene_from_stage(stage)
         rays = RayScene(scene.points, scene.triangles)
         size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)
-        charts = run.checkpoint("charts", lambda: _charts(scene, size))
+        charts = run.checkpoint("charts", lambda: _charts(stage, scene, size))
         scene = replace(scene, corner_uv=charts["corner_uv"])
         texels = texels_from_atlas(scene, charts["resolution"])
         say(f"texture: {len(texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames")
@@ -95,8 +102,16 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
     return step.run(work)
 
 
-def _charts(scene: Scene, texel_size: float) -> dict[str, npt.NDArray[Any]]:
+def _charts(stage: Usd.Stage, scene: Scene, texel_size: float) -> dict[str, npt.NDArray[Any]]:
+    """New charts, but for objects that came with coordinates which are fit for it."""
     corner_uv, resolution = unwrap(scene, texel_size)
+    for i, obj in enumerate(scene.objects):
+        given = given_corner_uv(stage, obj.prim_path)
+        corners = scene.points[scene.triangles[obj.faces]]
+        side = None if given is None else atlas_side(given, corners, texel_size)
+        if given is not None and side is not None:
+            corner_uv[obj.faces], resolution[i] = given, side
+            say(f"texture: {obj.identifier} keeps the texture coordinates that it came with")
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 

@@ -4,14 +4,16 @@ frames. What a texel gets does not depend on its group."""
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.scan.scan import Frames
@@ -23,13 +25,16 @@ Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
 _GIB = 1 << 30
+_CONTAINER = Path("/sys/fs/cgroup/memory.max")
 # Without --memory this share of the machine's.
 _SHARE = 0.75
 # Bytes. Of a texel in the present group: its running statistics (120), and its place among the
-# blocks of texels while these are sorted out. Of every texel: its results, and what becomes of
-# them when the maps are made. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what
-# the present one sees. Of the process: interpreter, libraries and compiled code.
-_PER_GROUPED_TEXEL, _PER_TEXEL, _PER_TRIANGLE, _PER_PIXEL = 180, 100, 200, 200
+# blocks of texels while these are sorted out. Of every texel: its results, and in their place, when
+# all groups are done, what becomes of them while the maps are made. Of a triangle: Embree's tree.
+# Of a pixel: frames read ahead, and what the present one sees. Of the process: interpreter,
+# libraries and compiled code.
+_PER_GROUPED_TEXEL, _PER_RESULT, _PER_MAPPED_TEXEL = 180, 48, 200
+_PER_TRIANGLE, _PER_PIXEL = 200, 200
 _PROCESS = _GIB // 2
 # A pass costs reading all frames: groups smaller than this are not worth it.
 _SMALLEST_GROUP = 250_000
@@ -90,15 +95,17 @@ def groups_of_texels(
     """As few groups of consecutive texels as fit, with scene and texels, into ``memory`` GiB
     (None: three quarters of the machine's).
 
-    Raises InputRefused where not even the smallest groups do.
+    Raises EnvironmentFailure where not even the smallest groups do.
     """
     limit = (memory or _SHARE * _machine_gib()) * _GIB
     held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
-    held += _PER_TEXEL * len(texels) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
+    held += _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
+    mapped = held + _PER_MAPPED_TEXEL * len(texels)
+    held += _PER_RESULT * len(texels)
     smallest = min(len(texels), _SMALLEST_GROUP)
-    needed = held + _PER_GROUPED_TEXEL * smallest
+    needed = max(held + _PER_GROUPED_TEXEL * smallest, mapped)
     if needed > limit:
-        raise InputRefused(
+        raise EnvironmentFailure(
             f"{len(texels):,} texels and {len(scene.triangles):,} triangles need "
             f"{needed / _GIB:.1f} GiB, the limit is {limit / _GIB:.1f}. Allow more with --memory, "
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
@@ -114,4 +121,8 @@ def _bytes(table: Scene | Texels) -> int:
 
 
 def _machine_gib() -> float:
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / _GIB
+    """The machine's memory, or less where a container may have less."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with suppress(OSError, ValueError):  # no such file, or "max"
+        machine = min(machine, int(_CONTAINER.read_text()))
+    return machine / _GIB

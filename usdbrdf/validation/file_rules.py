@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from pxr import Sdf, Usd
+from pxr import Ar, Sdf, Usd
 
 from usdbrdf.stage.frames_from_stage import asset_file
 from usdbrdf.validation.asset_stage import AssetStage, located, record_of
@@ -85,6 +85,8 @@ def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
 
 
 def _is_there(file: Path) -> bool:
+    if Ar.IsPackageRelativePath(str(file)):
+        return bool(Ar.GetResolver().Resolve(str(file)))
     if _UDIM not in file.name or file.is_file():
         return file.is_file()
     tiles = re.compile(re.escape(file.name).replace(re.escape(_UDIM), r"\d{4}"))
