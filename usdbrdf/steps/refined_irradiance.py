@@ -33,8 +33,8 @@ Float = npt.NDArray[np.float32]
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
 # the specular light, with so many again from where each of them ends.
-_DIFFUSE_RAYS = 16
-_SPECULAR_RAYS, _RAYS_OF_LOBE = 16, 4
+_DIFFUSE_RAYS = 64
+_SPECULAR_RAYS, _RAYS_OF_LOBE = 8, 4
 # Not the seed of the irradiance as traced: their errors must not add up.
 _SEED = 0x5EED
 
