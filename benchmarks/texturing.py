@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from measure import figure
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.geometry.rays import RayScene
@@ -56,9 +57,20 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
 
-    stage = open_measured(Asset.at(options.asset))
+    results = measure(options.asset, options.frames)
+    text = json.dumps(results, indent=2)
+    print(text)
+    print(row(results))
+    if options.json:
+        options.json.write_text(text + "\n")
+    return 0
+
+
+def measure(asset: Path, most: int | None) -> dict[str, Any]:
+    """All figures, of the first ``most`` frames."""
+    stage = open_measured(Asset.at(asset))
     atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
-    count = min(options.frames or len(frames), len(frames))
+    count = min(most or len(frames), len(frames))
     rays = RayScene(atlas.scene.points, atlas.scene.triangles)
     streamed(atlas, rays, frames, Observation.empty(len(atlas.texels)), 2)  # compiles
 
@@ -68,7 +80,7 @@ def main() -> int:
     late, _ = streamed(atlas, rays, frames, observed, count)
     spent, samples = by_parts(atlas, rays, frames, count)
     exact = stored_median(samples)
-    results: dict[str, Any] = {
+    return {
         "frames": count,
         "resolution": frames.resolution[0].tolist(),
         "texels": len(atlas.texels),
@@ -88,12 +100,20 @@ def main() -> int:
             "median_abs_difference": difference(median, exact),
         },
     }
-    text = json.dumps(results, indent=2)
-    print(text)
-    print(row(results))
-    if options.json:
-        options.json.write_text(text + "\n")
-    return 0
+
+
+def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """For the table of all benchmarks."""
+    stored = results["stored"]
+    return [
+        figure("CPU per frame", 1000 * results["cpu_s_per_frame"], "ms"),
+        figure("frames per second of two cores", results["frames_per_second_of_two_cores"], ""),
+        figure("the last frames' time over the first ones'", results["late_to_early"], "x"),
+        figure("NumPy median of stored samples over ours, CPU",
+               stored["cpu_s"] / results["psquare_cpu_s"], "x"),
+        figure("bytes per texel, stored samples over ours",
+               stored["bytes_per_texel"] / results["state_bytes_per_texel"], "x"),
+    ]  # fmt: skip
 
 
 def streamed(

@@ -15,9 +15,11 @@ Both are unbiased for the piecewise bilinear L_d that they are given, but for th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +28,17 @@ from usdbrdf.geometry.rays import RayScene, lift_from_surface
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.irradiance_kernels import (
-    Draws,
-    add_cosine_rays,
-    add_light_rays,
-    cosine_rays,
-    light_rays,
+from usdbrdf.shading.irradiance_batches import (
+    DIMENSIONS,
+    add_cosine_batch,
+    add_light_batch,
+    cosine_batch,
+    frames_of,
+    light_batch,
+    mean_and_error,
+    shifts_of_points,
 )
+from usdbrdf.shading.irradiance_kernels import Draws
 from usdbrdf.shading.lights import Lights
 from usdbrdf.shading.warps import patch_shifts, sobol_points
 
@@ -43,8 +49,13 @@ Long = npt.NDArray[np.int64]
 
 _BLOCKS = 4
 _FIRST_ROUND = 64
-# Rays per call of Embree: long enough to feed all threads, short enough to stay in memory.
-_BATCH = 1 << 19
+# A point's own part of the shift: small, so that the rays of a patch stay nearly parallel. With
+# fewer rays than in a whole first round all of it is its own: errors that a patch's points share
+# show as a block then, which a filter takes for the picture.
+_OWN_SHIFT = 1 / 8
+# Points that a thread takes at a time, and rays that it makes, traces and adds up at a time: enough
+# to make the calls cheap, few enough to stay in the cache of its core.
+_POINTS, _BATCH = 1 << 10, 1 << 14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,73 +120,95 @@ def irradiance_at(
     their random shift and their stopping. scene_size: metres, for the lift off the surface.
     dark: (N,) W/m^2; where S is below it, the standard error is held against it instead of S.
     """
-    count = len(position)
-    origin = lift_from_surface(position, normal, scene_size)
-    sums = np.zeros((count, _BLOCKS, 3))
-    escaped = np.zeros(count)
-    done = np.zeros(count, np.int64)
-    active = np.arange(count)
-    floor = np.zeros(count) if dark is None else dark.astype(np.float64)
     # A point's number within its patch of at most 64: so no two points of the scene share their
     # random numbers, and a point draws the same ones whatever tile it comes in.
-    identity = 64 * patch.astype(np.int64) + active - np.searchsorted(patch, patch)
-    pairs = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
-    techniques = _Techniques(rays, radiance, lights, environment, sampling, pairs)
-    if sampling.estimator == "cosine":
-        rounds = [(0, sampling.max_rays)]
-    else:
-        ends = [0, max(1, min(_FIRST_ROUND, sampling.max_rays) // pairs)]
-        while 2 * ends[-1] * pairs <= sampling.max_rays:
-            ends.append(2 * ends[-1])
-        rounds = list(pairwise(ends))
-    for first, last in rounds:
+    identity = 64 * patch.astype(np.int64) + np.arange(len(patch)) - np.searchsorted(patch, patch)
+    floor = np.zeros(len(patch)) if dark is None else dark.astype(np.float64)
+    light = _Light(rays, radiance, lights, environment, sampling)
+
+    def traced(part: slice) -> Irradiance:
+        origin = lift_from_surface(position[part], normal[part], scene_size)
+        points = _Points(origin, normal[part], patch[part], identity[part], floor[part])
+        return _irradiance_of(points, light, sampling)
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
+        found = list(pool.map(traced, _whole_patches(patch)))
+    names = [field.name for field in fields(Irradiance)]
+    return Irradiance(**{n: np.concatenate([getattr(part, n) for part in found]) for n in names})
+
+
+def _whole_patches(patch: Int) -> list[slice]:
+    """Ranges of about _POINTS points that cut no patch."""
+    starts = np.flatnonzero(np.diff(patch, prepend=-1))
+    wanted = np.searchsorted(starts, np.arange(0, int(starts[-1]) + 1, _POINTS))
+    firsts = [int(first) for first in np.unique(starts[wanted])]
+    return [slice(first, last) for first, last in pairwise([*firsts, len(patch)])]
+
+
+class _Points(NamedTuple):
+    """Points of whole patches: origins of their rays and normals (P, 3), patches, random numbers'
+    identities and least S to hold errors against, (P,)."""
+
+    origin: Float
+    normal: Float
+    patch: Int
+    identity: Long
+    floor: Double
+
+    def of(self, which: Any) -> _Points:
+        return _Points(*(values[which] for values in self))
+
+
+def _irradiance_of(points: _Points, light: _Light, sampling: Sampling) -> Irradiance:
+    """Rounds of samples, each as many as all before, until every patch has enough."""
+    count = len(points.origin)
+    mean, error = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
+    share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
+    sums, escaped = np.zeros((2, count, _BLOCKS, 3)), np.zeros(count)
+    active: Any = slice(None)
+    for first, last in _rounds(sampling, light.techniques):
         if first:
-            sums[active, 0] = sums[active, 0] + sums[active, 1]
-            sums[active, 1] = sums[active, 2] + sums[active, 3]
-            sums[active, 2:] = 0
-        block_sums = sums[active]
-        block_escaped = escaped[active]
-        techniques.run(
-            origin[active], normal[active], patch[active], identity[active], first, last,
-            block_sums, block_escaped,
-        )  # fmt: skip
-        sums[active], escaped[active], done[active] = block_sums, block_escaped, last
-        error = _standard_error(sums[active], last)
-        error_target = sampling.standard_error
-        active = active[
-            _noisy(patch[active], sums[active], error, last, error_target, floor[active])
-        ]
-        if not len(active):
+            sums[:, :, 0] += sums[:, :, 1]
+            sums[:, :, 1] = sums[:, :, 2] + sums[:, :, 3]
+            sums[:, :, 2:] = 0
+        light.add(points, first, last, sums, escaped)
+        found, scatter = mean_and_error(sums, last)
+        mean[active], error[active], share[active] = found, scatter, escaped / last
+        done[active] = light.techniques * last
+        noisy = np.flatnonzero(
+            _noisy(points.patch, found, scatter, sampling.standard_error, points.floor)
+        )
+        if not len(noisy):
             break
-    mean = sums.sum(axis=1) / done[:, None]
-    return Irradiance(
-        mean=mean.astype(np.float32),
-        standard_error=_standard_error(sums, done[:, None]).astype(np.float32),
-        rays=(done * pairs).astype(np.int32),
-        escaped=(escaped / done).astype(np.float32),
-    )
+        if len(noisy) < len(escaped):
+            active = np.arange(count)[active][noisy]
+            points, sums, escaped = points.of(noisy), sums[:, noisy], escaped[noisy]
+    return Irradiance(mean=mean, standard_error=error, rays=done, escaped=share)
 
 
-def _standard_error(sums: Double, samples: Any) -> Double:
-    """Standard error (N, 3) of the mean of four blocks' sums (N, 4, 3) of ``samples`` in all."""
-    means = sums * (_BLOCKS / np.asarray(samples, np.float64)[..., None])
-    return np.asarray(means.std(axis=1, ddof=1) / np.sqrt(_BLOCKS))
+def _rounds(sampling: Sampling, techniques: int) -> list[tuple[int, int]]:
+    """First and last sample of each round."""
+    if sampling.estimator == "cosine":
+        return [(0, sampling.max_rays)]
+    ends = [0, max(1, min(_FIRST_ROUND, sampling.max_rays) // techniques)]
+    while 2 * ends[-1] * techniques <= sampling.max_rays:
+        ends.append(2 * ends[-1])
+    return list(pairwise(ends))
 
 
-def _noisy(
-    patch: Int, sums: Double, error: Double, samples: int, target: float, dark: Double
-) -> Any:
-    """(N,) bool: does the point's patch still miss the target relative standard error?"""
+def _noisy(patch: Int, mean: Double, error: Double, target: float, dark: Double) -> Any:
+    """(P,) bool: does the point's patch still miss the target relative standard error? mean, error
+    (P, 3)."""
     index = patch - patch[0]
     points = np.maximum(np.bincount(index), 1)
-    mean = np.bincount(index, sums.sum(axis=(1, 2)) / (3 * samples)) / points
-    square = np.bincount(index, (error**2).mean(axis=1)) / points
+    level = np.bincount(index, mean.sum(axis=1) / 3) / points
+    square = np.bincount(index, (error**2).sum(axis=1) / 3) / points
     floor = np.maximum(np.bincount(index, dark) / points, 1e-12)
-    return (np.sqrt(square) > target * np.maximum(mean, floor))[index]
+    return (np.sqrt(square) > target * np.maximum(level, floor))[index]
 
 
-class _Techniques:
-    """The two ray generators and their sums, with what they share for all points."""
+class _Light:
+    """All that brings light, and the two techniques that look for it."""
 
     def __init__(
         self,
@@ -184,64 +217,52 @@ class _Techniques:
         lights: Lights,
         environment: Environment,
         sampling: Sampling,
-        pairs: int,
     ) -> None:
+        independent = sampling.estimator == "cosine"
         self.rays = rays
-        self.radiance = radiance
-        self.lights = lights
-        self.environment = environment
-        self.sampling = sampling
-        self.use_lights = pairs == 2
-        random = sampling.estimator == "cosine"
-        log2_count = 0 if random else int(np.ceil(np.log2(max(sampling.max_rays, 2))))
-        self.points = np.zeros((0, 5)) if random else sobol_points(log2_count, 5)
+        self.radiance = radiance.arrays
+        self.environment = environment.arrays
+        self.lights = lights.arrays
+        self.seed = sampling.seed
+        self.techniques = 1 if independent or not len(lights.face) else 2
+        log2_count = int(np.ceil(np.log2(max(sampling.max_rays, 2))))
+        self.sobol = (
+            np.zeros((0, DIMENSIONS)) if independent else sobol_points(log2_count, DIMENSIONS)
+        )
+        self.own_shift = _OWN_SHIFT if sampling.max_rays >= _FIRST_ROUND else 1.0
+        # Several steps per light: picking then seldom has to look further.
+        steps = np.linspace(0, 1, 8 * len(lights.face), endpoint=False)
+        self.guide = np.searchsorted(lights.cumulative, steps, side="right").astype(np.int32)
 
-    def run(
-        self,
-        origin: Float,
-        normal: Float,
-        patch: Int,
-        identity: Long,
-        first: int,
-        last: int,
-        sums: Double,
-        escaped: Double,
-    ) -> None:
-        """Trace samples first..last of each point and add them to sums (N, 4, 3), escaped (N,)."""
-        step = max(1, _BATCH // len(origin))
-        draws = self._draws(patch, identity)
+    def add(self, points: _Points, first: int, last: int, sums: Double, escaped: Double) -> None:
+        """Trace samples first..last of each point and add them to sums (2, P, 4, 3), one for each
+        technique, and escaped (P,)."""
+        frames, draws = frames_of(points.normal), self._draws(points)
+        shifts = shifts_of_points(draws, self.own_shift)
+        step = max(1, _BATCH // len(points.origin))
         for start in range(first, last, step):
             stop = min(start + step, last)
             block = _block_of(np.arange(start, stop), first, last)
-            many = np.tile(origin, (stop - start, 1))
-            directions = cosine_rays(normal, draws, start, stop)
-            hits = self.rays.closest(many, directions)
-            add_cosine_rays(
-                self.radiance.arrays,
-                self.environment.arrays,
-                self.lights.arrays,
-                self.use_lights,
-                normal,
-                directions,
-                (hits.face, hits.u, hits.v, hits.distance),
-                block,
-                sums,
-                escaped,
-            )
-            if self.use_lights:
-                directions, distances, brought = light_rays(
-                    self.radiance.arrays, self.lights.arrays, origin, normal, draws, start, stop
-                )
-                blocked = self.rays.occluded(many, directions, distances)
-                add_light_rays(brought, blocked, block, sums)
+            origins, directions = cosine_batch(points.origin, frames, shifts, draws, start, stop)
+            hits = self.rays.closest(origins, directions)
+            add_cosine_batch(
+                self.radiance, self.environment, self.lights, self.techniques == 2, points.normal,
+                directions, (hits.face, hits.u, hits.v, hits.distance), block, sums[0], escaped,
+            )  # fmt: skip
+            if self.techniques == 2:
+                number, *segments, brought = light_batch(
+                    self.radiance, self.lights, self.guide, points.origin, points.normal, shifts,
+                    self.sobol, start, stop,
+                )  # fmt: skip
+                blocked = self.rays.occluded(*segments)
+                add_light_batch(number, brought, blocked, block, sums[1])
 
-    def _draws(self, patch: Int, identity: Long) -> Draws:
+    def _draws(self, points: _Points) -> Draws:
         """The random numbers of the points, which depend on their patches' numbers only: a tile
         draws what the whole would."""
-        low, high = int(patch.min()), int(patch.max())
-        seed = self.sampling.seed
-        shifts = patch_shifts(high - low + 1, 5, seed, low)
-        return self.points, shifts, patch - low, seed, identity
+        low, high = int(points.patch.min()), int(points.patch.max())
+        shifts = patch_shifts(high - low + 1, DIMENSIONS, self.seed, low)
+        return self.sobol, shifts, points.patch - low, self.seed, points.identity
 
 
 def _block_of(sample: Long, first: int, last: int) -> Long:

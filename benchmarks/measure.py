@@ -1,0 +1,105 @@
+"""What the speed benchmarks share: clocks, ratios measured side by side, figures, their table."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.material.lit_scene import LitScene
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.read import open_measured
+from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.steps.lit import lit_scene
+
+T = TypeVar("T")
+
+
+class Spent(NamedTuple):
+    """Seconds: of all threads of this process together, and on the clock."""
+
+    cpu: float
+    wall: float
+
+    def over(self, other: Spent) -> Spent:
+        return Spent(self.cpu / other.cpu, self.wall / other.wall)
+
+    def __truediv__(self, count: float) -> Spent:
+        return Spent(self.cpu / count, self.wall / count)
+
+    def __add__(self, other: tuple[Any, ...]) -> Spent:
+        return Spent(self.cpu + other[0], self.wall + other[1])
+
+
+def timed(work: Callable[[], T]) -> tuple[T, Spent]:
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = work()
+    return result, Spent(time.process_time() - cpu, time.perf_counter() - wall)
+
+
+def side_by_side(works: Sequence[Callable[[], Any]], repeats: int) -> list[list[Spent]]:
+    """Each work's times, taken in turns: what else the machine does then falls on all alike."""
+    times: list[list[Spent]] = [[] for _ in works]
+    for _ in range(repeats):
+        for own, work in zip(times, works, strict=True):
+            own.append(timed(work)[1])
+    return times
+
+
+def ratio(numerator: Sequence[Spent], denominator: Sequence[Spent]) -> Spent:
+    """Median of the turns' ratios."""
+    turns = [a.over(b) for a, b in zip(numerator, denominator, strict=True)]
+    return median(turns)
+
+
+def median(times: Sequence[Spent]) -> Spent:
+    return Spent(*(statistics.median(values) for values in zip(*times, strict=True)))
+
+
+def figure(what: str, value: float, unit: str, least: float = -1e99, most: float = 1e99) -> dict:
+    """One line of the table; bounds are what was asked for."""
+    asked = f">= {least:g}" if least > -1e99 else f"<= {most:g}" if most < 1e99 else ""
+    holds = least <= value <= most
+    return {"figure": what, "value": value, "unit": unit, "asked": asked, "holds": bool(holds)}
+
+
+def table(figures: Sequence[dict]) -> str:
+    lines = ["| figure | measured | asked | holds |", "| --- | --- | --- | --- |"]
+    for item in figures:
+        holds = ("yes" if item["holds"] else "no") if item["asked"] else ""
+        value = f"{item['value']:.3g} {item['unit']}".strip()
+        lines.append(f"| {item['figure']} | {value} | {item['asked']} | {holds} |")
+    return "\n".join(lines)
+
+
+class Lit(NamedTuple):
+    """An asset as shading sees it."""
+
+    atlas: Atlas
+    scene: LitScene
+
+
+def lit_asset(folder: Path) -> Lit:
+    atlas = atlas_from_stage(open_measured(Asset.at(folder)))
+    return Lit(atlas, lit_scene(atlas, black_environment()))
+
+
+class RecordedRays:
+    """A RayScene that keeps all rays that it was given: (origins, directions, None or distances)
+    of every call, in their order."""
+
+    def __init__(self, rays: RayScene) -> None:
+        self.rays = rays
+        self.calls: list[tuple[Any, Any, Any]] = []
+
+    def closest(self, origins: Any, directions: Any) -> Any:
+        self.calls.append((origins, directions, None))
+        return self.rays.closest(origins, directions)
+
+    def occluded(self, origins: Any, directions: Any, distances: Any) -> Any:
+        self.calls.append((origins, directions, distances))
+        return self.rays.occluded(origins, directions, distances)

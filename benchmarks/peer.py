@@ -1,0 +1,164 @@
+"""Against gradient-based inverse rendering with Mitsuba 3, on the same capture and cores.
+
+    export DRJIT_LIBLLVM_PATH=$(ls /usr/lib/*/libLLVM.so.19*|head -1)
+    python benchmarks/peer.py ASSET TRUTH_FOLDER [-o FOLDER] [--quick]
+
+ASSET was shaded, TRUTH_FOLDER holds its capture's true phi and psi, as `samples/study/truth` does.
+The peer optimises the same two parameters of the same lobe (usdbrdf/relighting/lobe_plugin.py, so
+nothing has to be converted) and has the same input: the frames, and the lit texture L_d as what
+every surface sends out and is lit by. Its settings:
+
+    variant     llvm_ad_rgb; integrator prb (detached sampling) with one reflection, L_d as a
+                textured area emitter on every mesh, multiple importance sampling
+    parameters  phi and psi of all objects that do not shine, together, from 0.5 each, kept within
+                [0.02, 1] and [0, 1]
+    optimiser   mi.ad.Adam, learning rate 0.03, a fifth of it from half of the most epochs on
+    step        four frames in full resolution, 16 paths per pixel, other seeds in each; relative
+                squared error without clipped pixels, lamps and the outlines of objects
+    stop        when the parameters' means over two epochs (all frames once) in turn differ by less
+                than 0.01 on average, or after 12 epochs, or at the time limit
+
+Ours is the fit step's own fit: one pass over the frames and every object. Both are read without
+class priors. Errors are means over the objects that ours calls measured, and over all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fitting import Fitted, fitted
+from measure import figure, lit_asset, table
+from peer_optimiser import Settings, optimised
+
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.evaluation.truth import known_objects
+from usdbrdf.relighting.variant import mitsuba_variant
+
+SETTINGS = Settings()
+QUICK = Settings(most_epochs=1, limit_s=60.0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("asset", type=Path)
+    parser.add_argument("truth", type=Path)
+    parser.add_argument("-o", "--output", type=Path, help="folder for JSON and plot")
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    results = measure(options.asset, options.truth, options.quick)
+    print(json.dumps(results, indent=2))
+    print(table(results["figures"]))
+    if options.output and "skipped" not in results:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / "peer.json").write_text(json.dumps(results, indent=2) + "\n")
+        plot(results, options.output)
+    return 0
+
+
+def measure(asset: Path, truth: Path, quick: bool) -> dict[str, Any]:
+    settings = QUICK if quick else SETTINGS
+    try:
+        mi = mitsuba_variant()
+    except EnvironmentFailure as error:
+        return {"skipped": str(error), "figures": []}
+    if mi.variant() != "llvm_ad_rgb":
+        reason = "no LLVM library of version 17 or newer; set DRJIT_LIBLLVM_PATH"
+        return {"skipped": reason, "figures": []}
+    lit = lit_asset(asset)
+    known = known_objects(truth, lit.atlas)
+    surveying, objects = fitted(asset)
+    ours = sum((one.spent for one in objects.values()), surveying)
+    labels = [name for name, one in objects.items() if np.isfinite(one.found["numbers"][0])]
+    measured = [name for name in labels if objects[name].record.status == "measured"]
+    found = {name: parameters(objects[name]) for name in labels}
+    steps = optimised(mi, asset, lit, labels, settings)
+
+    def errors(values: dict[str, Any], names: list[str]) -> list[float]:
+        off = [np.abs(np.subtract(values[n], (known[n]["phi"], known[n]["psi"]))) for n in names]
+        return [float(mean) for mean in np.mean(off, axis=0)]
+
+    def both(values: dict[str, Any]) -> dict[str, list[float]]:
+        return {"measured": errors(values, measured), "all": errors(values, labels)}
+
+    last = steps[-1]
+    results = {
+        "objects": len(labels),
+        "measured": measured,
+        "settings": settings._asdict(),
+        "ours": {**ours._asdict(), "errors": both(found)},
+        "peer": {
+            **last.spent._asdict(),
+            "converged": last.converged,
+            "epochs": len(steps),
+            "errors": both(last.values),
+            "course": [{**s.spent._asdict(), "errors": both(s.values)} for s in steps],
+        },
+    }
+    results["parameters"] = {
+        name: {
+            "truth": [known[name]["phi"], known[name]["psi"]],
+            "ours": [round(float(v), 3) for v in found[name]],
+            "peer": [round(float(v), 3) for v in last.values[name]],
+        }
+        for name in labels
+    }
+    results["figures"] = figures(results)
+    return results
+
+
+def parameters(one: Fitted) -> tuple[float, float]:
+    phi, psi = one.found["numbers"][:2]
+    return float(phi), float(psi)
+
+
+def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
+    ours, peer = results["ours"], results["peer"]
+    how = "converged" if peer["converged"] else "stopped at its limit"
+    rows = [
+        figure(
+            f"peer's time over ours, CPU (peer {how})", peer["cpu"] / ours["cpu"], "x", least=10
+        ),
+        figure("the same by the clock", peer["wall"] / ours["wall"], "x"),
+        figure("ours, CPU", ours["cpu"], "s"),
+        figure("peer, CPU", peer["cpu"], "s"),
+    ]
+    for which in ("measured", "all"):
+        for k, name in enumerate(("phi", "psi")):
+            mine, theirs = (side["errors"][which][k] for side in (ours, peer))
+            what = f"mean error of {name}, {which} objects"
+            rows.append(figure(f"{what}: ours", mine, "", most=round(theirs, 4)))
+            rows.append(figure(f"{what}: peer", theirs, ""))
+    return rows
+
+
+def plot(results: dict[str, Any], folder: Path) -> Path:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    ours, course = results["ours"], results["peer"]["course"]
+    drawing, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    for k, (name, colour) in enumerate((("phi", "C0"), ("psi", "C1"))):
+        errors = [step["errors"]["measured"][k] for step in course]
+        axes.plot(
+            [step["cpu"] for step in course], errors, ".-", color=colour, label=f"peer, {name}"
+        )
+        axes.plot(ours["cpu"], ours["errors"]["measured"][k], "*", ms=12, color=colour,
+                  label=f"ours, {name}")  # fmt: skip
+    axes.set(xlabel="CPU seconds", ylabel="mean error, measured objects", xscale="log")
+    axes.set_ylim(bottom=0)
+    axes.legend()
+    path = folder / "peer.png"
+    drawing.savefig(path, dpi=120)
+    pyplot.close(drawing)
+    return path
+
+
+if __name__ == "__main__":
+    sys.exit(main())

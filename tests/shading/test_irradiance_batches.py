@@ -1,0 +1,79 @@
+"""The estimator's loops do what the warps and NumPy say, whatever the sizes of their batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, box, room, world_of
+from usdbrdf.shading import irradiance
+from usdbrdf.shading.environment import black_environment
+from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.shading.irradiance_batches import _picked
+from usdbrdf.shading.warp_loops import in_triangle, on_hemisphere
+from usdbrdf.shading.warps import cosine_direction, triangle_point
+
+
+def _square(rng: np.random.Generator) -> np.ndarray:
+    """Random points, with the middle, the corners and the diagonals."""
+    special = [(0.5, 0.5), (0.0, 0.0), (1.0, 1.0), (0.25, 0.25), (0.25, 0.75), (0.5, 0.1)]
+    return np.concatenate([rng.random((4000, 2)), special])
+
+
+def test_hemisphere_is_the_warps():
+    square = _square(np.random.default_rng(1))
+    x, y = square.T.copy()
+    z = np.empty_like(x)
+    on_hemisphere(x, y, z)
+    expected = np.array([cosine_direction(*point) for point in square])
+    # z loses digits at the horizon, where it is the root of a difference.
+    np.testing.assert_allclose(np.stack([x, y], axis=1), expected[:, :2], rtol=0, atol=5e-16)
+    np.testing.assert_allclose(z**2, expected[:, 2] ** 2, rtol=0, atol=1e-15)
+
+
+def test_triangle_is_the_warps():
+    square = _square(np.random.default_rng(2))
+    u, v = square.T.copy()
+    in_triangle(u, v)
+    np.testing.assert_array_equal(np.stack([u, v], 1), [triangle_point(*p) for p in square])
+
+
+@pytest.mark.parametrize("lights", [1, 2, 37])
+def test_picking_is_a_search(lights: int):
+    rng = np.random.default_rng(3)
+    cumulative = np.cumsum(rng.random(lights) ** 8)
+    cumulative /= cumulative[-1]
+    steps = np.linspace(0, 1, 8 * lights, endpoint=False)
+    guide = np.searchsorted(cumulative, steps, side="right").astype(np.int32)
+    picks = np.concatenate([rng.random(2000), steps, cumulative[:-1], [np.nextafter(1, 0)]])
+    expected = np.minimum(np.searchsorted(cumulative, picks, side="right"), lights - 1)
+    np.testing.assert_array_equal([_picked(cumulative, guide, p) for p in picks], expected)
+
+
+@pytest.mark.parametrize("estimator", ["mis", "cosine"])
+def test_batches_and_tasks_do_not_matter(monkeypatch: pytest.MonkeyPatch, estimator: str):
+    world = world_of(room((0, 0, 0), (2, 2, 2)) + box((0.8, 0.8, 1.5), (1.2, 1.2, 1.7)))
+    lit = np.full((len(world.texels), 3), 0.1, np.float32)
+    lit[world.texels.object_index() > 5] = 8
+    assert len(world.lights(lit).face)
+    sampling = Sampling(estimator=estimator, standard_error=0.05, max_rays=256)
+
+    def found(points: int, batch: int) -> Irradiance:
+        monkeypatch.setattr(irradiance, "_POINTS", points)
+        monkeypatch.setattr(irradiance, "_BATCH", batch)
+        return _shaded(world, lit, sampling)
+
+    whole = found(1 << 20, 1 << 20)
+    parts = found(16, 100)
+    for name, values in vars(whole).items():
+        np.testing.assert_array_equal(values, getattr(parts, name), err_msg=name)
+    if estimator == "mis":
+        assert len(np.unique(whole.rays)) > 1  # some patches stopped early
+
+
+def _shaded(world: World, lit: np.ndarray, sampling: Sampling) -> Irradiance:
+    order, patch = patches_of_texels(world.texels)
+    return irradiance_at(
+        world.rays, world.texture(lit), world.lights(lit), black_environment(),
+        world.texels.position[order], world.texels.normal[order], patch, sampling, world.size,
+    )  # fmt: skip
