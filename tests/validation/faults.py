@@ -173,6 +173,17 @@ def look_that_is_not_there(built):
         layer.GetPrimAtPath("/room").variantSelections["look"] = "shadde"
 
 
+def lights_that_are_not_there(built):
+    with edited(built.asset.edits_layer) as layer:
+        layer.GetPrimAtPath("/room").variantSelections["lights"] = "usdlx"
+
+
+def lamp_that_glows_beside_its_lights(built):
+    with edited(built.asset.edits_layer) as layer:
+        layer.GetPrimAtPath("/room").variantSelections["lights"] = "usdlux"
+    opinion(built, "/room/mtl/lamp/EmissionTexture", "inputs:scale", Types.Float4, Gf.Vec4f(0.5))
+
+
 FAULTS = {
     "LayerMissing": edits_layer_deleted,
     "LayerOrder": edits_below_the_measurement,
@@ -202,4 +213,6 @@ FAULTS = {
     "BindingBesideLooks": binding_beside_the_looks,
     "LookIncomplete": look_without_an_object,
     "LookSelection": look_that_is_not_there,
+    "LightsSelection": lights_that_are_not_there,
+    "LampTwice": lamp_that_glows_beside_its_lights,
 }

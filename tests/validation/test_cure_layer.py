@@ -6,6 +6,7 @@ from pxr import Sdf, Usd
 from tests.validation.faults import FAULTS, edited
 from usdbrdf.errors import UsageError
 from usdbrdf.validation.cure_layer import write_cures
+from usdbrdf.validation.standard import open_or_finding
 from usdbrdf.validation.validate import own_findings
 
 CURABLE = ("CameraExposure", "SpecularColor", "LobeMatchesFit", "LookSelection", "EmitterAlbedo")
@@ -60,6 +61,21 @@ def test_cures_are_refused_a_place_that_is_somebodys(built, place, code):
     with pytest.raises(UsageError) as refused:
         write_cures(built.asset, built.asset.folder / place)
     assert code in str(refused.value)
+
+
+def test_a_file_that_appears_meanwhile_is_kept(built, monkeypatch):
+    FAULTS["LookMaterial"](built)
+    layer = built.asset.folder / "fixes.usda"
+
+    def open_late(root_layer):
+        layer.write_text("somebody's")
+        return open_or_finding(root_layer)
+
+    monkeypatch.setattr("usdbrdf.validation.cure_layer.open_or_finding", open_late)
+    with pytest.raises(UsageError, match=r"\[fix\.exists\]"):
+        write_cures(built.asset, layer)
+    assert layer.read_text() == "somebody's"
+    assert not list(layer.parent.glob(".tmp-*"))
 
 
 def test_the_fault_is_the_artists_to_keep(built):

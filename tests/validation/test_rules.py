@@ -5,7 +5,15 @@ from dataclasses import replace
 import pytest
 from pxr import Sdf, Usd
 
-from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
+from tests.validation.faults import (
+    ALBEDO_TEXTURE,
+    CHAIR,
+    FAULTS,
+    SURFACE,
+    Types,
+    edited,
+    opinion,
+)
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.rules import RULES
@@ -94,6 +102,65 @@ def test_a_mapping_that_is_not_known_is_not_judged_by_another(built):
     opinion(built, CHAIR, "usdBrdf:fit:mapping", Types.Token, "of tomorrow")
     opinion(built, CHAIR, "usdBrdf:fit:phi", Types.Float, 0.75)
     assert {f.rule for f in own(built)} == {"usdbrdf.AllowedTokens"}
+
+
+def test_a_lamp_counts_once_with_its_lights_alone_or_its_glow_alone(built):
+    with edited(built.asset.edits_layer) as layer:
+        layer.GetPrimAtPath("/room").variantSelections["lights"] = "usdlux"
+    assert own(built) == []
+    surface = "/room/mtl/lamp/PreviewSurface"
+    with edited(built.asset.edits_layer) as layer:
+        prim = Sdf.CreatePrimInLayer(layer, surface)
+        glow = Sdf.AttributeSpec(prim, "inputs:emissiveColor", Types.Color3f)
+        glow.default = (1, 1, 1)
+        glow.connectionPathList.ClearEditsAndMakeExplicit()
+    assert [(f.site, f.rule) for f in own(built)] == [
+        (f"<{surface}.inputs:emissiveColor>", "usdbrdf.LampTwice")
+    ]
+    with edited(built.asset.edits_layer) as layer:
+        Sdf.CreatePrimInLayer(layer, "/room/lights/lamp").SetInfo("active", False)
+    assert own(built) == []
+
+
+URIS = ("https://example.org/wood.exr", "asset:wood.exr")
+
+
+@pytest.mark.parametrize("uri", URIS)
+def test_what_a_resolver_finds_is_not_looked_for(built, uri):
+    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(uri))
+    with edited(built.asset.edits_layer) as layer:
+        layer.GetPrimAtPath("/room").customData = {"sheet": Sdf.AssetPath(uri)}
+    (finding,) = own(built)
+    assert (finding.rule, finding.severity) == ("usdbrdf.AnchoredPath", Severity.WARNING)
+    assert f"@{uri}@" in finding.message
+
+
+@pytest.mark.parametrize("metadata", ["assetInfo", "customData", "clips"])
+def test_paths_in_metadata_count(built, metadata):
+    with edited(built.asset.edits_layer) as layer:
+        value = {"one": {"manifestAssetPath": Sdf.AssetPath("./gone.usda")}}
+        layer.GetPrimAtPath("/room").SetInfo(metadata, value)
+    (finding,) = own(built)
+    assert finding.rule == "usdbrdf.MissingTexture"
+    assert "gone.usda@ does not exist" in finding.message
+    with edited(built.asset.edits_layer) as layer:
+        value = {"one": {"manifestAssetPath": Sdf.AssetPath(str(built.asset.edits_layer))}}
+        layer.GetPrimAtPath("/room").SetInfo(metadata, value)
+    assert {f.rule for f in own(built)} == {"usdbrdf.AnchoredPath"}
+
+
+def test_paths_in_layers_of_the_folder_that_are_referenced_count(built):
+    prop = Sdf.Layer.CreateNew(str(built.asset.folder / "prop.usda"))
+    spec = Sdf.CreatePrimInLayer(prop, "/prop")
+    Sdf.AttributeSpec(spec, "sheet", Types.Asset).default = Sdf.AssetPath("../sheet.exr")
+    prop.Save()
+    (built.asset.folder.parent / "sheet.exr").touch()
+    with edited(built.asset.edits_layer) as layer:
+        prim = Sdf.CreatePrimInLayer(layer, "/room/prop")
+        prim.referenceList.prependedItems = [Sdf.Reference("./prop.usda", "/prop")]
+    (finding,) = own(built)
+    assert finding.rule == "usdbrdf.PathOutside"
+    assert "prop.usda@ leads out" in finding.message
 
 
 def test_rules_have_nothing_to_say_about_stages_of_others(tmp_path):

@@ -4,6 +4,7 @@ import pytest
 from pxr import Sdf
 
 from tests.validation.faults import edited, opinion
+from usdbrdf.cli import main
 from usdbrdf.stage.asset import ROLES
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import has_errors, listed_rules, validate
@@ -47,6 +48,17 @@ def test_what_is_no_layer_is_a_finding(tmp_path):
     (finding,) = validate(tmp_path / "x.usda")
     assert str(finding).endswith("[usd.Open]")
     assert has_errors([finding])
+
+
+def test_a_layer_that_cannot_be_read_is_a_finding(built, capsys):
+    with built.asset.edits_layer.open("a") as file:
+        file.write('over "broken" {\n')
+    findings = [f for f in validate(built.asset.root_layer) if f.rule == "usd.Open"]
+    assert [f.site for f in findings] == [f"@{built.asset.edits_layer}@"]
+    assert "USD cannot open it" in str(findings[0])
+    assert "Expected }" in str(findings[0])
+    assert main(["validate", str(built.asset.folder)]) == 7
+    assert f"@{built.asset.edits_layer}@: USD cannot open it" in capsys.readouterr().out
 
 
 def test_a_missing_file_is_found_once(built):

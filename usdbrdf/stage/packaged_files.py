@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdShade, UsdUtils
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.stage.asset import Asset
+from usdbrdf.stage.named_files import named_files
 
 Types = Sdf.ValueTypeNames
 
@@ -93,14 +94,7 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
 
 def other_files(flat: Usd.Stage, done: Collection[str]) -> list[str]:
     """All asset paths of the stage, in attributes and metadata, but for those in ``done``."""
-    found: set[str] = set()
-
-    def seen(path: str) -> str:
-        found.add(path)
-        return path
-
-    UsdUtils.ModifyAssetPaths(flat.GetRootLayer(), seen)
-    return sorted(found - {"", *(f"./{path}" for path in done)})
+    return sorted(named_files(flat.GetRootLayer()) - {f"./{path}" for path in done})
 
 
 def replace_files(flat: Usd.Stage, new: Mapping[str, str]) -> None:

@@ -1,4 +1,7 @@
-"""What the shading stage adds: materials with albedo or emission, maps, and render outputs."""
+"""What the shading stage adds: materials with albedo or emission, maps, and render outputs.
+
+Measured maps are looks; the UsdRender vars are what a renderer makes of the asset.
+"""
 
 from __future__ import annotations
 

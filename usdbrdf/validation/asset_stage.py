@@ -9,9 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Usd, UsdShade
+from pxr import Ar, Sdf, Usd, UsdShade
 
 from usdbrdf.stage.asset import ROLES, Asset
+from usdbrdf.stage.named_files import named_files
 from usdbrdf.stage.scopes import Scopes
 
 
@@ -90,8 +91,25 @@ class AssetStage:
 
     @cached_property
     def asset_paths(self) -> tuple[tuple[Sdf.Layer, Sdf.Path, str], ...]:
-        """Every path that a layer of the stage names, of all variants: (layer, spec, path)."""
-        return tuple((layer, *found) for layer in self.layers for found in _asset_paths(layer))
+        """Every path that a layer of the stage names, or one of the asset's folder that it reaches
+        by an arc, of all variants: (layer, spec, path). In metadata the spec is the empty path."""
+        layers = (*self.layers, *self._reached_layers())
+        return tuple((layer, *found) for layer in layers for found in _asset_paths(layer))
+
+    def _reached_layers(self) -> list[Sdf.Layer]:
+        """Layers of the folder by reference, payload or clip; a package names its own content."""
+        if not self.asset:
+            return []
+        stack = self.stage.GetLayerStack(includeSessionLayers=True)
+        reached = [
+            layer
+            for layer in self.stage.GetUsedLayers()
+            if layer not in stack
+            and not layer.GetFileFormat().IsPackage()
+            and not Ar.IsPackageRelativePath(layer.identifier)
+            and Path(layer.realPath).is_relative_to(self.asset.folder)
+        ]
+        return sorted(reached, key=lambda layer: str(layer.realPath))
 
     def shaders(self, scope: str, identifier: str) -> Iterator[UsdShade.Shader]:
         """The shaders with an ``info:id`` below a scope of ours ("materials" or "looks")."""
@@ -148,6 +166,8 @@ def _asset_paths(layer: Sdf.Layer) -> list[tuple[Sdf.Path, str]]:
                 found.extend((path, arc.assetPath) for arc in arcs.GetAddedOrExplicitItems())
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    metadata = named_files(layer) - {value for _, value in found}
+    found.extend((Sdf.Path.emptyPath, value) for value in sorted(metadata))
     return [(path, value) for path, value in found if value]
 
 

@@ -58,7 +58,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         cured = tuple(finding for finding in dict.fromkeys(applied) if finding not in after)
         if cured:
             cures.Save()
-            os.replace(written, path)
+            _publish(written, path)
     return Cured(layer=path, findings=cured)
 
 
@@ -66,16 +66,28 @@ def _check_place(asset: Asset, path: Path) -> None:
     if path.suffix != ".usda":
         raise UsageError(f"{path}: the cures are written as text; name a .usda file. [fix.suffix]")
     if os.path.lexists(path):
-        raise UsageError(
-            f"{path}: the file exists, and cures never go into a layer that somebody wrote. Name a "
-            "new file. [fix.exists]"
-        )
+        raise _taken(path)
     reserved = [asset.folder / name for name in ("layers", "textures", ".usdbrdf")]
     if any(path.is_relative_to(folder) for folder in reserved):
         raise UsageError(
             f"{path}: the folder is the pipeline's own. Name a file beside "
             f"{asset.root_layer.name}. [fix.place]"
         )
+
+
+def _publish(written: Path, path: Path) -> None:
+    """Never over a file that somebody wrote in the meantime: a hard link replaces nothing."""
+    try:
+        os.link(written, path)
+    except FileExistsError as error:
+        raise _taken(path) from error
+
+
+def _taken(path: Path) -> UsageError:
+    return UsageError(
+        f"{path}: the file exists, and cures never go into a layer that somebody wrote. Name a "
+        "new file. [fix.exists]"
+    )
 
 
 def _curable(stage: Usd.Stage) -> list[tuple[Rule, Fault]]:

@@ -15,12 +15,21 @@ from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Rule, Severity, Site
 
 _UDIM = "<UDIM>"
+# A letter before a colon is a drive.
+_URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 
 
 def _anchored(scene: AssetStage) -> Iterator[Fault]:
     if scene.asset:
         for layer, path, value in scene.asset_paths:
-            if not value.startswith(("./", "../")):
+            if _URI.match(value):
+                yield Fault(
+                    site=_site(scene.stage, layer, path),
+                    message=f"@{value}@ in @{layer.realPath}@ is for a resolver that others may "
+                    "not have.",
+                    severity=Severity.WARNING,
+                )
+            elif not value.startswith(("./", "../")):
                 yield Fault(
                     site=_site(scene.stage, layer, path),
                     message=f"@{value}@ in @{layer.realPath}@ does not begin with ./ or ../ .",
@@ -74,14 +83,20 @@ def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
             if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
                 continue
             times = [Usd.TimeCode.Default(), *attribute.GetTimeSamples()]
-            for file in {asset_file(attribute, time) for time in times}:
+            files = {asset_file(attribute, t) for t in times if not _is_uri(attribute.Get(t))}
+            for file in files:
                 if file is not None and not _is_there(file):
                     missing[file].append(attribute)
     for layer, path, value in scene.asset_paths:
         file = located(layer, value)
-        if path.ContainsPrimVariantSelection() and file not in missing and not _is_there(file):
+        uncomposed = path.isEmpty or path.ContainsPrimVariantSelection()
+        if uncomposed and not _URI.match(value) and file not in missing and not _is_there(file):
             missing[file].append(layer)
     return missing
+
+
+def _is_uri(value: Sdf.AssetPath | None) -> bool:
+    return value is not None and bool(_URI.match(value.path))
 
 
 def _is_there(file: Path) -> bool:
@@ -100,7 +115,8 @@ def _orphans(scene: AssetStage) -> Iterator[Fault]:
         return
     if any(record_of(layer).get("state") == "pending" for layer in scene.own_layers):
         return  # the textures of a stage that runs again may be there before its layer
-    named = {located(layer, value).name for layer, _, value in scene.asset_paths}
+    paths = [(layer, value) for layer, _, value in scene.asset_paths if not _URI.match(value)]
+    named = {located(layer, value).name for layer, value in paths}
     tiled = [re.escape(name).replace(re.escape(_UDIM), r"\d{4}") for name in named if _UDIM in name]
     for file in sorted(folder.iterdir()):
         known = file.name in named or any(re.fullmatch(tile, file.name) for tile in tiled)
@@ -114,7 +130,8 @@ RULES = (
         severity=Severity.ERROR,
         description="Every path in a layer begins with ./ or ../ . Absolute paths lead nowhere on "
         "another machine; paths without a dot are looked up wherever a site's resolver is set up "
-        "to, and packages rename them.",
+        "to, and packages rename them. A path with a scheme, such as https:, is a warning alone, "
+        "and no other rule looks for its file.",
         advice="Bring the file into the asset's folder and name it relative to the layer.",
         check=_anchored,
     ),
@@ -130,8 +147,9 @@ RULES = (
     Rule(
         name="MissingTexture",
         severity=Severity.ERROR,
-        description="Every texture that the composed stage names exists. Renderers show the "
-        "fallback, or black, in place of one that does not.",
+        description="Every texture that the composed stage names exists, and every file that a "
+        "layer names in its metadata, such as clips and thumbnails. Renderers show the fallback, "
+        "or black, in place of a texture that does not.",
         advice="Run usdbrdf convert again, which makes missing textures anew; or restore the file.",
         check=_missing_textures,
     ),

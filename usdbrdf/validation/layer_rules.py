@@ -102,7 +102,8 @@ RULES = (
         severity=Severity.ERROR,
         description="Strongest first the sublayers are edits.usda, material, shading, texturing, "
         "scan. In another order the lobe of a material is hidden by the stage before it, or the "
-        "artist's edits by a measurement. Other layers may stand between them.",
+        "artist's edits by a measurement. Other layers may stand between them. lights, "
+        "texturing_uv and materialx are no sublayers of the root, but of the layers that own them.",
         advice="Restore the order in the root layer; mute a layer instead of moving it.",
         check=_order,
     ),

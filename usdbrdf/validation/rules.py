@@ -6,6 +6,7 @@ from usdbrdf.validation import (
     capture_rules,
     file_rules,
     layer_rules,
+    lights_rules,
     look_rules,
     material_rules,
     record_rules,
@@ -19,4 +20,5 @@ RULES: tuple[Rule, ...] = (
     *record_rules.RULES,
     *material_rules.RULES,
     *look_rules.RULES,
+    *lights_rules.RULES,
 )

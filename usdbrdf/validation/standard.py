@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from pxr import Tf, Usd, UsdShade, UsdValidation
+from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
 from usdbrdf.stage.usd_errors import in_one_line
 from usdbrdf.validation.rule import Finding, Severity
@@ -34,12 +34,7 @@ def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
             if not layer.anonymous:
                 layer.Reload()
     except Tf.ErrorException as error:
-        return Finding(
-            severity=Severity.ERROR,
-            site=f"@{root_layer}@",
-            message=f"USD cannot open it: {in_one_line(error)}.",
-            rule=OPEN,
-        )
+        return _not_opened(str(root_layer), error)
     return stage
 
 
@@ -52,7 +47,13 @@ def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
     registry = UsdValidation.ValidationRegistry()
     names = [metadata.name for metadata in _built_in()]
     context = UsdValidation.ValidationContext(validators=registry.GetOrLoadValidatorsByName(names))
-    for error in context.Validate(stage):
+    try:
+        errors = context.Validate(stage)
+    except Tf.ErrorException as failure:
+        # A validator opened a layer itself, and the stage's own open had passed over it.
+        yield from _unreadable(stage) or [_not_opened(stage.GetRootLayer().realPath, failure)]
+        return
+    for error in errors:
         if _is_materialx_unknown(error):
             continue
         yield Finding(
@@ -65,10 +66,32 @@ def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
 
 def standard_rules() -> Iterator[tuple[str, str]]:
     """(name, description) of all that ``standard_findings`` looks for."""
-    yield OPEN, "USD can open the root layer."
+    yield OPEN, "USD can open the root layer, and the layers that it needs."
     yield COMPOSITION, "All layers, references and payloads of the stage compose."
     for metadata in _built_in():
         yield metadata.name, " ".join(metadata.doc.split())
+
+
+def _not_opened(file: str, error: Tf.ErrorException) -> Finding:
+    return Finding(
+        severity=Severity.ERROR,
+        site=f"@{file}@",
+        message=f"USD cannot open it: {in_one_line(error)}.",
+        rule=OPEN,
+    )
+
+
+def _unreadable(stage: Usd.Stage) -> list[Finding]:
+    """The layers that those of the stage name, and that USD cannot read."""
+    found = {}
+    for layer in stage.GetUsedLayers():
+        for path in layer.GetCompositionAssetDependencies():
+            try:
+                Sdf.Layer.FindOrOpenRelativeToLayer(layer, path)
+            except Tf.ErrorException as error:
+                file = layer.ComputeAbsolutePath(path)
+                found[file] = _not_opened(file, error)
+    return [finding for _, finding in sorted(found.items())]
 
 
 def _built_in() -> list[UsdValidation.ValidatorMetadata]:

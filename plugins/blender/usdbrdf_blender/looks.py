@@ -13,15 +13,15 @@ def show_look(file, root, look):
     AssetUnreadable if the asset is gone.
     """
     wanted = usd_asset.materials_in_look(file, root, look)
-    missing = set(wanted.values()) - _materials_of(file).keys()
+    missing = {path for worn in wanted.values() for path, _ in worn} - _materials_of(file).keys()
     if missing:
         _import_materials(file, missing)
     materials = _materials_of(file)
     for item in objects_of(file, root):
         item[SHOWN] = look
-        material = materials.get(wanted.get(item[PRIM]))
-        if item.type == "MESH" and material is not None:
-            _wear(item.data, material)
+        worn = [(materials[p], faces) for p, faces in wanted.get(item[PRIM], ()) if p in materials]
+        if item.type == "MESH" and worn:
+            _wear(item.data, worn)
 
 
 def objects_of(file, root):
@@ -33,11 +33,19 @@ def _materials_of(file):
     return {m[PRIM]: m for m in bpy.data.materials if m.get(FILE) == file}
 
 
-def _wear(mesh, material):
-    if not mesh.materials:
+def _wear(mesh, worn):
+    """One slot per material, the mesh's own first; faces that the mesh has lost are passed over."""
+    slots = list(dict.fromkeys(material for material, _ in worn))
+    indices = [0] * len(mesh.polygons)
+    for material, faces in worn:
+        for face in faces:
+            if face < len(indices):
+                indices[face] = slots.index(material)
+    mesh.materials.clear()
+    for material in slots:
         mesh.materials.append(material)
-    for i in range(len(mesh.materials)):
-        mesh.materials[i] = material
+    mesh.polygons.foreach_set("material_index", indices)
+    mesh.update()
 
 
 def _import_materials(file, paths):

@@ -44,17 +44,26 @@ def looks_of_file(file):
 
 
 def materials_in_look(file, root, look):
-    """Mesh path -> path of the material bound to it while the prim ``root`` shows ``look``."""
+    """Mesh path -> what it wears while the prim ``root`` shows ``look``: (material path, faces),
+    first the mesh's own material with no faces, then those of its GeomSubsets."""
     stage = open_stage(file)
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         stage.GetPrimAtPath(root).GetVariantSet(LOOK).SetVariantSelection(look)
     found = {}
     for prim in Usd.PrimRange(stage.GetPrimAtPath(root)):
         if prim.GetTypeName() == "Mesh":
-            material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-            if material:
-                found[str(prim.GetPath())] = str(material.GetPath())
+            found[str(prim.GetPath())] = _worn(prim)
     return found
+
+
+def _worn(mesh):
+    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    worn = []
+    for prim, faces in [(mesh, ()), *((s.GetPrim(), s.GetIndicesAttr().Get()) for s in subsets)]:
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        if material:
+            worn.append((str(material.GetPath()), list(faces or ())))
+    return worn
 
 
 def facts_of(prim):

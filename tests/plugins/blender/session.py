@@ -154,6 +154,21 @@ def looks(file):
     return told
 
 
+def slots(file, look):
+    """Name of each object -> its materials' prims, and the slot of each face."""
+    enable()
+    empty_scene()
+    bpy.ops.usdbrdf.import_asset(filepath=file, look=look)
+    return {
+        o.name: [
+            [material.get("usdbrdf_prim") for material in o.data.materials],
+            [face.material_index for face in o.data.polygons],
+        ]
+        for o in bpy.data.objects
+        if o.type == "MESH"
+    }
+
+
 def render(file, look, picture):
     """The middle pixel of the capture camera's view with Cycles, in the light of a strong sun."""
     enable()

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from pxr import Sdf
 
 from tests.scenes import make_capture
 
@@ -137,6 +138,30 @@ def test_looks(told_of_looks):
     assert wall["emission_color"] == [0.5, 0, 0.5]
     assert told["back"] == told["shaded"]
     assert told["imported_lit"] == told["lit"]
+
+
+@needs_blender
+def test_a_part_of_an_object_keeps_its_own_material(session, synthetic, tmp_path):
+    asset = synthetic.build(tmp_path / "room", synthetic.make_scan(tmp_path / "capture")).asset
+    layer = Sdf.Layer.FindOrOpen(str(asset.edits_layer))
+    part = Sdf.CreatePrimInLayer(layer, "/room/geo/Stuhl_No_1/seat")
+    part.specifier, part.typeName = Sdf.SpecifierDef, "GeomSubset"
+    for name, kind, value in (
+        ("elementType", Sdf.ValueTypeNames.Token, "face"),
+        ("familyName", Sdf.ValueTypeNames.Token, "materialBind"),
+        ("indices", Sdf.ValueTypeNames.IntArray, [2, 3, 7]),
+    ):
+        Sdf.AttributeSpec(part, name, kind).default = value
+    part.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=["MaterialBindingAPI"]))
+    binding = Sdf.RelationshipSpec(part, "material:binding", custom=False)
+    binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+    layer.Save()
+    told = session("slots", asset.root_layer, "lit")
+    materials, faces = told["Stuhl_No_1"]
+    assert materials == ["/room/looks/lit/Stuhl_No_1", "/room/mtl/wall"]
+    assert [i for i, slot in enumerate(faces) if slot == 1] == [2, 3, 7]
+    assert set(faces) == {0, 1}
+    assert told["lamp"] == [["/room/looks/lit/lamp"], [0] * 12]
 
 
 @needs_blender
