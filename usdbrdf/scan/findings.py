@@ -78,9 +78,10 @@ def _why_too_few(
     elif len(worst) == total and rule == "capture.saturated":
         head = f"{source}: all {total} frames are saturated, there is no HDR headroom."
     first = f"{len(worst)} of them, first {worst[0].name!r}: {worst[0].reason}."
-    return f"{head} {first} {_CURES[rule]} [{rule}]"
+    return f"{head} {first} {_CURES.get(rule, _CURE)} [{rule}]"
 
 
+_CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
     "capture.file": "Copy the missing images, or remove their entries.",
