@@ -193,6 +193,13 @@ def ring_of_poses(count: int, *, radius: float = 1.2, height: float = 1.4) -> Do
     return np.array(poses)
 
 
+def poses_down_and_up(down: int, up: int) -> np.ndarray:
+    """Some look down at the room from a ring, some up at its lamp."""
+    lamp = np.array([2.0, 1.5, 2.4])
+    places = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(up)]
+    return np.concatenate([ring_of_poses(down), [look_at(place, lamp) for place in places]])
+
+
 def look_at(centre: Double, target: Double) -> Double:
     """World-from-camera matrix (4, 4), z up, looking down the camera's -z."""
     back = (centre - target) / np.linalg.norm(centre - target)

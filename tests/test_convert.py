@@ -15,7 +15,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 import usdbrdf
-from tests.scenes import MadeCapture, edited, look_at, make_capture, ring_of_poses, write_ply
+from tests.scenes import MadeCapture, edited, make_capture, poses_down_and_up, write_ply
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
@@ -56,13 +56,6 @@ def _quiet():
     set_quiet(False)
 
 
-def poses() -> np.ndarray:
-    """Half of them look down, half of them up at the lamp."""
-    lamp = np.array([2.0, 1.5, 2.4])
-    places = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(6)]
-    return np.concatenate([ring_of_poses(6), [look_at(place, lamp) for place in places]])
-
-
 def add_hidden_object(capture: MadeCapture) -> None:
     """A square below the floor, where no camera ever looks."""
     square = np.array([[0, 0, -1], [1, 0, -1], [1, 1, -1], [0, 1, -1]], np.float32)
@@ -85,7 +78,9 @@ def base(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def capture(base):
-    made = make_capture(base / "scan", subdivisions=2, poses=poses(), radiance=CEILING)
+    made = make_capture(
+        base / "scan", subdivisions=2, poses=poses_down_and_up(6, 6), radiance=CEILING
+    )
     add_hidden_object(made)
     return made
 
@@ -311,7 +306,7 @@ def test_a_lamp_that_saturates_in_every_frame_is_a_lower_bound(tmp_path):
     made = make_capture(
         tmp_path / "scan",
         subdivisions=1,
-        poses=poses(),
+        poses=poses_down_and_up(6, 6),
         radiance=CEILING,
         size=(48, 36),
         saturation_radiance=4.0,
@@ -415,7 +410,9 @@ def as_usd(made: MadeCapture, path: Path) -> None:
 
 
 def test_a_usd_stage_stays_as_it_is_and_wears_our_materials(tmp_path, monkeypatch):
-    made = make_capture(tmp_path / "scan", subdivisions=2, poses=poses(), radiance=CEILING)
+    made = make_capture(
+        tmp_path / "scan", subdivisions=2, poses=poses_down_and_up(6, 6), radiance=CEILING
+    )
     as_usd(made, tmp_path / "haus.usda")
     before = (tmp_path / "haus.usda").read_bytes()
     monkeypatch.chdir(tmp_path)

@@ -24,3 +24,10 @@ def parallel_kernel(function: F) -> F:
     the result does not depend on the number of threads."""
     compiled: F = numba.njit(cache=True, parallel=True)(function)
     return compiled
+
+
+def loop(function: F) -> F:
+    """Compile for one thread, without Python's lock. Divisions by 0 give infinities instead of
+    exceptions: the test for them would keep a loop from using vector instructions."""
+    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled

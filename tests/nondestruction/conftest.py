@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.scenes import MadeCapture, look_at, make_capture, ring_of_poses, write_ply
+from tests.scenes import MadeCapture, make_capture, poses_down_and_up, write_ply
 from usdbrdf.cli import main
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.stage.asset import Asset
@@ -25,16 +25,12 @@ def _quiet():
     set_quiet(False)
 
 
-def poses() -> np.ndarray:
-    """Half of them look down, half of them up at the lamp."""
-    lamp = np.array([2.0, 1.5, 2.4])
-    places = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(5)]
-    return np.concatenate([ring_of_poses(5), [look_at(place, lamp) for place in places]])
-
-
 def photographed(folder: Path) -> MadeCapture:
     return make_capture(
-        folder, subdivisions=1, poses=poses(), radiance={"ceiling": (0.125, 0.125, 0.125)}
+        folder,
+        subdivisions=1,
+        poses=poses_down_and_up(5, 5),
+        radiance={"ceiling": (0.125, 0.125, 0.125)},
     )
 
 

@@ -13,7 +13,7 @@ from pxr import Usd, UsdShade
 from scipy import stats
 
 import usdbrdf
-from tests.scenes import MadeCapture, look_at, make_capture, ring_of_poses
+from tests.scenes import MadeCapture, make_capture, poses_down_and_up
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.cameras import pixel_centres
@@ -58,13 +58,6 @@ class Room:
     folder: Path
     clean: Atlas
     glossy: Asset
-
-
-def _poses() -> np.ndarray:
-    """Two thirds look down at the room, the others up at the lamp."""
-    lamp = np.array([2.0, 1.5, 2.4])
-    up = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(6)]
-    return np.concatenate([ring_of_poses(12), [look_at(place, lamp) for place in up]])
 
 
 def _shaded(capture: MadeCapture, folder: Path) -> Asset:
@@ -118,7 +111,11 @@ def room(tmp_path_factory) -> Room:
     folder = tmp_path_factory.mktemp("refine")
     made = {
         name: make_capture(
-            folder / name, size=(40, 30), subdivisions=1, poses=_poses(), radiance=CEILING
+            folder / name,
+            size=(40, 30),
+            subdivisions=1,
+            poses=poses_down_and_up(12, 6),
+            radiance=CEILING,
         )
         for name in ("clean", "glossy")
     }

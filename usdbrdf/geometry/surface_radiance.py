@@ -10,7 +10,7 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.geometry.texels import Texels
-from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.kernel import kernel, loop, parallel_kernel
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
@@ -56,6 +56,23 @@ def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceT
     )
 
 
+@loop
+def texture_place(radiance: TextureArrays, f: int, u: float, v: float) -> tuple[int, float, float]:
+    """Where a texture is read at barycentric (u, v) of face f: the upper left of four pixels, and
+    how far from it, in pixels; for use inside kernels."""
+    _, corner_pixel, first_pixel, size = radiance
+    width = size[f, 0]
+    height = size[f, 1]
+    w = 1.0 - u - v
+    x = w * corner_pixel[f, 0, 0] + u * corner_pixel[f, 1, 0] + v * corner_pixel[f, 2, 0] - 0.5
+    y = w * corner_pixel[f, 0, 1] + u * corner_pixel[f, 1, 1] + v * corner_pixel[f, 2, 1] - 0.5
+    x = min(max(x, 0.0), width - 1.0)
+    y = min(max(y, 0.0), height - 1.0)
+    i = min(int(x), max(width - 2, 0))
+    j = min(int(y), max(height - 2, 0))
+    return first_pixel[f] + j * width + i, x - i, y - j
+
+
 @kernel
 def texture_at(
     pixels: Float,
@@ -68,21 +85,11 @@ def texture_at(
     channel: int,
 ) -> float:
     """One channel at barycentric (u, v) of a face, bilinear; for use inside kernels."""
-    corners = corner_pixel[face]
+    k, fx, fy = texture_place((pixels, corner_pixel, first_pixel, size), face, u, v)
     width = size[face, 0]
     height = size[face, 1]
-    w = 1.0 - u - v
-    x = w * corners[0, 0] + u * corners[1, 0] + v * corners[2, 0] - 0.5
-    y = w * corners[0, 1] + u * corners[1, 1] + v * corners[2, 1] - 0.5
-    x = min(max(x, 0.0), width - 1.0)
-    y = min(max(y, 0.0), height - 1.0)
-    i = min(int(x), max(width - 2, 0))
-    j = min(int(y), max(height - 2, 0))
-    fx = x - i
-    fy = y - j
     right = 1 if width > 1 else 0
     down = width if height > 1 else 0
-    k = first_pixel[face] + j * width + i
     top = pixels[k, channel] * (1 - fx) + pixels[k + right, channel] * fx
     low = pixels[k + down, channel] * (1 - fx) + pixels[k + down + right, channel] * fx
     value: float = top * (1 - fy) + low * fy

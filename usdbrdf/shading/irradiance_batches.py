@@ -18,11 +18,12 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.surface_radiance import TextureArrays
+from usdbrdf.geometry.surface_radiance import TextureArrays, texture_place
+from usdbrdf.kernel import loop
 from usdbrdf.shading.environment import EnvironmentArrays, environment_at
 from usdbrdf.shading.irradiance_kernels import Draws
 from usdbrdf.shading.lights import LightArrays
-from usdbrdf.shading.warp_loops import fractions, in_triangle, loop, on_hemisphere
+from usdbrdf.shading.warp_loops import fractions, in_triangle, on_hemisphere
 from usdbrdf.shading.warps import hashed_uniform, tangent_frame
 
 Float = npt.NDArray[np.float32]
@@ -93,26 +94,10 @@ def cosine_batch(
 
 
 @loop
-def _place(radiance: TextureArrays, f: int, u: float, v: float) -> tuple[int, float, float]:
-    """Where ``texture_at`` reads: the upper left pixel, and how far from it, in pixels."""
-    _, corner_pixel, first_pixel, size = radiance
-    width = size[f, 0]
-    height = size[f, 1]
-    w = 1.0 - u - v
-    x = w * corner_pixel[f, 0, 0] + u * corner_pixel[f, 1, 0] + v * corner_pixel[f, 2, 0] - 0.5
-    y = w * corner_pixel[f, 0, 1] + u * corner_pixel[f, 1, 1] + v * corner_pixel[f, 2, 1] - 0.5
-    x = min(max(x, 0.0), width - 1.0)
-    y = min(max(y, 0.0), height - 1.0)
-    i = min(int(x), max(width - 2, 0))
-    j = min(int(y), max(height - 2, 0))
-    return first_pixel[f] + j * width + i, x - i, y - j
-
-
-@loop
 def _colour(
     radiance: TextureArrays, f: int, k: int, fx: float, fy: float
 ) -> tuple[float, float, float]:
-    """``texture_at`` for all three channels, at a ``_place`` on face f."""
+    """``texture_at`` for all three channels, at a ``texture_place`` on face f."""
     pixels, _, _, size = radiance
     width, height = size[f, 0], size[f, 1]
     right = k + (1 if width > 1 else 0)
@@ -168,7 +153,7 @@ def add_cosine_batch(
                 if facing > 0:
                     square = distance[r] * distance[r]
                     weight[k] = cosine / (cosine / np.pi + light_density[f] * square / facing)
-            place[k], fx[k], fy[k] = _place(radiance, f, u[r], v[r])
+            place[k], fx[k], fy[k] = texture_place(radiance, f, u[r], v[r])
         for k in range(count):
             if weight[k] > 0:
                 f = face[first + k]
@@ -230,7 +215,7 @@ def light_batch(
             weight = both / (both / np.pi + light_density[f] * square * square)
             distance = math.sqrt(square)
             inverse = 1 / distance
-            place, fx, fy = _place(radiance, f, u, v)
+            place, fx, fy = texture_place(radiance, f, u, v)
             red, green, blue = _colour(radiance, f, place, fx, fy)
             number[used] = (sample - start) * count + k
             for c in range(3):

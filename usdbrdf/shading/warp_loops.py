@@ -4,22 +4,13 @@ the compiler makes vector instructions of them, several times as fast."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf.kernel import loop
+
 Double = npt.NDArray[np.float64]
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def loop(function: F) -> F:
-    """Compile for one thread, without Python's lock. Divisions by 0 give infinities instead of
-    exceptions: the test for them would keep a loop from using vector instructions."""
-    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
 
 
 @loop

@@ -60,9 +60,10 @@ def refined_maps(
     diffuse = np.maximum(psquare.quantile(observed.quantiles, _QUANTILE), 0)
     diffuse = np.where(emissive[:, None], emission, inpaint(texels, diffuse, known))
     # What clips in every frame is at least as bright as that.
-    clipped = atlas.map("coverage") == CLIPPED
+    coverage = atlas.map("coverage")
+    clipped = coverage == CLIPPED
     diffuse = np.where(clipped, np.maximum(diffuse, atlas.map("lit")), diffuse)
-    seen = atlas.map("coverage")[:, 0] != FILLED
+    seen = coverage[:, 0] != FILLED
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
         """Base colour, and L_d with what it reflects where nobody looked."""
