@@ -26,7 +26,7 @@ from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import open_edited
 from usdbrdf.stage.scopes import Scopes
 
-WIDTH, ACROSS = 88, 5
+WIDTH, ACROSS = 172, 5
 # Degrees about x, y, z, irradiance; from above whatever way is up.
 LIGHTS = (((-50, 30, 0), 2.0), ((50, -30, 0), 1.0))
 

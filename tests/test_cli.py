@@ -280,9 +280,11 @@ def test_version_and_plugin_path(capsys):
     assert main(["--version"]) == 0
     assert re.fullmatch(r"usdbrdf \S+\n", capsys.readouterr().out)
     assert main(["plugin-path"]) == 0
-    assert (Path(capsys.readouterr().out.strip()) / "plugInfo.json").is_file()
-    assert main(["plugin-path", "--validators"]) == 0
-    assert (Path(capsys.readouterr().out.strip()) / "usd_plugin.py").is_file()
+    schemas, validators = capsys.readouterr().out.strip().split(os.pathsep)
+    assert (Path(schemas) / "generatedSchema.usda").is_file()
+    assert (Path(validators) / "usd_plugin.py").is_file()
+    assert main(["plugin-path", "--schemas"]) == 0
+    assert capsys.readouterr().out.strip() == schemas
 
 
 def test_adapters_are_listed_one_per_line(monkeypatch, capsys):

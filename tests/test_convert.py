@@ -184,6 +184,9 @@ def test_an_object_that_no_frame_sees_is_neutral_and_says_so(asset):
     stage = open_edited(asset)
     assert read_fit(stage, str(prim_of(stage, "hidden").GetPath())).status == "unseen"
     assert prim_of(stage, "hidden").GetAttribute("usdBrdf:fit:status").Get() == "unseen"
+    target = "usdBrdf:fit:targetFrame"
+    assert prim_of(stage, "hidden").GetAttribute(target).Get() == -1
+    assert 0 <= prim_of(stage, "ceiling").GetAttribute(target).Get() < 12
     textures = asset.folder / "textures"
     assert (read_exr(textures / "hidden.coverage.exr") == 0).all()
     assert (read_exr(textures / "hidden.samples.exr") == 0).all()

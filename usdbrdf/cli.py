@@ -210,7 +210,8 @@ def _about(adapter: Adapter) -> str:
 
 
 def _plugin_path(chosen: Arguments) -> int:
-    _print(str(validators_path() if chosen.validators else plugin_path()))
+    folders = [plugin_path()] if chosen.schemas else [plugin_path(), validators_path()]
+    _print(os.pathsep.join(str(folder) for folder in folders))
     return 0
 
 

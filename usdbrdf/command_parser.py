@@ -79,11 +79,12 @@ def command_parser() -> argparse.ArgumentParser:
     rules = command("rules", "list what validate looks for")
     rules.add_argument("--json", action="store_true", help="with descriptions, as JSON")
     command("adapters", "list the capture formats that can be read")
-    plugins = command("plugin-path", "print the folder to put into PXR_PLUGINPATH_NAME")
+    plugins = command("plugin-path", "print what to put into PXR_PLUGINPATH_NAME")
     plugins.add_argument(
-        "--validators",
+        "--schemas",
         action="store_true",
-        help="that of the validators instead, for applications whose Python has usdbrdf",
+        help="without the validators, for applications whose Python has no usdbrdf: USD reports an "
+        "error there when all validators are asked for",
     )
     return parser
 

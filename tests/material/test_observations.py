@@ -26,8 +26,10 @@ def floor() -> World:
     ])  # fmt: skip
 
 
-def _lit(world: World) -> LitScene:
+def _lit(world: World, lamp: int | None = None) -> LitScene:
     lit = np.full((len(world.texels), 3), 0.5, np.float32)
+    if lamp is not None:
+        lit[world.texels.of_object(lamp)] = 50
     texture = world.texture(lit)
     return LitScene(
         scene=world.scene, rays=world.rays, radiance=texture,
@@ -92,3 +94,22 @@ def test_texels_that_no_frame_sees_give_no_observations(floor: World):
     # The second square lies out of every picture.
     _, found = _followed(floor, 4, floor.texels.object_index() == 1)
     assert len(found.texel) == 0
+
+
+def test_the_target_frame_shows_the_highlight():
+    """A floor, a wall that no camera sees, and a lamp above, which the floor mirrors only towards
+    the fourth camera: from c to a lamp at 3, both 2 above the floor, light turns at (c + 3) / 2."""
+    room = world_of([
+        quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), size=(24, 24)),
+        quad((-9, -1, 0), (0, 2, 0), (0, 0, 2), size=(8, 8)),
+        quad((2.5, -0.5, 2), (0, 1, 0), (1, 0, 0), size=(8, 8)),
+    ])  # fmt: skip
+    usable = room.texels.object_index() != 2
+    follower = Follower(_lit(room, lamp=2), room.texels, usable, 6, 0)
+    for camera in (0.0, 1.0, 2.0, -2.5, 0.5, 1.5):
+        view = View(
+            radiance=np.ones((SIZE, SIZE, 3), np.float32), valid=np.ones((SIZE, SIZE), bool),
+            world_from_camera=look_at(np.array([camera, -0.1, 2.0]), np.zeros(3)), intrinsics=LENS,
+        )  # fmt: skip
+        follower.add(view, np.zeros((SIZE, SIZE), bool), 0.0)
+    np.testing.assert_array_equal(follower.target_frames(room.texels), [3, -1, -1])

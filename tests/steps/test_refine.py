@@ -345,16 +345,16 @@ def _contents(folder: Path) -> dict[str, str]:
 
 def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatch):
     starts = []
-    through_all = refine.radiance_from_frames
+    through_all = refine.samples_from_frames
 
     def interrupted(*arguments, **options):
-        starts.append(arguments[6])
-        for done in through_all(*arguments, **options):
-            yield done
-            if len(starts) == 1 and done == FIRST_UNSAVED:
+        starts.append(arguments[4])
+        for samples in through_all(*arguments, **options):
+            yield samples
+            if len(starts) == 1 and samples.frame == FIRST_UNSAVED:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(refine, "radiance_from_frames", interrupted)
+    monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())
     folder = room.folder / "assets" / "again"

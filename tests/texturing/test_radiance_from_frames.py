@@ -101,29 +101,6 @@ def test_every_object_gets_the_radiance_it_was_drawn_with(room: Room):
     )
 
 
-def test_specular_light_is_taken_off_every_sample(room: Room):
-    # 1/16 of what each object was drawn with, in every frame's samples of it.
-    world, owner = room.world, room.world.texels.object_index()
-    drawn = np.array([RADIANCE[name] for name in room.names], np.float32)
-    asked = np.zeros((12, len(world.texels)), np.int32)
-
-    def specular(frame: int, which: np.ndarray) -> np.ndarray:
-        asked[frame, which] += 1
-        return drawn[owner[which]] / 16
-
-    observed = Observation.empty(len(world.texels))
-    steps = radiance_from_frames(
-        world.texels, world.scene, world.rays, room.frames, observed, 0.5, specular=specular
-    )
-    assert list(steps) == list(range(12))
-    seen = observed.quantiles.count > 0
-    np.testing.assert_allclose(
-        quantile(observed.quantiles, 0.5)[seen], drawn[owner[seen]] * 15 / 16, rtol=1e-5
-    )
-    np.testing.assert_array_equal(asked.sum(axis=0), observed.quantiles.count)
-    assert asked.max() == 1
-
-
 def test_going_on_from_a_saved_state_changes_no_bit(room: Room):
     whole = Observation.empty(len(room.world.texels))
     _observe(room.world, room.frames, whole)

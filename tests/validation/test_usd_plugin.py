@@ -9,7 +9,8 @@ import pytest
 from pxr import Sdf, Usd, UsdValidation
 
 from tests.validation.faults import FAULTS
-from usdbrdf.stage.schema import plugin_path, validators_path
+from usdbrdf.cli import main
+from usdbrdf.stage.schema import validators_path
 from usdbrdf.validation.rules import RULES
 from usdbrdf.validation.usd_plug_info import PLUGIN, plug_info
 
@@ -69,19 +70,22 @@ def test_a_fixer_writes_into_the_layer_that_the_user_names(built):
     assert before == {name: layer.ExportToString() for name, layer in layers.items()}
 
 
-def test_other_applications_find_them_by_the_environment_variable(built):
+def test_other_applications_find_them_and_the_schemas_by_the_environment_variable(built, capsys):
     FAULTS["FitRange"](built)
     code = (
         "import sys\n"
         "from pxr import Usd, UsdValidation as V\n"
         "registry = V.ValidationRegistry()\n"
         "names = [m.name for m in registry.GetValidatorMetadataForKeyword('usdBrdf')]\n"
+        "schema = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('UsdBrdfMaterialFitAPI')\n"
+        "assert 'usdBrdf:fit:phi' in schema.GetPropertyNames()\n"
         "assert 'usdbrdf' not in sys.modules\n"
         "found = V.ValidationContext(keywords=['usdBrdf']).Validate(Usd.Stage.Open(sys.argv[1]))\n"
         "import json; print(json.dumps([len(names), [e.GetName() for e in found]]))"
     )
     root = str(validators_path().parents[1])
-    paths = os.pathsep.join([str(plugin_path()), str(validators_path())])
+    assert main(["plugin-path"]) == 0
+    paths = capsys.readouterr().out.strip()
     done = subprocess.run(
         [sys.executable, "-c", code, str(built.asset.root_layer)],
         env={**os.environ, "PYTHONPATH": root, "PXR_PLUGINPATH_NAME": paths},

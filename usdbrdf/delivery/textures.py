@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
-from usdbrdf.files.images import image_size, resized, write_exr, write_preview_png
+from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
 from usdbrdf.stage.packaged_files import NewTexture, TextureUse
-from usdbrdf.stage.published_materials import read_texture
+from usdbrdf.stage.published_materials import is_srgb, read_texture
 
 Float = npt.NDArray[np.float32]
 Byte = npt.NDArray[np.uint8]
@@ -23,6 +23,8 @@ EXR, PNG = "exr", "png"
 # What a package may hold as it is; of these, what has 8 bits already.
 EIGHT_BIT = frozenset({".png", ".jpg", ".jpeg"})
 IMAGES = EIGHT_BIT | {".exr"}
+# What becomes EXR or PNG.
+CONVERTED = frozenset({".hdr", ".tif", ".tiff"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,21 +48,20 @@ def add_texture(
     width, height, _ = image_size(use.file)
     smaller = size_within(width, height, options.max_size)
     fits = smaller == (width, height)
-    as_it_is = source in EIGHT_BIT or options.format == EXR
+    as_it_is = source in EIGHT_BIT or (options.format == EXR and source not in CONVERTED)
     if as_it_is and (fits or use.reads_alpha):
         path = _free(f"textures/{use.file.stem}{source}", taken)
         _place(folder / path)
         shutil.copyfile(use.file, folder / path)
-        space = use.space
-        if space == "auto":
-            space = "sRGB" if source in EIGHT_BIT else "raw"
-        return NewTexture(path=path, space=space)
-    if use.reads_alpha:
+        return NewTexture(path=path, space="sRGB" if is_srgb(use.file, use.space) else "raw")
+    if use.reads_alpha and options.format != EXR:
         raise InputRefused(
             f"{use.file}: its alpha is used, and 8-bit packages keep alpha of PNG files only. Save "
             "it as PNG. [package.alpha]"
         )
     pixels = read_texture(use.file, use.space)
+    if use.reads_alpha:
+        pixels = _with_alpha(pixels, use.file)
     if not fits:
         pixels = resized(pixels, *smaller)
     path = _free(f"textures/{use.file.stem}.{options.format}", taken)
@@ -74,12 +75,17 @@ def add_texture(
 
 
 def add_file(file: Path, below: Path, folder: Path, taken: Collection[str]) -> str:
-    """Copy a picture that is no texture of a material; returns its path in the package, which is
-    the one that it has below ``below`` if that is free."""
+    """Add a picture that is no texture of a material, such as a dome light's; returns its path in
+    the package, which is the one that it has below ``below`` if that is free."""
     _check_is_image(file)
-    path = _free(file.relative_to(below).as_posix(), taken)
+    convert = file.suffix.lower() in CONVERTED
+    place = file.relative_to(below)
+    path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken)
     _place(folder / path)
-    shutil.copyfile(file, folder / path)
+    if convert:
+        write_exr(folder / path, read_texture(file, "auto"))
+    else:
+        shutil.copyfile(file, folder / path)
     return path
 
 
@@ -104,11 +110,21 @@ def size_within(width: int, height: int, max_size: int | None) -> tuple[int, int
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
+def _with_alpha(colour: Float, file: Path) -> Float:
+    """(H, W, 4), or the colour alone where the file has no alpha: readers take it for 1."""
+    names = [name.upper() for name in image_size(file)[2]]
+    if "A" not in names:
+        return colour
+    alpha = np.nan_to_num(read_exr(file)[..., names.index("A"), None])
+    return np.concatenate([colour, alpha], axis=2)
+
+
 def _check_is_image(file: Path) -> None:
-    if file.suffix.lower() not in IMAGES:
+    if file.suffix.lower() not in IMAGES | CONVERTED:
+        known = ", ".join(sorted(IMAGES | CONVERTED))
         raise InputRefused(
-            f"{file}: packages hold {', '.join(sorted(IMAGES))} only. Convert it, or take it out "
-            "of edits.usda. [package.format]"
+            f"{file}: packages are made of {known} only. Convert it, or take it out of edits.usda. "
+            "[package.format]"
         )
     image_size(file)  # refuses what only has the name of a picture
 

@@ -76,6 +76,11 @@ def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
     return spec.full_width, spec.full_height, tuple(spec.channelnames)
 
 
+def is_eight_bit(path: Path) -> bool:
+    """Whether the image holds bytes, from the header alone."""
+    return str(_open(path, MAX_SIDE).spec().format) == "uint8"
+
+
 def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
     """Write finite pixels, (H, W) or (H, W, 1 | 3 | 4), as ZIP-compressed scene-linear Rec.709.
 

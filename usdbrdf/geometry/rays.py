@@ -78,6 +78,9 @@ class RayScene:
 
     def closest(self, origins: Float, directions: Float) -> Hits:
         """First hit of each ray; origins and directions (R, 3) float32 in the world frame."""
+        if len(origins) <= _CHUNK:
+            found = self._scene.run(origins, directions, output=True)
+            return Hits(face=found["primID"], u=found["u"], v=found["v"], distance=found["tfar"])
         face = np.full(len(origins), -1, np.int32)
         u, v, distance = (np.zeros(len(origins), np.float32) for _ in range(3))
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from usdbrdf.geometry.packed_texture import PackedArrays, packed_arrays
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.kernel import kernel, loop, parallel_kernel
 
@@ -38,6 +40,10 @@ class SurfaceTexture:
     @property
     def arrays(self) -> TextureArrays:
         return self.pixels, self.corner_pixel, self.first_pixel, self.size
+
+    @cached_property
+    def packed(self) -> PackedArrays:
+        return packed_arrays(*self.arrays)
 
     def at(self, face: Int, u: Float, v: Float) -> Float:
         """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""

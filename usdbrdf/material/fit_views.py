@@ -21,6 +21,7 @@ from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.texturing.footprints import RINGS
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -37,11 +38,6 @@ _WIDER = (0.5, 1.0, 1.4, 2.0)
 _KEPT = 0.4
 # From this deviation of the normal over a footprint on, in radians, an object counts as curved.
 _CURVED = 0.01
-# Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
-_RING = np.pi / 4 * np.arange(8)
-_OFFSETS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
-    [np.cos(_RING), np.sin(_RING)], axis=-1
-)
 MIN_OBSERVATIONS = 48
 _MIN_VIEWS = 3
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
@@ -73,8 +69,8 @@ def fit_views(
     samples = _samples(lit, texels, observed, footprints[0], view_of)
     # Views of a texel share their random numbers: what they have in common then cancels in their
     # differences, which are all that is fitted.
-    points_of_texel = len(_OFFSETS) * samples.texel[:, None]
-    stream = (points_of_texel + np.arange(len(_OFFSETS))).ravel()
+    points_of_texel = len(RINGS) * samples.texel[:, None]
+    stream = (points_of_texel + np.arange(len(RINGS))).ravel()
     candidates = []
     for points in footprints:
         bases = [
@@ -97,9 +93,9 @@ def _footprints(
     see; and the footprints' points, for the usual width and, on curved objects, for others."""
 
     def whole(some: Observations, width: float) -> tuple[Long, SurfacePoints]:
-        kept, points = _points(lit, texels, some, view_of, index, width * _OFFSETS)
+        kept, points = _points(lit, texels, some, view_of, index, width * RINGS)
         enough = _several_views(some.texel[kept])
-        return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(_OFFSETS))))
+        return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(RINGS))))
 
     kept, points = whole(observed, _FOOTPRINT)
     observed = observed.take(kept)
@@ -126,7 +122,7 @@ def _samples(
     position = texels.position[observed.texel]
     # Views cut a pattern differently: its contrast within the footprint is an error of the sample.
     shown = lit.radiance.at(points.face, points.u, points.v)
-    contrast = shown.reshape(len(position), len(_OFFSETS), 3).std(axis=1)
+    contrast = shown.reshape(len(position), len(RINGS), 3).std(axis=1)
     return ViewSamples(
         texel=np.unique(observed.texel, return_inverse=True)[1].astype(np.int64),
         frame=observed.frame.astype(np.int64),
@@ -164,7 +160,7 @@ def _pixel_size(position: Float, frame: Int, view_of: Callable[[int], View]) -> 
 
 def _deviation_of_normal(points: SurfacePoints) -> float:
     """Median standard deviation of the normal, in radians per axis, over a sample's points."""
-    normal = points.normal.reshape(-1, len(_OFFSETS), 3)
+    normal = points.normal.reshape(-1, len(RINGS), 3)
     spread = ((normal - normal.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
     return float(np.sqrt(np.median(spread) / 2))
 

@@ -124,6 +124,20 @@ class Follower:
             noise=self._noise[row],
         )
 
+    def target_frames(self, texels: Texels) -> Int:
+        """Per object, the frame in which its followed texels mirror most light beyond what each of
+        them mirrors on the mean; -1 where none does, or nothing was followed."""
+        mean = self._light.sum(axis=0) / np.maximum(self._seen.sum(axis=0), 1)
+        objects = len(texels.resolution)
+        beyond = np.stack(
+            [
+                np.bincount(self._owner, np.maximum(light - mean, 0) * seen, minlength=objects)
+                for seen, light in zip(self._seen, self._light, strict=True)
+            ]
+        )
+        best = self._frame[beyond.argmax(axis=0)]
+        return np.where(beyond.max(axis=0) > 0, best, -1).astype(np.int32)
+
     def _scores(self) -> Double:
         """How much the mirrored light changes between the views of each followed texel, over its
         radiance; -1 where too few frames see it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -18,7 +18,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.scan.scan import Scan
 
-__all__ = ["Adapter", "IngestOptions", "list_adapters", "read_scan"]
+__all__ = ["Adapter", "IngestOptions", "choose_adapter", "list_adapters", "read_scan", "read_with"]
 
 GROUP = "usdbrdf.adapters"
 
@@ -45,13 +45,17 @@ class AdapterModule(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Adapter:
-    """An announced adapter; ``module`` is None and ``problem`` says why if it is broken."""
+    """An announced adapter; ``module`` is None and ``problem`` says why if it is broken.
+
+    package  distribution and version that announce it; "" for ours
+    """
 
     name: str
     description: str
     origin: str
     module: AdapterModule | None
     problem: str = ""
+    package: str = ""
 
 
 def list_adapters(*, plugins: bool = True) -> tuple[Adapter, ...]:
@@ -71,14 +75,17 @@ def read_scan(
     path: Path, options: IngestOptions, adapter: str | None = None, *, plugins: bool = True
 ) -> Scan:
     """Read a capture with the named adapter, or with the first that recognises it."""
+    return read_with(choose_adapter(path, adapter, plugins=plugins), path, options)
+
+
+def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True) -> Adapter:
+    """The named adapter, or the first that recognises the capture."""
     adapters = list_adapters(plugins=plugins)
-    if adapter is not None:
-        chosen = _named(adapter, adapters)
-    elif not path.exists():
+    if name is not None:
+        return _named(name, adapters)
+    if not path.exists():
         raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
-    else:
-        chosen = _recognising(path, adapters)
-    return _read(chosen, path, options)
+    return _recognising(path, adapters)
 
 
 def _loaded(point: EntryPoint) -> Adapter:
@@ -107,7 +114,12 @@ def _loaded(point: EntryPoint) -> Adapter:
         description=module.DESCRIPTION,
         origin=point.value,
         module=cast(AdapterModule, module),
+        package="" if point.name in _OURS or point.dist is None else _name_of(point.dist),
     )
+
+
+def _name_of(package: Distribution) -> str:
+    return f"{package.metadata['Name']} {package.version}"
 
 
 def _named(name: str, adapters: tuple[Adapter, ...]) -> Adapter:
@@ -138,7 +150,8 @@ def _recognising(path: Path, adapters: tuple[Adapter, ...]) -> Adapter:
     )
 
 
-def _read(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
+def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
+    """What a chosen adapter makes of a capture."""
     assert adapter.module is not None
     try:
         return adapter.module.read(path, options)

@@ -6,8 +6,9 @@ eq. 10). Two estimators:
 ``cosine``  the paper's: independent cosine-distributed directions.
 ``mis``     as many cosine-distributed directions as points picked on the bright triangles, combined
             by the balance heuristic (E. Veach and L. Guibas, "Optimally combining sampling
-            techniques for Monte Carlo rendering", 1995). Sobol points, shifted once per patch of
-            8 x 8 texels: neighbouring texels trace nearly parallel rays, which Embree likes.
+            techniques for Monte Carlo rendering", 1995). Which triangles are picked is up to each
+            patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the patch and
+            the texel: neighbouring texels trace nearly parallel rays, which Embree likes.
 
 Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
 ``mis``: points that happen to agree stop early. Tests bound this by 1e-3 of S.
@@ -29,30 +30,27 @@ from usdbrdf.geometry.surface_radiance import SurfaceTexture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.irradiance_batches import (
-    DIMENSIONS,
+    PickArrays,
     add_cosine_batch,
     add_light_batch,
     cosine_batch,
     frames_of,
     light_batch,
     mean_and_error,
-    shifts_of_points,
+    scrambles_of_points,
 )
-from usdbrdf.shading.irradiance_kernels import Draws
+from usdbrdf.shading.light_groups import weighed_groups
 from usdbrdf.shading.lights import Lights
-from usdbrdf.shading.warps import patch_shifts, sobol_points
+from usdbrdf.shading.warps import sobol_bits
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Long = npt.NDArray[np.int64]
+Bits = npt.NDArray[np.uint32]
 
 _BLOCKS = 4
 _FIRST_ROUND = 64
-# A point's own part of the shift: small, so that the rays of a patch stay nearly parallel. With
-# fewer rays than in a whole first round all of it is its own: errors that a patch's points share
-# show as a block then, which a filter takes for the picture.
-_OWN_SHIFT = 1 / 8
 # Points that a thread takes at a time, and rays that it makes, traces and adds up at a time: enough
 # to make the calls cheap, few enough to stay in the cache of its core.
 _POINTS, _BATCH = 1 << 10, 1 << 14
@@ -65,7 +63,7 @@ class Sampling:
     estimator       "mis" or "cosine"
     standard_error  "mis" doubles a patch's rays until its relative standard error is below this
     max_rays        per texel; "cosine" traces exactly this many
-    seed            of the random shifts
+    seed            of the random bits
     """
 
     estimator: Literal["mis", "cosine"] = "mis"
@@ -117,8 +115,9 @@ def irradiance_at(
     """S at N surface points.
 
     position, normal (N, 3) float32, world; patch (N,) int32 ascending: points of one patch share
-    their random shift and their stopping. scene_size: metres, for the lift off the surface.
-    dark: (N,) W/m^2; where S is below it, the standard error is held against it instead of S.
+    what lights they pick, part of their random bits, and their stopping. scene_size: metres, for
+    the lift off the surface. dark: (N,) W/m^2; where S is below it, the standard error is held
+    against it instead of S.
     """
     # A point's number within its patch of at most 64: so no two points of the scene share their
     # random numbers, and a point draws the same ones whatever tile it comes in.
@@ -164,17 +163,20 @@ def _irradiance_of(points: _Points, light: _Light, sampling: Sampling) -> Irradi
     count = len(points.origin)
     mean, error = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    sums, escaped = np.zeros((2, count, _BLOCKS, 3)), np.zeros(count)
+    sums, escaped = np.zeros((2, _BLOCKS, count, 3)), np.zeros(count)
     active: Any = slice(None)
-    for first, last in _rounds(sampling, light.techniques):
+    rounds = _rounds(sampling, light.techniques)
+    for first, last in rounds:
         if first:
-            sums[:, :, 0] += sums[:, :, 1]
-            sums[:, :, 1] = sums[:, :, 2] + sums[:, :, 3]
-            sums[:, :, 2:] = 0
+            sums[:, 0] += sums[:, 1]
+            sums[:, 1] = sums[:, 2] + sums[:, 3]
+            sums[:, 2:] = 0
         light.add(points, first, last, sums, escaped)
         found, scatter = mean_and_error(sums, last)
         mean[active], error[active], share[active] = found, scatter, escaped / last
         done[active] = light.techniques * last
+        if last == rounds[-1][1]:
+            break
         noisy = np.flatnonzero(
             _noisy(points.patch, found, scatter, sampling.standard_error, points.floor)
         )
@@ -182,7 +184,7 @@ def _irradiance_of(points: _Points, light: _Light, sampling: Sampling) -> Irradi
             break
         if len(noisy) < len(escaped):
             active = np.arange(count)[active][noisy]
-            points, sums, escaped = points.of(noisy), sums[:, noisy], escaped[noisy]
+            points, sums, escaped = points.of(noisy), sums[:, :, noisy], escaped[noisy]
     return Irradiance(mean=mean, standard_error=error, rays=done, escaped=share)
 
 
@@ -220,49 +222,66 @@ class _Light:
     ) -> None:
         independent = sampling.estimator == "cosine"
         self.rays = rays
-        self.radiance = radiance.arrays
+        self.radiance = radiance.packed
         self.environment = environment.arrays
         self.lights = lights.arrays
         self.seed = sampling.seed
         self.techniques = 1 if independent or not len(lights.face) else 2
+        self.groups = lights.groups
         log2_count = int(np.ceil(np.log2(max(sampling.max_rays, 2))))
-        self.sobol = (
-            np.zeros((0, DIMENSIONS)) if independent else sobol_points(log2_count, DIMENSIONS)
-        )
-        self.own_shift = _OWN_SHIFT if sampling.max_rays >= _FIRST_ROUND else 1.0
-        # Several steps per light: picking then seldom has to look further.
-        steps = np.linspace(0, 1, 8 * len(lights.face), endpoint=False)
-        self.guide = np.searchsorted(lights.cumulative, steps, side="right").astype(np.int32)
+        self.sobol = sobol_bits(0 if independent else log2_count)[independent:]
+        first_round = _rounds(sampling, self.techniques)[0][1]
+        self.own_bits = _own_bits(first_round)
 
     def add(self, points: _Points, first: int, last: int, sums: Double, escaped: Double) -> None:
-        """Trace samples first..last of each point and add them to sums (2, P, 4, 3), one for each
+        """Trace samples first..last of each point and add them to sums (2, 4, P, 3), one for each
         technique, and escaped (P,)."""
-        frames, draws = frames_of(points.normal), self._draws(points)
-        shifts = shifts_of_points(draws, self.own_shift)
+        frames = frames_of(points.normal)
+        scrambles = scrambles_of_points(points.patch, points.identity, self.seed, self.own_bits)
+        draws = self.sobol, scrambles, self.seed, points.identity
+        picks = self._picks(points)
         step = max(1, _BATCH // len(points.origin))
         for start in range(first, last, step):
             stop = min(start + step, last)
             block = _block_of(np.arange(start, stop), first, last)
-            origins, directions = cosine_batch(points.origin, frames, shifts, draws, start, stop)
+            origins, directions = cosine_batch(points.origin, frames, draws, start, stop)
             hits = self.rays.closest(origins, directions)
             add_cosine_batch(
-                self.radiance, self.environment, self.lights, self.techniques == 2, points.normal,
+                self.radiance, self.environment, self.lights, picks, points.normal,
                 directions, (hits.face, hits.u, hits.v, hits.distance), block, sums[0], escaped,
             )  # fmt: skip
             if self.techniques == 2:
-                number, *segments, brought = light_batch(
-                    self.radiance, self.lights, self.guide, points.origin, points.normal, shifts,
-                    self.sobol, start, stop,
-                )  # fmt: skip
+                *segments, lit = light_batch(
+                    picks, points.origin, points.normal, draws, start, stop
+                )
                 blocked = self.rays.occluded(*segments)
-                add_light_batch(number, brought, blocked, block, sums[1])
+                add_light_batch(self.radiance, lit, blocked, block, sums[1])
 
-    def _draws(self, points: _Points) -> Draws:
-        """The random numbers of the points, which depend on their patches' numbers only: a tile
-        draws what the whole would."""
-        low, high = int(points.patch.min()), int(points.patch.max())
-        shifts = patch_shifts(high - low + 1, DIMENSIONS, self.seed, low)
-        return self.sobol, shifts, points.patch - low, self.seed, points.identity
+    def _picks(self, points: _Points) -> PickArrays:
+        starts = np.flatnonzero(np.diff(points.patch, prepend=-1))
+        number = np.repeat(
+            np.arange(len(starts), dtype=np.int32), np.diff(starts, append=len(points.patch))
+        )
+        if self.techniques == 1:
+            none = np.zeros((0, 0))
+            return self.groups.arrays, number, none, none.astype(np.int32), none.astype(np.float32)
+        first_point = np.append(starts, len(points.patch))
+        weighed = weighed_groups(
+            self.groups.start, self.groups.bounds, points.origin, points.normal, first_point
+        )
+        return self.groups.arrays, number, *weighed
+
+
+def _own_bits(samples: int) -> Bits:
+    """Which bits of its scrambles a point has for itself, (2,).
+
+    In every run of 2^m Sobol points each cell of a grid of 2^m cells holds one. Where in the cells
+    is a point's own; which cell comes when is its patch's, so that the patch's rays of one sample
+    stay nearly parallel and yet its points' errors are independent.
+    """
+    shared = (samples & -samples).bit_length() - 1
+    high = (shared + 1) // 2
+    return np.array([(1 << 32 - high) - 1, (1 << 32 - (shared - high)) - 1], np.uint32)
 
 
 def _block_of(sample: Long, first: int, last: int) -> Long:

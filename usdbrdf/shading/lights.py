@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels
+from usdbrdf.shading.light_groups import LightGroups, light_groups
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -20,7 +22,7 @@ LightArrays: TypeAlias = tuple[Int, Double, Float, Float, Float]
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
-_BRIGHT = 6.0
+_BRIGHT = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +45,10 @@ class Lights:
     @property
     def arrays(self) -> LightArrays:
         return self.face, self.cumulative, self.density, self.corners, self.normals
+
+    @cached_property
+    def groups(self) -> LightGroups:
+        return light_groups(*self.arrays)
 
 
 def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Lights:

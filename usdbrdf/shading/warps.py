@@ -11,6 +11,7 @@ from usdbrdf.kernel import kernel
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Long = npt.NDArray[np.int64]
+Bits = npt.NDArray[np.uint32]
 
 
 def sobol_points(log2_count: int, dimensions: int) -> Double:
@@ -21,6 +22,13 @@ def sobol_points(log2_count: int, dimensions: int) -> Double:
     """
     points: Double = qmc.Sobol(dimensions, scramble=False).random_base2(log2_count)
     return points
+
+
+def sobol_bits(log2_count: int) -> Bits:
+    """The first 2**log2_count two-dimensional ones as numbers of 32 bits, (N, 2). Combined with
+    random bits by exclusive or (T. Kollig and A. Keller, "Efficient Multidimensional Sampling",
+    2002) they stay one in each cell of every grid of 2**m cells."""
+    return np.asarray(sobol_points(log2_count, 2) * 2.0**32, np.uint64).astype(np.uint32)
 
 
 @kernel

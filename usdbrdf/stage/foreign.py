@@ -138,7 +138,7 @@ def _opened(path: Path) -> Any:
 
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
     """Visible meshes in the order of the stage, and sentences about the rest."""
-    meshes, other, cages, hidden = [], [], 0, 0
+    meshes, other, hidden = [], [], 0
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
         if prim.IsA(UsdGeom.PointInstancer):
             raise InputRefused(
@@ -150,9 +150,7 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
         if not _is_visible(prim):
             hidden += 1
         elif prim.IsA(UsdGeom.Mesh):
-            mesh = UsdGeom.Mesh(prim)
-            meshes.append(mesh)
-            cages += mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none
+            meshes.append(UsdGeom.Mesh(prim))
         else:
             other.append(f"<{prim.GetPath()}> ({prim.GetTypeName()})")
     if not meshes:
@@ -160,36 +158,44 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
             f"{path}: no visible mesh below <{root.GetPath()}>. Export the surface as meshes "
             "inside the default prim. [mesh.empty]"
         )
+    return meshes, _warnings(path.name, root, meshes, other, hidden)
+
+
+def _warnings(
+    name: str, root: Any, meshes: Sequence[Any], other: Sequence[str], hidden: int
+) -> list[str]:
+    """What a file's meshes lose on the way, and what else it holds: prims of other types, and the
+    number of hidden ones."""
     warnings = []
     if other:
         warnings.append(
-            f"{path.name}: {len(other)} prims are not meshes and are ignored, first {other[0]}. "
+            f"{name}: {len(other)} prims are not meshes and are ignored, first {other[0]}. "
             "[stage.not_mesh]"
         )
+    schemes = [mesh.GetSubdivisionSchemeAttr().Get() for mesh in meshes]
+    cages = sum(scheme != UsdGeom.Tokens.none for scheme in schemes)
     if cages:
         warnings.append(
-            f"{path.name}: {cages} meshes are subdivision cages (what USD assumes where no scheme "
+            f"{name}: {cages} meshes are subdivision cages (what USD assumes where no scheme "
             "is set); the cage is taken as the surface. [stage.subdivision]"
         )
     moving = [mesh for mesh in meshes if _is_moving(mesh, root)]
     if moving:
         warnings.append(
-            f"{path.name}: {len(moving)} meshes move or change with time, first "
+            f"{name}: {len(moving)} meshes move or change with time, first "
             f"<{moving[0].GetPath()}>; each is taken, and stays, as its first time sample has it. "
             "The photographs must show that state. [stage.animated]"
         )
     skinned = sum(mesh.GetPrim().HasAPI(UsdSkel.BindingAPI) for mesh in meshes)
     if skinned:
         warnings.append(
-            f"{path.name}: {skinned} meshes may be bound to a skeleton, which is not applied: they "
+            f"{name}: {skinned} meshes may be bound to a skeleton, which is not applied: they "
             "are taken in their rest pose. Bake the pose that the photographs show. "
             "[stage.skinned]"
         )
     if hidden:
-        warnings.append(
-            f"{path.name}: {hidden} invisible or guide prims are left out. [stage.hidden]"
-        )
-    return meshes, warnings
+        warnings.append(f"{name}: {hidden} invisible or guide prims are left out. [stage.hidden]")
+    return warnings
 
 
 def _is_moving(mesh: Any, root: Any) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
 from usdbrdf.files.colour import to_working_space
-from usdbrdf.files.images import image_size, read_exr, read_radiance
+from usdbrdf.files.images import image_size, is_eight_bit, read_exr, read_radiance
 from usdbrdf.relighting.surfaces import Float, Material, constant_map, preview_material
 from usdbrdf.stage.frames_from_stage import asset_file
 from usdbrdf.stage.preview_surface import fit_from_preview_surface
@@ -27,7 +27,6 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
     "useSpecularWorkflow": (0.0,),
     "opacity": (1.0,),
 }
-_FLOAT_FORMATS = frozenset({".exr", ".hdr"})
 # "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
 _WRAP = {"repeat": "repeat", "mirror": "mirror"}
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
@@ -233,16 +232,23 @@ class _Reader:
 
 
 def read_texture(file: Path, space: str) -> Float:
-    """(H, W, 3) float32 linear Rec.709. ``space`` is UsdUVTexture's: raw, sRGB, or auto, which
-    takes integer images for sRGB."""
+    """(H, W, 3) float32 linear Rec.709; ``space`` is UsdUVTexture's: raw, sRGB or auto."""
     if len(image_size(file)[2]) >= 3:
         texels = read_radiance(file)
     else:
         texels = np.repeat(read_exr(file)[..., :1], 3, axis=2)
     texels = np.nan_to_num(texels, nan=0.0, posinf=0.0, neginf=0.0)
-    if space == "sRGB" or (space == "auto" and file.suffix.lower() not in _FLOAT_FORMATS):
+    if is_srgb(file, space):
         return to_working_space(texels, "srgb_rec709_scene")
     return texels
+
+
+def is_srgb(file: Path, space: str) -> bool:
+    """Whether a texture's values are sRGB, where UsdUVTexture is told raw, sRGB or auto: this last
+    is sRGB for bytes of three or four channels."""
+    if space == "auto":
+        return is_eight_bit(file) and len(image_size(file)[2]) >= 3
+    return space == "sRGB"
 
 
 def _source(wanted: UsdShade.Input | None) -> tuple[UsdShade.Shader, str] | None:

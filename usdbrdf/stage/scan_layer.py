@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,11 +61,7 @@ def write_scan_layer(
     _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
     if source and scan.usd_geometry:
         author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        for i, (path_of_mesh, mesh) in enumerate(meshes.items()):
-            weaken_bindings(layer, mesh, source, scopes.root)
-            normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
-            author_overrides(layer, path_of_mesh, mesh, normals)
-            author_label(over(layer, path_of_mesh), scan.objects[i])
+        _author_input_meshes(layer, scopes.root, source, meshes, scan)
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
@@ -107,6 +104,17 @@ def _input_meshes(source: Usd.Prim, scan: Scan, root: str) -> dict[str, Usd.Prim
     meshes = [input_mesh(source, below) for below in scan.object_prims]
     here = Sdf.Path(root)
     return {str(mesh.GetPath().ReplacePrefix(source.GetPath(), here)): mesh for mesh in meshes}
+
+
+def _author_input_meshes(
+    layer: Sdf.Layer, root: str, source: Usd.Prim, meshes: Mapping[str, Usd.Prim], scan: Scan
+) -> None:
+    """What the referenced meshes need to be our objects."""
+    for i, (path, mesh) in enumerate(meshes.items()):
+        weaken_bindings(layer, mesh, source, root)
+        normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
+        author_overrides(layer, path, mesh, normals)
+        author_label(over(layer, path), scan.objects[i])
 
 
 def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:

@@ -175,8 +175,8 @@ def _said(item: FittedObject) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Survey:
-    """What one pass over the frames gathers, as the method needs: per object the target frame (-1:
-    none), or the observations of followed texels."""
+    """What one pass over the frames gathers: per object the target frame, which shows its highlight
+    best (-1: none), and, as the method needs, the observations of followed texels."""
 
     target: Int
     observations: Observations
@@ -199,9 +199,9 @@ def _survey(
                 follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
             else:
                 counts.append(_count(lit, frames, i, pixels.valid))
-        target = np.full(len(lit.scene.objects), -1, np.int32)
-        if counts:
-            target, _ = choose_target_frames(counts)
+        target = (
+            follower.target_frames(atlas.texels) if by_views else choose_target_frames(counts)[0]
+        )
         chosen = follower.chosen(atlas.texels, options.seed)
         return {"target": target, **chosen.arrays()}
 
@@ -235,8 +235,8 @@ def _fit_arrays(
     options: FitOptions,
 ) -> dict[str, npt.NDArray[Any]]:
     """phi, psi, their errors, share unresolved, cost and evidence (NaN where the object could not
-    be fitted), the number of samples, and the target frame (-1: many frames)."""
-    numbers, used, target = np.full(7, np.nan), 0, -1
+    be fitted), the number of samples, and the target frame (-1: none)."""
+    numbers, used, target = np.full(7, np.nan), 0, int(survey.target[index])
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
@@ -248,8 +248,7 @@ def _fit_arrays(
                 lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
                 lobe.evidence,
             )  # fmt: skip
-    elif survey.target[index] >= 0 and not _is_lamp(lit, index):
-        target = int(survey.target[index])
+    elif target >= 0 and not _is_lamp(lit, index):
         pixels = read_frame(frames, target)
         view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
         residual: Residual = "paper" if options.method == "paper" else "scaled"

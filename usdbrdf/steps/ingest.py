@@ -9,7 +9,7 @@ from typing import Any
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult, StageRun
-from usdbrdf.scan.adapters import read_scan
+from usdbrdf.scan.adapters import choose_adapter, read_with
 from usdbrdf.scan.geometry_from_usd import USD_SUFFIXES
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.asset import ROLES, Asset
@@ -38,6 +38,11 @@ def ingest(
         for key, value in asdict(options).items()
         if key not in ("mesh", "objects", "allow_outside")
     }
+    inputs = _inputs(capture, options, asset.folder)
+    chosen = choose_adapter(capture, adapter, plugins=plugins)
+    if chosen.package:
+        # Our own adapters change with the version of the code, which every stamp holds.
+        parameters["adapter_package"] = chosen.package
     step = Step(
         asset=asset,
         name="ingest",
@@ -47,11 +52,11 @@ def ingest(
             "places": _places(capture, options, asset),
             **parameters,
         },
-        inputs=_inputs(capture, options, asset.folder),
+        inputs=inputs,
     )
 
     def work(run: StageRun) -> dict[str, Any]:
-        scan = read_scan(capture, options, adapter, plugins=plugins)
+        scan = read_with(chosen, capture, options)
         for warning in scan.warnings:
             say(f"warning: {warning}")
         header = StageHeader.of_scan(asset.name, scan)

@@ -2,7 +2,8 @@
 
 The median of the frames keeps the specular reflection that is seen from everywhere: by 2 to 130 %
 it made albedos too large. With the lobes known it can be taken off every single sample, by ray
-tracing; the same streaming median then runs over what is left.
+tracing. What is left are samples of one number with known errors: so their robust mean takes the
+place of the median, and what the pixels blurred is restored where it stands above the noise.
 """
 
 from __future__ import annotations
@@ -21,19 +22,25 @@ from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, TexelMap
 from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
-from usdbrdf.texturing import psquare
+from usdbrdf.texturing.footprints import footprints, widest
 from usdbrdf.texturing.inpaint import inpaint
-from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
+from usdbrdf.texturing.radiance_from_frames import samples_from_frames
+from usdbrdf.texturing.restore import restored
+from usdbrdf.texturing.robust_mean import MeanState, robust_mean, update
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
-# Rays per texel and frame: the median over the frames averages their noise out.
+# Rays per texel and frame: the mean over the frames averages their noise out.
 _RAYS = 16
-# Whatever quantile the lit map has: highlights are gone, so the median is the diffuse radiance.
-_QUANTILE = 0.5
+# A sample's error, in parts of the texel's lit radiance: what poses, lobes and reading do to it;
+# and in parts of the noise floor, which lies some four deviations of the sensor's noise above zero.
+_RELATIVE_ERROR, _OF_NOISE_FLOOR = 0.03, 0.25
+# Errors in proportion to what is seen: those of black surfaces are not below this share of the
+# scene's median.
+_DARKEST = 1e-3
 
 
 def refined_maps(
@@ -53,12 +60,11 @@ def refined_maps(
     """
     texels = atlas.texels
     observed = _observe(run, atlas, lit, frames, lobes, seed)
-    measured = observed.quantiles.count > 0
+    measured = observed.count > 0
     emission = atlas.map_where_present("emission", 3)
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
-    diffuse = np.maximum(psquare.quantile(observed.quantiles, _QUANTILE), 0)
-    diffuse = np.where(emissive[:, None], emission, inpaint(texels, diffuse, known))
+    diffuse = np.where(emissive[:, None], emission, _restored(atlas, observed, known))
     # What clips in every frame is at least as bright as that.
     coverage = atlas.map("coverage")
     clipped = coverage == CLIPPED
@@ -81,6 +87,22 @@ def refined_maps(
     }
 
 
+def _restored(atlas: Atlas, observed: MeanState, known: Bool) -> Float:
+    """(T, 3), W/(m^2 sr), from the means in units of ``_level``; filled in where not ``known``."""
+    found = robust_mean(observed)
+    level = _level(atlas)[:, None]
+    filled = inpaint(atlas.texels, np.maximum(found.mean * level, 0), known)
+    variance = found.variance * level[:, 0] ** 2
+    return np.maximum(restored(atlas.texels, filled, known, variance, found.footprint), 0)
+
+
+def _level(atlas: Atlas) -> Float:
+    """Of each texel, (T,), W/(m^2 sr): its lit radiance."""
+    lit = atlas.map("lit").mean(axis=1)
+    level: Float = np.maximum(lit, max(_DARKEST * float(np.median(lit)), 1e-30))
+    return level
+
+
 def _observe(
     run: StageRun,
     atlas: Atlas,
@@ -88,26 +110,36 @@ def _observe(
     frames: Frames,
     lobes: Lobes,
     seed: int,
-) -> Observation:
-    """All frames, going on from the last saved state of an interrupted run."""
-    texels, owner = atlas.texels, atlas.texels.object_index()
+) -> MeanState:
+    """All frames without their specular light, in units of ``_level``, going on from the last saved
+    state of an interrupted run."""
+    texels, owner, level = atlas.texels, atlas.texels.object_index(), _level(atlas)
     saved = run.latest("refined")
-    start, observed = 0, Observation.empty(len(texels))
+    start, observed = 0, MeanState.empty(len(texels))
     if saved is not None:
-        start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
-
-    def specular(frame: int, which: Int) -> Float:
-        points = _seen_from(texels, which, frames.world_from_camera[frame][:3, 3])
-        own = owner[which]
-        number = seed + len(frames) + frame
-        return non_diffuse_radiance(lit, points, lobes.phi[own], lobes.psi[own], _RAYS, number)
-
-    steps = radiance_from_frames(
-        texels, atlas.scene, lit.rays, frames, observed, _QUANTILE, start, specular
-    )
-    for done in progress(steps, total=len(frames) - start, label="fit: refine", unit="frames"):
-        if done % 16 == 15:
-            run.save_latest("refined", done, observed.arrays())
+        start, observed = saved[0] + 1, MeanState(**saved[1])
+    samples = samples_from_frames(texels, atlas.scene, lit.rays, frames, start)
+    for some in progress(samples, total=len(frames) - start, label="fit: refine", unit="frames"):
+        pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
+        own, unit = owner[some.texel], level[some.texel]
+        specular = non_diffuse_radiance(
+            lit, _seen_from(texels, some.texel, pose[:3, 3]), lobes.phi[own], lobes.psi[own], _RAYS,
+            seed + len(frames) + some.frame,
+        )  # fmt: skip
+        covered = footprints(texels, some.texel, pose, lens)
+        noise = _OF_NOISE_FLOOR * np.float32(frames.noise_floor_radiance[some.frame]) / unit
+        # A wide view of a texel says less of it than its noise tells.
+        wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
+        deviation = np.hypot(_RELATIVE_ERROR, noise) * wide
+        update(
+            observed,
+            some.texel,
+            (some.radiance - specular) / unit[:, None],
+            deviation.astype(np.float32),
+            covered,
+        )
+        if some.frame % 16 == 15:
+            run.save_latest("refined", some.frame, observed.arrays())
     return observed
 
 

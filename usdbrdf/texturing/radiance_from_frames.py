@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -31,8 +31,17 @@ Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 # Threads that decode, and frames in memory besides the one that is projected.
 _READERS, _AHEAD = 2, 3
-# (frame, texels) -> what to take off their radiance, (len(texels), 3).
-Specular = Callable[[int, Int], Float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSamples:
+    """What one frame shows: texels with a sample (M,) int32 and their radiance (M, 3) float32;
+    texels that it saw saturated, clipped (K,) int32."""
+
+    frame: int
+    texel: Int
+    radiance: Float
+    clipped: Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,19 +93,36 @@ def radiance_from_frames(
     observed: Observation,
     quantile: float,
     start: int = 0,
-    specular: Specular | None = None,
     part: slice | None = None,
 ) -> Iterator[int]:
     """Add frames start.. to ``observed``, in order; yields each frame's index once it is in.
 
-    specular  the light that a frame's samples hold besides the diffuse
-    part      the texels that ``observed`` is of; None: all
+    part  the texels that ``observed`` is of; None: all
+    """
+    first = np.int32(part.start if part else 0)
+    for sampled in samples_from_frames(texels, scene, rays, frames, start, part):
+        psquare.update(observed.quantiles, sampled.texel - first, sampled.radiance, quantile)
+        saturated = sampled.clipped - first
+        observed.clipped[saturated] += 1
+        limit = np.float32(frames.saturation_radiance[sampled.frame])
+        observed.lower_bound[saturated] = np.maximum(observed.lower_bound[saturated], limit)
+        yield sampled.frame
+
+
+def samples_from_frames(
+    texels: Texels,
+    scene: Scene,
+    rays: RayScene,
+    frames: Frames,
+    start: int = 0,
+    part: slice | None = None,
+) -> Iterator[FrameSamples]:
+    """What frames start.. show of the texels of ``part`` (None: all), frame by frame.
 
     The next frames are read and decoded while one is projected.
     """
-    part = part or slice(0, len(texels))
     owner = texels.object_index()
-    blocks = blocks_of_texels(texels, part)
+    blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
     for i, pixels in enumerate(_read_ahead(frames, start), start):
         pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
         which = blocks.texels_in_view(pose, lens, size, MIN_COSINE)
@@ -104,15 +130,12 @@ def radiance_from_frames(
             texels, which, owner, first_surfaces(rays, scene.face_object, pose, lens, size),
             pixels.radiance, pixels.valid, pixels.clipped, pose, lens,
         )  # fmt: skip
-        sampled, values = which[kind == SAMPLE], radiance[kind == SAMPLE]
-        if specular is not None:
-            values = values - specular(i, sampled)
-        psquare.update(observed.quantiles, sampled - np.int32(part.start), values, quantile)
-        saturated = which[kind == CLIPPED] - part.start
-        observed.clipped[saturated] += 1
-        limit = np.float32(frames.saturation_radiance[i])
-        observed.lower_bound[saturated] = np.maximum(observed.lower_bound[saturated], limit)
-        yield i
+        yield FrameSamples(
+            frame=i,
+            texel=which[kind == SAMPLE],
+            radiance=radiance[kind == SAMPLE],
+            clipped=which[kind == CLIPPED],
+        )
 
 
 def _read_ahead(frames: Frames, start: int) -> Iterator[FramePixels]:

@@ -126,7 +126,7 @@ def samples_of_texels(
 
 
 @kernel
-def _project(
+def project(
     p: Float, sx: Float, sy: Float, dx: float, dy: float, k: Double, m: Double
 ) -> tuple[float, float, float]:
     """Pixel of the point p + dx sx + dy sy and its depth in front of the camera."""
@@ -174,14 +174,14 @@ def _sample(
             continue
         sx = step_x[t]
         sy = step_y[t]
-        u, v, depth = _project(p, sx, sy, 0.0, 0.0, intrinsics, camera_from_world)
+        u, v, depth = project(p, sx, sy, 0.0, 0.0, intrinsics, camera_from_world)
         column = int(np.floor(u))
         row = int(np.floor(v))
         if depth < 0 or column < 1 or row < 1 or column > width - 2 or row > height - 2:
             continue
         pixel_size = depth / intrinsics[0]
-        ux, vx, _ = _project(p, sx, sy, 1.0, 0.0, intrinsics, camera_from_world)
-        uy, vy, _ = _project(p, sx, sy, 0.0, 1.0, intrinsics, camera_from_world)
+        ux, vx, _ = project(p, sx, sy, 1.0, 0.0, intrinsics, camera_from_world)
+        uy, vy, _ = project(p, sx, sy, 0.0, 1.0, intrinsics, camera_from_world)
         span_x = np.sqrt((ux - u) ** 2 + (vx - v) ** 2)
         span_y = np.sqrt((uy - u) ** 2 + (vy - v) ** 2)
         taps_x = min(_MAX_TAPS, max(1, int(np.ceil(span_x))))
@@ -202,7 +202,7 @@ def _sample(
             for b in range(taps_y):
                 dx = (a + 0.5) / taps_x - 0.5
                 dy = (b + 0.5) / taps_y - 0.5
-                su, sv, _ = _project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
+                su, sv, _ = project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
                 good, saturated, red, green, blue = _bilinear(
                     su, sv, radiance, valid, clipped, red, green, blue
                 )

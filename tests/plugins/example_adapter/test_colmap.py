@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Sdf, Usd
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import make_capture
@@ -44,10 +45,10 @@ def installed(plugins, tmp_path_factory):
 def usdbrdf(installed, tmp_path):
     """The command line with the package installed."""
 
-    def run(*arguments):
+    def run(*arguments, site=installed):
         return subprocess.run(
             [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
-            env={**os.environ, "PYTHONPATH": str(installed)},
+            env={**os.environ, "PYTHONPATH": str(site)},
             cwd=tmp_path,
             capture_output=True,
             text=True,
@@ -104,6 +105,26 @@ def test_the_cameras_are_the_true_ones(usdbrdf, capture, tmp_path):
     np.testing.assert_allclose(frames.intrinsics, np.tile(capture.intrinsics, (12, 1)), atol=1e-5)
     meshes = [prim.GetName() for prim in stage.Traverse() if prim.IsA("Mesh")]
     assert sorted(meshes) == sorted(capture.names)
+
+
+def test_an_upgraded_adapter_reads_again(usdbrdf, installed, capture, tmp_path):
+    site = tmp_path / "site"
+    shutil.copytree(installed, site)
+
+    def said():
+        done = usdbrdf("ingest", capture.folder, "-o", tmp_path / "asset", site=site)
+        assert done.returncode == 0, done.stderr
+        return done.stderr.splitlines()[-1]
+
+    assert said().endswith(": written")
+    assert said().endswith(": up to date")
+    (metadata,) = site.glob("*.dist-info/METADATA")
+    metadata.write_text(re.sub(r"(?m)^Version: .*$", "Version: 9.1", metadata.read_text()))
+    assert said().endswith(": written")
+    assert said().endswith(": up to date")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "asset/layers/scan.usdc"))
+    parameters = layer.customLayerData["usdbrdf"]["parameters"]
+    assert parameters["adapter_package"] == "usdbrdf_colmap 9.1"
 
 
 def test_scale_and_axis_are_the_users(installed, capture, monkeypatch):

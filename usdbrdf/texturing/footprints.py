@@ -1,0 +1,111 @@
+"""What a pixel covers of a surface, and surfaces as pixels blur them, in texels."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.geometry.texels import Texels
+from usdbrdf.kernel import parallel_kernel
+from usdbrdf.texturing.samples_from_frame import project
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+Long = npt.NDArray[np.int64]
+
+# Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
+_RING = np.pi / 4 * np.arange(8)
+RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
+    [np.cos(_RING), np.sin(_RING)], axis=-1
+)
+# Variance of a texel's own area, in texels.
+_OF_TEXEL = 1 / 12
+
+
+def footprints(texels: Texels, which: Int, world_from_camera: Double, intrinsics: Double) -> Float:
+    """A pixel's steps right and down on the surface at some texels, as a covariance in texels:
+    (M, 3), xx, xy, yy. Texels that the camera sees from the front."""
+    found = np.zeros((len(which), 3), np.float32)
+    _footprints(
+        which, texels.position, texels.step_x, texels.step_y,
+        np.linalg.inv(world_from_camera).astype(np.float64, copy=False),
+        np.asarray(intrinsics, np.float64), found,
+    )  # fmt: skip
+    return found
+
+
+def widest(footprint: Float) -> Float:
+    """(M,): standard deviation along the longer axis of covariances (M, 3)."""
+    middle, half = (footprint[:, 0] + footprint[:, 2]) / 2, (footprint[:, 0] - footprint[:, 2]) / 2
+    largest: Float = np.sqrt(middle + np.sqrt(half**2 + footprint[:, 1] ** 2))
+    return largest
+
+
+def blurred(texels: Texels, values: Float, covariance: Float) -> Float:
+    """Means of ``values`` (T, C) over normal distributions around each texel in its atlas, and over
+    the texel's own area. covariance (T, 3): xx, xy, yy, in texels. What lies off a chart counts as
+    the chart's nearest texel does.
+    """
+    owner = texels.object_index()
+    picture = np.ascontiguousarray(values[np.maximum(texels.nearest_texel, 0)])
+    blurry = np.zeros_like(values)
+    _blur(
+        picture, texels.pixel, texels.first_pixel[owner], texels.resolution[owner], covariance,
+        RINGS, blurry,
+    )  # fmt: skip
+    return blurry
+
+
+@parallel_kernel
+def _footprints(
+    which: Int, position: Float, step_x: Float, step_y: Float, m: Double, k: Double, out: Float
+) -> None:
+    for i in prange(len(which)):
+        t = which[i]
+        p, sx, sy = position[t], step_x[t], step_y[t]
+        u, v, _ = project(p, sx, sy, 0.0, 0.0, k, m)
+        ux, vx, _ = project(p, sx, sy, 1.0, 0.0, k, m)
+        uy, vy, _ = project(p, sx, sy, 0.0, 1.0, k, m)
+        # Pixels per texel, and its inverse.
+        a, b, c, d = ux - u, uy - u, vx - v, vy - v
+        determinant = a * d - b * c
+        if abs(determinant) < 1e-9:
+            determinant = 1e-9
+        a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
+        out[i, 0] = a * a + b * b
+        out[i, 1] = a * c + b * d
+        out[i, 2] = c * c + d * d
+
+
+@parallel_kernel
+def _blur(
+    picture: Float,
+    pixel: Long,
+    first: Long,
+    size: Int,
+    covariance: Float,
+    offsets: Double,
+    out: Float,
+) -> None:
+    for t in prange(len(pixel)):
+        width, height = size[t, 0], size[t, 1]
+        at = pixel[t] - first[t]
+        row, column = at // width, at % width
+        # Cholesky's factor of the covariance.
+        across = np.sqrt(covariance[t, 0] + _OF_TEXEL)
+        skewed = covariance[t, 1] / across
+        down = np.sqrt(max(covariance[t, 2] + _OF_TEXEL - skewed * skewed, 0.0))
+        for k in range(len(offsets)):
+            x = column + across * offsets[k, 0]
+            y = row + skewed * offsets[k, 0] + down * offsets[k, 1]
+            x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
+            i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+            fx, fy = x - i, y - j
+            right, below = (1 if width > 1 else 0), (width if height > 1 else 0)
+            p = first[t] + j * width + i
+            for c in range(out.shape[1]):
+                upper = (1 - fx) * picture[p, c] + fx * picture[p + right, c]
+                lower = (1 - fx) * picture[p + below, c] + fx * picture[p + below + right, c]
+                out[t, c] += ((1 - fy) * upper + fy * lower) / len(offsets)

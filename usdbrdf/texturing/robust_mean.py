@@ -1,0 +1,180 @@
+"""Running means per texel that outliers do not spoil, with a state of fixed size.
+
+A median takes all frames for equally good. Where their noise is known, weights make more of the
+same frames: exposures differ by ten times in noise, and near views by as much in sharpness. So a
+texel keeps Huber's M-estimate (P. Huber, "Robust Estimation of a Location Parameter", 1964): every
+five samples are added to what came before by reweighted least squares, in which a sample that lies
+further off than its own error allows loses weight. The first five start from their median.
+
+Besides the mean are kept its variance, and what a pixel covered of the surface, on the average of
+the samples as they were weighted: how blurred it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from usdbrdf.kernel import kernel, parallel_kernel
+
+Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int32]
+
+# Samples that are added at a time.
+_BATCH = 5
+# Deviations from which a sample loses weight, and steps of the reweighting.
+_OUTLYING, _STEPS = 2.5, 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeanState:
+    """What is kept of all samples so far: 132 bytes per texel, however many frames there were.
+
+    waiting    (T, 5, 4) float32, radiance and standard deviation of samples not yet added
+    count      (T,) int32, samples so far
+    mean       (T, 3) float32; weight (T, 3) float32, sums of the samples' robust weights
+    scatter    (T, 2) float32, over the channels: squares of what each sample pulls at the mean, and
+               weights of those that lie within their errors
+    precision  (T,) float32, sum of 1 / variance of the samples
+    footprint  (T, 3) float32, sum of the samples' footprints by 1 / variance
+    """
+
+    waiting: Float
+    count: Int
+    mean: Float
+    weight: Float
+    scatter: Float
+    precision: Float
+    footprint: Float
+
+    @classmethod
+    def empty(cls, num_texels: int) -> MeanState:
+        def zeros(*shape: int) -> Float:
+            return np.zeros((num_texels, *shape), np.float32)
+
+        return cls(
+            waiting=zeros(_BATCH, 4),
+            count=np.zeros(num_texels, np.int32),
+            mean=zeros(3),
+            weight=zeros(3),
+            scatter=zeros(2),
+            precision=zeros(),
+            footprint=zeros(3),
+        )
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return dict(vars(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustMean:
+    """mean (T, 3), NaN where a texel has no sample; variance (T,), of the mean of the channels'
+    errors, 0 where a single sample tells nothing of it; footprint (T, 3): covariance xx, xy, yy."""
+
+    mean: Float
+    variance: Float
+    footprint: Float
+
+
+def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
+    """Add one sample to each of the listed texels, in place.
+
+    texel      (M,) int32, each texel at most once
+    values     (M, 3) float32, finite
+    deviation  (M,) float32, standard deviation of their errors, above 0
+    footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
+    """
+    _update(
+        state.waiting, state.count, state.mean, state.weight, state.scatter, state.precision,
+        state.footprint, texel, values, deviation, footprint,
+    )  # fmt: skip
+
+
+def robust_mean(state: MeanState) -> RobustMean:
+    """Of all samples so far; ``state`` stays as it is."""
+    mean, weight, scatter = state.mean.copy(), state.weight.copy(), state.scatter.copy()
+    _add_rest(state.waiting, state.count, mean, weight, scatter)
+    # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
+    pull, inlying = scatter.T.astype(np.float64) / 3
+    count = np.maximum(state.count, 1)
+    variance = pull / np.maximum(np.maximum(inlying, state.precision / count), 1e-30) ** 2
+    return RobustMean(
+        mean=np.where(state.count[:, None] > 0, mean, np.nan).astype(np.float32),
+        variance=variance.astype(np.float32),
+        footprint=(state.footprint / np.maximum(state.precision, 1e-30)[:, None]).astype(
+            np.float32
+        ),
+    )
+
+
+@parallel_kernel
+def _update(
+    waiting: Float,
+    count: Int,
+    mean: Float,
+    weight: Float,
+    scatter: Float,
+    precision: Float,
+    footprint: Float,
+    texel: Int,
+    values: Float,
+    deviation: Float,
+    covered: Float,
+) -> None:
+    for m in prange(len(texel)):
+        t = texel[m]
+        slot = count[t] % _BATCH
+        for c in range(3):
+            waiting[t, slot, c] = values[m, c]
+        waiting[t, slot, 3] = deviation[m]
+        count[t] += 1
+        own = 1 / (deviation[m] * deviation[m])
+        precision[t] += own
+        for k in range(3):
+            footprint[t, k] += own * covered[m, k]
+        if slot == _BATCH - 1:
+            _add(waiting[t], mean[t], weight[t], scatter[t])
+
+
+@parallel_kernel
+def _add_rest(waiting: Float, count: Int, mean: Float, weight: Float, scatter: Float) -> None:
+    for t in prange(len(count)):
+        rest = count[t] % _BATCH
+        if rest:
+            _add(waiting[t, :rest], mean[t], weight[t], scatter[t])
+
+
+@kernel
+def _add(samples: Float, mean: Float, weight: Float, scatter: Float) -> None:
+    """Add ``samples`` (N, 4) to one texel's mean, weight (3,) and scatter (2,), in place."""
+    for c in range(3):
+        before, known = float(mean[c]), float(weight[c])
+        centre = before if known > 0 else float(np.median(samples[:, c]))
+        for _ in range(_STEPS):
+            total, sum_of_weights = known * before, known
+            for j in range(len(samples)):
+                own = _trust(samples[j], c, centre) / samples[j, 3] ** 2
+                total += own * samples[j, c]
+                sum_of_weights += own
+            centre = total / sum_of_weights
+        mean[c], weight[c] = centre, sum_of_weights
+        for j in range(len(samples)):
+            trust, own = _trust(samples[j], c, centre), 1 / samples[j, 3] ** 2
+            # The mean follows each of its samples by this share.
+            alone = 1 - trust * own / sum_of_weights
+            if alone > 1e-3:
+                scatter[0] += (trust * own * (samples[j, c] - centre)) ** 2 / alone
+            if trust == 1:
+                scatter[1] += own
+
+
+@kernel
+def _trust(sample: Float, c: int, centre: float) -> float:
+    """Huber's weight of channel c, 1 within its error."""
+    off = abs(float(sample[c]) - centre) / float(sample[3])
+    return min(1.0, _OUTLYING / max(off, 1e-12))
