@@ -26,7 +26,7 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.material import fit_views as views
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_measured
-from usdbrdf.steps import fit
+from usdbrdf.steps import fit, fit_objects
 
 T = TypeVar("T")
 
@@ -66,15 +66,17 @@ def fitted(asset: Path, most: int | None = None) -> tuple[Spent, dict[str, Fitte
     """Time of the pass over the frames, and each object by its label."""
     lit = lit_asset(asset)
     frames = frames_from_stage(open_measured(Asset.at(asset)))
-    options = fit.FitOptions()
+    options = fit_objects.FitOptions()
     survey, surveying = timed(
-        lambda: fit._survey(NoCheckpoints(), lit.atlas, lit.scene, frames, options)
+        lambda: fit_objects.survey_frames(NoCheckpoints(), lit.atlas, lit.scene, frames, options)
     )
-    fit._fit_arrays(lit.scene, lit.atlas.texels, frames, survey, 0, options)  # compiles
+    fit_objects.fit_object(lit.scene, lit.atlas.texels, frames, survey, 0, options)  # compiles
     objects = {}
     for i, obj in enumerate(lit.atlas.scene.objects[:most]):
         found, used = timed(
-            lambda i=i: fit._fit_arrays(lit.scene, lit.atlas.texels, frames, survey, i, options)
+            lambda i=i: fit_objects.fit_object(
+                lit.scene, lit.atlas.texels, frames, survey, i, options
+            )
         )
         objects[obj.label] = Fitted(used, found, fit._record(lit.scene, i, found, options, True))
     return surveying, objects

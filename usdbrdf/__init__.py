@@ -17,8 +17,8 @@ from usdbrdf.relighting.relight import RelightOptions as RelightOptions  # noqa:
 from usdbrdf.relighting.relight import relight as relight  # noqa: E402
 from usdbrdf.scan.ingest_options import IngestOptions as IngestOptions  # noqa: E402
 from usdbrdf.shading.irradiance import Sampling as Sampling  # noqa: E402
-from usdbrdf.steps.fit import FitOptions as FitOptions  # noqa: E402
 from usdbrdf.steps.fit import fit as fit  # noqa: E402
+from usdbrdf.steps.fit_objects import FitOptions as FitOptions  # noqa: E402
 from usdbrdf.steps.ingest import ingest as ingest  # noqa: E402
 from usdbrdf.steps.shade import ShadeOptions as ShadeOptions  # noqa: E402
 from usdbrdf.steps.shade import shade as shade  # noqa: E402

@@ -5,12 +5,19 @@ Never ``fastmath``: under it ``np.isnan`` is False, and sums depend on the machi
 
 from __future__ import annotations
 
+import functools
+import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+# One kernel at a time runs on all cores: numba's own pool of threads, which is all that some
+# machines have, ends the process when two threads of Python call it.
+_turn = threading.Lock()
 
 
 def kernel(function: F) -> F:
@@ -22,8 +29,15 @@ def kernel(function: F) -> F:
 def parallel_kernel(function: F) -> F:
     """Compile with ``prange`` over all cores. Every iteration writes to places of its own, so that
     the result does not depend on the number of threads."""
-    compiled: F = numba.njit(cache=True, parallel=True)(function)
-    return compiled
+    compiled = numba.njit(cache=True, parallel=True)(function)
+
+    @functools.wraps(function)
+    def in_turn(*arguments: Any) -> Any:
+        with _turn:
+            return compiled(*arguments)
+
+    result: Any = in_turn
+    return result  # type: ignore[no-any-return]
 
 
 def loop(function: F) -> F:

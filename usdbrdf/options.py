@@ -182,7 +182,8 @@ def add_shade_options(parser: argparse.ArgumentParser) -> None:
         type=finite_number,
         default=known.sampling.standard_error,
         metavar="E",
-        help="mis stops where the relative standard error of S is below this",
+        help="mis stops where the relative standard error of S is below this, or 1.5 times as much "
+        "where S is filtered",
     )
     add(
         "--rays",

@@ -31,7 +31,8 @@ from usdbrdf.job.stage import StageResult
 from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.stage.adopt import adopt
 from usdbrdf.stage.asset import Asset
-from usdbrdf.steps.fit import FitOptions, fit
+from usdbrdf.steps.fit import fit
+from usdbrdf.steps.fit_objects import FitOptions
 from usdbrdf.steps.ingest import ingest
 from usdbrdf.steps.shade import ShadeOptions, shade
 from usdbrdf.steps.texture import TextureOptions, texture

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-import usdbrdf.steps.fit
+import usdbrdf.steps.fit_objects
 import usdbrdf.steps.texture
 import usdbrdf.steps.trace
 from tests.scenes import make_capture
@@ -178,8 +178,8 @@ def calls(monkeypatch):
     count(usdbrdf.steps.texture, "unwrap")
     count(usdbrdf.steps.texture, "radiance_from_frames")
     count(usdbrdf.steps.trace, "irradiance_at")
-    count(usdbrdf.steps.fit, "choose_target_frames")
-    count(usdbrdf.steps.fit, "_fit_arrays")
+    count(usdbrdf.steps.fit_objects, "choose_target_frames")
+    count(usdbrdf.steps.fit_objects, "fit_object")
     return counted
 
 
@@ -215,7 +215,7 @@ def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resum
 
 def test_fitting_fits_only_the_objects_that_are_missing(resumed):
     # The first checkpoint are the target frames.
-    assert resumed("fit", "checkpoint:3") == {"_fit_arrays": 5 - 2}
+    assert resumed("fit", "checkpoint:3") == {"fit_object": 5 - 2}
 
 
 def test_a_step_that_was_being_published_is_not_computed_again(resumed):

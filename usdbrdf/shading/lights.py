@@ -22,7 +22,7 @@ LightArrays: TypeAlias = tuple[Int, Double, Float, Float, Float]
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
-_BRIGHT = 3.0
+_BRIGHTER_THAN = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +51,11 @@ class Lights:
         return light_groups(*self.arrays)
 
 
-def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Lights:
-    """Triangles whose mean L_d is bright, picked in proportion to area times radiance.
+def lights_from_radiance(
+    scene: Scene, texels: Texels, radiance: Float, brighter_than: float = _BRIGHTER_THAN
+) -> Lights:
+    """Triangles whose mean L_d is ``brighter_than`` so many times the scene's area mean, picked in
+    proportion to area times radiance.
 
     radiance (T, 3): L_d per texel. Triangles smaller than a texel take the texel under their
     centre through their neighbours' mean, so that no lit triangle is left out.
@@ -69,7 +72,7 @@ def lights_from_radiance(scene: Scene, texels: Texels, radiance: Float) -> Light
     doubled = np.linalg.norm(normal, axis=-1)
     area = doubled / 2
     scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
-    bright = (mean > _BRIGHT * scene_mean) & (area > 0)
+    bright = (mean > brighter_than * scene_mean) & (area > 0)
     share = np.where(bright, mean * area, 0)
     total = share.sum()
     face = np.flatnonzero(bright).astype(np.int32)

@@ -11,6 +11,9 @@ from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.lights import lights_from_radiance
 from usdbrdf.steps.atlas import Atlas
 
+# Lobes pick among all lights alike, by power: each of the few rays is to meet one that shows.
+_BRIGHTER_THAN = 6.0
+
 
 def lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
     """L_d as texture and as lights; where shading found an emitter, the radiance it found there
@@ -23,7 +26,7 @@ def lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
         scene=scene,
         rays=RayScene(scene.points, scene.triangles),
         radiance=surface_texture(texels, scene.face_object, lit),
-        lights=lights_from_radiance(scene, texels, lit),
+        lights=lights_from_radiance(scene, texels, lit, _BRIGHTER_THAN),
         emission=surface_texture(
             texels, scene.face_object, np.repeat(emissive.astype(np.float32), 3, axis=1)
         ),

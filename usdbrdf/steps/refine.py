@@ -34,7 +34,7 @@ Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
 # Rays per texel and frame: the mean over the frames averages their noise out.
-_RAYS = 16
+_RAYS = 8
 # A sample's error, in parts of the texel's lit radiance: what poses, lobes and reading do to it;
 # and in parts of the noise floor, which lies some four deviations of the sensor's noise above zero.
 _RELATIVE_ERROR, _OF_NOISE_FLOOR = 0.03, 0.25
