@@ -32,9 +32,9 @@ def parallel_kernel(function: F) -> F:
     compiled = numba.njit(cache=True, parallel=True)(function)
 
     @functools.wraps(function)
-    def in_turn(*arguments: Any) -> Any:
+    def in_turn(*arguments: Any, **named: Any) -> Any:
         with _turn:
-            return compiled(*arguments)
+            return compiled(*arguments, **named)
 
     result: Any = in_turn
     return result  # type: ignore[no-any-return]

@@ -348,10 +348,10 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     through_all = refine.samples_from_frames
 
     def interrupted(*arguments, **options):
-        starts.append(arguments[4])
-        for samples in through_all(*arguments, **options):
+        starts.append(NUM_FRAMES - len(arguments[4]))
+        for done, samples in enumerate(through_all(*arguments, **options)):
             yield samples
-            if len(starts) == 1 and samples.frame == FIRST_UNSAVED:
+            if len(starts) == 1 and done == FIRST_UNSAVED:
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)

@@ -17,7 +17,11 @@ from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing.psquare import quantile
-from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
+from usdbrdf.texturing.radiance_from_frames import (
+    Observation,
+    radiance_from_frames,
+    spread_order,
+)
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
 SATURATION = 4.0
@@ -176,3 +180,11 @@ def test_rounding_the_texel_size_keeps_the_texels_below_the_limit(room: Room, ma
     size = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels)
     assert 0.8 * max_texels < 100**2 / size**2 / 0.7 <= max_texels
     assert float(f"{size:.2g}") == size
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 8, 54, 90, 400, 401])
+def test_a_film_is_read_so_that_neighbours_do_not_follow_each_other(count: int):
+    order = spread_order(count)
+    assert sorted(order) == list(range(count))
+    apart = np.abs(np.diff(order)) if count > 3 else np.array([count])
+    assert apart.min() >= 0.2 * count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,38 @@ def test_the_rim_beside_a_lamp_is_not_made_brighter_still(floor: World):
         _footprint(floor, 2, 0, 2),
     )  # fmt: skip
     assert found.max() <= 2
+
+
+def test_another_chart_of_the_atlas_is_no_detail():
+    # Charts of 1.0 and 0.1 side by side; a quad of the same object leaves 4 empty columns between.
+    left, right, gap = 28, 32, 4
+    whole = left + gap + right
+    parts = quad((0, 0, 0), (left * TEXEL, 0, 0), (0, 0.4, 0), (whole, 20))
+    other = quad((5, 0, 0), (right * TEXEL, 0, 0), (0, 0.4, 0), (whole, 20))
+    uv = np.concatenate(
+        [parts.uv * [left / whole, 1], other.uv * [right / whole, 1] + [(left + gap) / whole, 0]]
+    )
+    both = replace(
+        parts,
+        points=np.concatenate([parts.points, other.points]),
+        triangles=np.concatenate([parts.triangles, other.triangles + 4]),
+        uv=uv,
+        normals=np.concatenate([parts.normals, other.normals]),
+    )
+    world = world_of([both])
+    values = np.where(world.texels.position[:, 0] < 4, 1.0, 0.1)[:, None] * np.ones(3)
+    count = len(values)
+    found = restored(
+        world.texels, values.astype(np.float32), np.ones(count, bool),
+        np.full(count, 1e-8, np.float32), _footprint(world, 30, 0, 30),
+    )  # fmt: skip
+    np.testing.assert_allclose(found, values, rtol=1e-5)
+
+
+def test_a_view_along_the_surface_has_a_finite_footprint(floor: World):
+    # The eye lies in the plane: both steps of a texel project onto one line.
+    pose = look_at(np.array([-3.0, 0.001, 0.0]), np.zeros(3))
+    which = np.arange(len(floor.texels), dtype=np.int32)
+    found = footprints(floor.texels, which, pose, LENS)
+    assert np.isfinite(found).all()
+    assert np.isfinite(widest(found)).all()

@@ -73,7 +73,7 @@ def test_few_samples_and_none():
     found = robust_mean(state)
     np.testing.assert_allclose(found.mean[1], [1, 2, 3])
     np.testing.assert_allclose(found.footprint[1], [4, 1, 2])
-    assert found.variance[1] == 0
+    assert found.variance[1] == pytest.approx(0.1**2, rel=1e-4)
     assert np.isnan(found.mean[[0, 2]]).all()
     # Two of a kind: the median of the first few is between them, not one of them.
     update(state, one, np.float32([[3, 2, 3]]), np.float32([0.1]), np.float32([[4, 1, 2]]))
@@ -106,3 +106,10 @@ def test_reading_changes_nothing_and_going_on_gives_the_same_bits():
 
 def test_state_is_132_bytes_per_texel():
     assert sum(array.nbytes for array in MeanState.empty(1000).arrays().values()) == 132_000
+
+
+def test_one_good_sample_beside_bad_ones_keeps_its_error():
+    deviation = np.array([0.03, 1.0, 2.0, 1.5, 1.0])
+    noise = np.random.default_rng(8).standard_normal((5, 500, 3))
+    found = _found(1 + deviation[:, None, None] * noise, deviation)
+    np.testing.assert_allclose(found.variance, 0.03**2, rtol=0.1)

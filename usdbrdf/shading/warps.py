@@ -17,7 +17,7 @@ Bits = npt.NDArray[np.uint32]
 def sobol_points(log2_count: int, dimensions: int) -> Double:
     """The first 2**log2_count points of Sobol's sequence, (N, dimensions), unscrambled.
 
-    Shifted modulo 1 by a random vector per patch (Cranley and Patterson 1976) they give unbiased
+    Shifted modulo 1 by a random vector per point (Cranley and Patterson 1976) they give unbiased
     estimates whose error falls nearly with 1/N where the integrand is smooth.
     """
     points: Double = qmc.Sobol(dimensions, scramble=False).random_base2(log2_count)

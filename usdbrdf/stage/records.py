@@ -97,7 +97,8 @@ class FittedObject:
     cost          loss at the minimum
     evidence      1 - loss(phi, psi) / loss(no specular lobe)
     status        "measured", "prior", "unseen" or "failed"
-    target_frame  index of the photograph from 0; -1 for none
+    target_frame  index from 0 of the photograph that was fitted, or of many the one that shows the
+                  highlight best; -1 for none
     num_pixels    how many the fit used
     aovs          "diffuse", "refined_irradiance" and "base_color", if the fit refined them
     mean_color    area-weighted base colour, linear

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import say
 from usdbrdf.job.stage import StageResult, StageRun
 from usdbrdf.material.lit_scene import LitScene
 from usdbrdf.material.prior import NEUTRAL, class_prior
@@ -65,11 +65,11 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         lit = lit_scene(atlas, environment)
         survey = survey_frames(run, atlas, lit, frames, options)
         seen = atlas.map("coverage")[:, 0] != FILLED
-        count = len(lit.scene.objects)
-        fits = fitted_objects(run, lit, atlas.texels, frames, survey, options)
         objects = [
             _record(lit, i, found, options, bool(seen[atlas.texels.of_object(i)].any()))
-            for i, found in enumerate(progress(fits, total=count, label="fit", unit="objects"))
+            for i, found in enumerate(
+                fitted_objects(run, lit, atlas.texels, frames, survey, options)
+            )
         ]
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -123,26 +122,26 @@ def fitted_objects(
     frames: Frames,
     survey: Survey,
     options: FitOptions,
-) -> Iterator[dict[str, npt.NDArray[Any]]]:
-    """What ``fit_object`` says of every object in order, going on where an interrupted run was."""
+) -> list[dict[str, npt.NDArray[Any]]]:
+    """What ``fit_object`` says of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))
     stored = {i: run.checkpoint_if(f"object-{i}") for i in numbers}
     done = {i: found for i, found in stored.items() if found is not None}
     with ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool:
         jobs = {
-            i: pool.submit(fit_object, lit, texels, frames, survey, i, options)
+            pool.submit(fit_object, lit, texels, frames, survey, i, options): i
             for i in numbers
             if i not in done
         }
         try:
-            for i in numbers:
-                if i in jobs:
-                    done[i] = jobs[i].result()
-                    run.save(f"object-{i}", done[i])
-                yield done[i]
+            for job in progress(as_completed(jobs), total=len(jobs), label="fit", unit="objects"):
+                i, found = jobs[job], job.result()
+                run.save(f"object-{i}", found)
+                done[i] = found
         finally:
-            for job in jobs.values():
+            for job in jobs:
                 job.cancel()
+    return [done[i] for i in numbers]
 
 
 def fit_object(

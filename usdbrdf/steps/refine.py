@@ -24,9 +24,9 @@ from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing.footprints import footprints, widest
 from usdbrdf.texturing.inpaint import inpaint
-from usdbrdf.texturing.radiance_from_frames import samples_from_frames
+from usdbrdf.texturing.radiance_from_frames import samples_from_frames, spread_order
 from usdbrdf.texturing.restore import restored
-from usdbrdf.texturing.robust_mean import MeanState, robust_mean, update
+from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def refined_maps(
     """
     texels = atlas.texels
     observed = _observe(run, atlas, lit, frames, lobes, seed)
-    measured = observed.count > 0
+    measured = np.isfinite(observed.mean[:, 0])
     emission = atlas.map_where_present("emission", 3)
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
@@ -87,9 +87,8 @@ def refined_maps(
     }
 
 
-def _restored(atlas: Atlas, observed: MeanState, known: Bool) -> Float:
+def _restored(atlas: Atlas, found: RobustMean, known: Bool) -> Float:
     """(T, 3), W/(m^2 sr), from the means in units of ``_level``; filled in where not ``known``."""
-    found = robust_mean(observed)
     level = _level(atlas)[:, None]
     filled = inpaint(atlas.texels, np.maximum(found.mean * level, 0), known)
     variance = found.variance * level[:, 0] ** 2
@@ -110,7 +109,7 @@ def _observe(
     frames: Frames,
     lobes: Lobes,
     seed: int,
-) -> MeanState:
+) -> RobustMean:
     """All frames without their specular light, in units of ``_level``, going on from the last saved
     state of an interrupted run."""
     texels, owner, level = atlas.texels, atlas.texels.object_index(), _level(atlas)
@@ -118,8 +117,11 @@ def _observe(
     start, observed = 0, MeanState.empty(len(texels))
     if saved is not None:
         start, observed = saved[0] + 1, MeanState(**saved[1])
-    samples = samples_from_frames(texels, atlas.scene, lit.rays, frames, start)
-    for some in progress(samples, total=len(frames) - start, label="fit: refine", unit="frames"):
+    # The mean starts from its first samples, which must not all show one highlight.
+    order = spread_order(len(frames))[start:]
+    samples = samples_from_frames(texels, atlas.scene, lit.rays, frames, order)
+    bar = progress(samples, total=len(order), label="fit: refine", unit="frames")
+    for done, some in enumerate(bar, start):
         pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
         own, unit = owner[some.texel], level[some.texel]
         specular = non_diffuse_radiance(
@@ -138,9 +140,9 @@ def _observe(
             deviation.astype(np.float32),
             covered,
         )
-        if some.frame % 16 == 15:
-            run.save_latest("refined", some.frame, observed.arrays())
-    return observed
+        if done % 16 == 15:
+            run.save_latest("refined", done, observed.arrays())
+    return robust_mean(observed)
 
 
 def _seen_from(texels: Texels, which: Int, eye: Double) -> SurfacePoints:

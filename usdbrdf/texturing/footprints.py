@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from numba import prange
+from scipy import ndimage
 
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.kernel import parallel_kernel
@@ -20,8 +21,8 @@ _RING = np.pi / 4 * np.arange(8)
 RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
     [np.cos(_RING), np.sin(_RING)], axis=-1
 )
-# Variance of a texel's own area, in texels.
-_OF_TEXEL = 1 / 12
+# Variance of a texel's own area, in texels; and what a view along the surface counts as.
+_OF_TEXEL, _LARGEST = 1 / 12, 1e6
 
 
 def footprints(texels: Texels, which: Int, world_from_camera: Double, intrinsics: Double) -> Float:
@@ -45,17 +46,29 @@ def widest(footprint: Float) -> Float:
 
 def blurred(texels: Texels, values: Float, covariance: Float) -> Float:
     """Means of ``values`` (T, C) over normal distributions around each texel in its atlas, and over
-    the texel's own area. covariance (T, 3): xx, xy, yy, in texels. What lies off a chart counts as
-    the chart's nearest texel does.
+    the texel's own area. covariance (T, 3): xx, xy, yy, in texels. What lies off a texel's chart
+    counts as the texel itself.
     """
-    owner = texels.object_index()
+    owner, chart = texels.object_index(), _chart_of_pixels(texels)
     picture = np.ascontiguousarray(values[np.maximum(texels.nearest_texel, 0)])
     blurry = np.zeros_like(values)
     _blur(
-        picture, texels.pixel, texels.first_pixel[owner], texels.resolution[owner], covariance,
-        RINGS, blurry,
+        picture, chart, texels.pixel, texels.first_pixel[owner], texels.resolution[owner],
+        covariance, RINGS, blurry,
     )  # fmt: skip
     return blurry
+
+
+def _chart_of_pixels(texels: Texels) -> Int:
+    """Number of the chart that each flat pixel shows, (P,): texels that touch share one."""
+    occupied = np.zeros(len(texels.nearest_texel), np.bool_)
+    occupied[texels.pixel] = True
+    chart = np.zeros(len(occupied), np.int32)
+    for i, (width, height) in enumerate(texels.resolution):
+        own = slice(int(texels.first_pixel[i]), int(texels.first_pixel[i + 1]))
+        chart[own] = ndimage.label(occupied[own].reshape(height, width), np.ones((3, 3)))[0].ravel()
+    shown: Int = chart[texels.pixel[np.maximum(texels.nearest_texel, 0)]]
+    return shown
 
 
 @parallel_kernel
@@ -66,13 +79,14 @@ def _footprints(
         t = which[i]
         p, sx, sy = position[t], step_x[t], step_y[t]
         u, v, _ = project(p, sx, sy, 0.0, 0.0, k, m)
-        ux, vx, _ = project(p, sx, sy, 1.0, 0.0, k, m)
-        uy, vy, _ = project(p, sx, sy, 0.0, 1.0, k, m)
+        ux, vx, right = project(p, sx, sy, 1.0, 0.0, k, m)
+        uy, vy, below = project(p, sx, sy, 0.0, 1.0, k, m)
         # Pixels per texel, and its inverse.
         a, b, c, d = ux - u, uy - u, vx - v, vy - v
         determinant = a * d - b * c
-        if abs(determinant) < 1e-9:
-            determinant = 1e-9
+        out[i, 0], out[i, 1], out[i, 2] = _LARGEST, 0.0, _LARGEST
+        if right < 0 or below < 0 or a * a + b * b + c * c + d * d >= _LARGEST * determinant**2:
+            continue
         a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
         out[i, 0] = a * a + b * b
         out[i, 1] = a * c + b * d
@@ -82,6 +96,7 @@ def _footprints(
 @parallel_kernel
 def _blur(
     picture: Float,
+    chart: Int,
     pixel: Long,
     first: Long,
     size: Int,
@@ -104,7 +119,14 @@ def _blur(
             i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
             fx, fy = x - i, y - j
             right, below = (1 if width > 1 else 0), (width if height > 1 else 0)
-            p = first[t] + j * width + i
+            p, own = first[t] + j * width + i, chart[pixel[t]]
+            if (
+                chart[p] != own
+                or chart[p + right] != own
+                or chart[p + below] != own
+                or chart[p + below + right] != own
+            ):
+                p, right, below = pixel[t], 0, 0
             for c in range(out.shape[1]):
                 upper = (1 - fx) * picture[p, c] + fx * picture[p + right, c]
                 lower = (1 - fx) * picture[p + below, c] + fx * picture[p + below + right, c]

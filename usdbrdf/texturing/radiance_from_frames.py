@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,7 @@ Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 # Threads that decode, and frames in memory besides the one that is projected.
 _READERS, _AHEAD = 2, 3
+_GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +102,9 @@ def radiance_from_frames(
     part  the texels that ``observed`` is of; None: all
     """
     first = np.int32(part.start if part else 0)
-    for sampled in samples_from_frames(texels, scene, rays, frames, start, part):
+    for sampled in samples_from_frames(
+        texels, scene, rays, frames, range(start, len(frames)), part
+    ):
         psquare.update(observed.quantiles, sampled.texel - first, sampled.radiance, quantile)
         saturated = sampled.clipped - first
         observed.clipped[saturated] += 1
@@ -114,16 +118,16 @@ def samples_from_frames(
     scene: Scene,
     rays: RayScene,
     frames: Frames,
-    start: int = 0,
+    order: Sequence[int],
     part: slice | None = None,
 ) -> Iterator[FrameSamples]:
-    """What frames start.. show of the texels of ``part`` (None: all), frame by frame.
+    """What the frames of ``order`` show of the texels of ``part`` (None: all), one by one.
 
     The next frames are read and decoded while one is projected.
     """
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
-    for i, pixels in enumerate(_read_ahead(frames, start), start):
+    for i, pixels in zip(order, _read_ahead(frames, order), strict=True):
         pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
         which = blocks.texels_in_view(pose, lens, size, MIN_COSINE)
         kind, radiance = samples_of_texels(
@@ -138,18 +142,24 @@ def samples_from_frames(
         )
 
 
-def _read_ahead(frames: Frames, start: int) -> Iterator[FramePixels]:
-    """The pixels of frames start.., of which some are in memory before they are asked for."""
+def spread_order(count: int) -> list[int]:
+    """The numbers below ``count``, so that what follows each other lies far apart: neighbours of a
+    film show the same highlights."""
+    step = max(1, round(_GOLDEN * count))
+    while math.gcd(step, count) > 1:
+        step += 1
+    return [step * k % count for k in range(count)]
+
+
+def _read_ahead(frames: Frames, order: Sequence[int]) -> Iterator[FramePixels]:
+    """The pixels of the frames of ``order``, some in memory before they are asked for."""
     with ThreadPoolExecutor(max_workers=_READERS) as readers:
-        coming = deque(
-            readers.submit(read_frame, frames, i)
-            for i in range(start, min(start + _AHEAD, len(frames)))
-        )
+        coming = deque(readers.submit(read_frame, frames, i) for i in order[:_AHEAD])
         try:
-            for i in range(start, len(frames)):
+            for ahead in range(_AHEAD, len(order) + _AHEAD):
                 pixels = coming.popleft().result()
-                if i + _AHEAD < len(frames):
-                    coming.append(readers.submit(read_frame, frames, i + _AHEAD))
+                if ahead < len(order):
+                    coming.append(readers.submit(read_frame, frames, order[ahead]))
                 yield pixels
         finally:
             for job in coming:

@@ -16,7 +16,8 @@ from usdbrdf.texturing.footprints import blurred
 Float = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 
-# Standard deviation of a sample's blur in pixels: the camera's own, bilinear reading, the pixel.
+# Standard deviation of a sample's blur in pixels: the camera's own, bilinear reading, the pixel. A
+# little less than the fit of highlights takes: what was not blurred must not be sharpened.
 SAMPLE_BLUR = 0.6
 # What is detail and what is noise is decided over three blurs of this many pixels.
 _NEIGHBOURHOOD = 2.0

@@ -7,7 +7,7 @@ five samples are added to what came before by reweighted least squares, in which
 further off than its own error allows loses weight. The first five start from their median.
 
 Besides the mean are kept its variance, and what a pixel covered of the surface, on the average of
-the samples as they were weighted: how blurred it is.
+the samples weighted by their precision: how blurred it is.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from numba import prange
 from usdbrdf.kernel import kernel, parallel_kernel
 
 Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 
 # Samples that are added at a time.
 _BATCH = 5
 # Deviations from which a sample loses weight, and steps of the reweighting.
 _OUTLYING, _STEPS = 2.5, 6
+# A sample whose distance from the mean is less than this share of its error says nothing of it.
+_LEFT = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +74,8 @@ class MeanState:
 
 @dataclass(frozen=True, kw_only=True)
 class RobustMean:
-    """mean (T, 3), NaN where a texel has no sample; variance (T,), of the mean of the channels'
-    errors, 0 where a single sample tells nothing of it; footprint (T, 3): covariance xx, xy, yy."""
+    """mean (T, 3), NaN where a texel has no sample; variance (T,), the mean over the channels, of a
+    single sample what was said of it; footprint (T, 3): covariance xx, xy, yy."""
 
     mean: Float
     variance: Float
@@ -86,7 +87,7 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
 
     texel      (M,) int32, each texel at most once
     values     (M, 3) float32, finite
-    deviation  (M,) float32, standard deviation of their errors, above 0
+    deviation  (M,) float32, standard deviation of their errors, between 1e-15 and 1e15
     footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
     """
     _update(
@@ -133,7 +134,7 @@ def _update(
             waiting[t, slot, c] = values[m, c]
         waiting[t, slot, 3] = deviation[m]
         count[t] += 1
-        own = 1 / (deviation[m] * deviation[m])
+        own = 1 / float(deviation[m]) ** 2
         precision[t] += own
         for k in range(3):
             footprint[t, k] += own * covered[m, k]
@@ -158,17 +159,20 @@ def _add(samples: Float, mean: Float, weight: Float, scatter: Float) -> None:
         for _ in range(_STEPS):
             total, sum_of_weights = known * before, known
             for j in range(len(samples)):
-                own = _trust(samples[j], c, centre) / samples[j, 3] ** 2
+                own = _trust(samples[j], c, centre) / float(samples[j, 3]) ** 2
                 total += own * samples[j, c]
                 sum_of_weights += own
             centre = total / sum_of_weights
         mean[c], weight[c] = centre, sum_of_weights
         for j in range(len(samples)):
-            trust, own = _trust(samples[j], c, centre), 1 / samples[j, 3] ** 2
-            # The mean follows each of its samples by this share.
-            alone = 1 - trust * own / sum_of_weights
-            if alone > 1e-3:
-                scatter[0] += (trust * own * (samples[j, c] - centre)) ** 2 / alone
+            trust, own = _trust(samples[j], c, centre), 1 / float(samples[j, 3]) ** 2
+            # The mean follows each of its samples; what is left of one tells of its error, unless
+            # there is hardly any other.
+            left = 1 - trust * own / sum_of_weights
+            if left > _LEFT:
+                scatter[0] += (trust * own * (samples[j, c] - centre)) ** 2 / left
+            else:
+                scatter[0] += own
             if trust == 1:
                 scatter[1] += own
 
