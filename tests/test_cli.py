@@ -312,7 +312,7 @@ def test_validate_prints_findings_and_exits_7(asset, capsys):
         away.rename(picture)
     (line,) = capsys.readouterr().out.splitlines()
     assert re.fullmatch(
-        r"error: <[\w/:.]+>: @.*@ does not exist\. .* \[usdbrdf\.MissingTexture\]", line
+        r"error: <[\w/:.]+> @[^@]+@: @.*@ does not exist\. .* \[usdbrdf\.MissingTexture\]", line
     )
     assert picture.name in line
 
@@ -325,7 +325,7 @@ def test_validate_with_warnings_alone_exits_0(asset, capsys):
     finally:
         orphan.unlink()
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("warning: @")
+    assert line.startswith("warning: </room> @")
     assert line.endswith(f"@{orphan}@. [usdbrdf.OrphanTexture]")
 
 

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import NoReturn
 
 from usdbrdf import compare, evaluate, fit, ingest, options, relight, shade, texture, working_on
@@ -165,19 +166,30 @@ def _package(chosen: Arguments) -> int:
 
 
 def _validate(chosen: Arguments) -> int:
-    root = Asset.at(chosen.asset).root_layer
-    if not root.is_file():
-        raise InputRefused(f"{chosen.asset}: there is no asset in this folder. [asset.missing]")
+    asset = _asset_at(chosen.asset)
+    root = asset.root_layer
     findings = validate(root)
     for finding in findings:
         _print(printable(str(finding)))
     if not findings:
         say(f"{root}: no errors")
     if chosen.fix is not None:
-        cured = write_cures(Asset.at(chosen.asset), chosen.fix)
+        cured = write_cures(asset, chosen.fix)
         done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
         say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
     return 7 if has_errors(findings) else 0
+
+
+def _asset_at(place: Path) -> Asset:
+    """The asset of a folder, or of the root layer in it."""
+    asset = Asset.at(place.parent if place.is_file() else place)
+    root = asset.root_layer
+    if not root.is_file() or (place.is_file() and not place.samefile(root)):
+        raise InputRefused(
+            f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or the "
+            "NAME.usda in it. [asset.missing]"
+        )
+    return asset
 
 
 def _rules(chosen: Arguments) -> int:

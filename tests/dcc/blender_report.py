@@ -35,7 +35,14 @@ def image_of(socket):
         "extension": node.extension,
         "uv": getattr(node_before(node.inputs["Vector"], "UVMAP"), "uv_map", None),
         "pixel": list(image.pixels[:4]),
+        "factor": factor_of(socket),
     }
+
+
+def factor_of(socket):
+    """What the texture is multiplied by; 1 without a node that does."""
+    node = node_before(socket, "VECT_MATH")
+    return list(node.inputs[1].default_value) if node else [1.0] * 3
 
 
 def report_material(material):

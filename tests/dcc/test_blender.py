@@ -2,11 +2,17 @@
 
 import json
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Usd, UsdShade
+
+from tests.nondestruction.conftest import convert, photographed
+from usdbrdf.files.images import read_radiance
+from usdbrdf.job.progress import set_quiet
+from usdbrdf.stage.asset import Asset
 
 BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 SCRIPT = Path(__file__).with_name("blender_report.py")
@@ -48,8 +54,10 @@ def report_of(built, tmp_path, look):
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_the_shaded_look(tmp_path, synthetic, folder):
     scan = synthetic.make_scan(tmp_path / "capture")
-    built = synthetic.build(tmp_path / folder, scan)
-    report = blender_report(built.asset.root_layer, tmp_path)
+    made = synthetic.build(tmp_path / "made" / "room", scan).asset
+    asset = Asset(tmp_path / folder, made.name)
+    shutil.move(made.folder, asset.folder)
+    report = blender_report(asset.root_layer, tmp_path)
     for mesh in report["meshes"].values():
         assert mesh["uv_layers"] == ["st"]
         assert len(mesh["slots"]) == 1
@@ -80,3 +88,55 @@ def test_a_look_shows_its_map_unlit(built, tmp_path, look):
     assert chair["emission_image"]["pixel"][:3] == [0.25] * 3
     assert chair["base_color"][:3] == [0, 0, 0]
     assert chair["ior"] == 1
+
+
+def test_every_object_of_a_converted_asset_that_was_moved(tmp_path):
+    """Roughness, ior, textures and their factors are those of its layers, on all objects."""
+    made = convert(photographed(tmp_path / "scan").folder, tmp_path / "made" / "room")
+    set_quiet(False)
+    asset = Asset(tmp_path / FOLDERS[1] / "room", made.name)
+    asset.folder.parent.mkdir()
+    shutil.move(made.folder, asset.folder)
+    shown = blender_report(asset.root_layer, tmp_path)["meshes"]
+    stage = Usd.Stage.Open(str(asset.root_layer))
+    written = objects_of(stage)
+    assert len(written) >= 4
+    assert shown.keys() == written.keys()
+    for name, surface in written.items():
+        (slot,) = shown[name]["slots"]
+        assert slot["roughness"] == pytest.approx(surface.GetInput("roughness").Get()), name
+        assert slot["ior"] == pytest.approx(surface.GetInput("ior").Get()), name
+        assert slot["tint"] == [1.0] * 4
+        check_texture(asset, surface.GetInput("diffuseColor"), slot["base_image"])
+        check_texture(asset, surface.GetInput("emissiveColor"), slot["emission_image"])
+    textured = [slot for mesh in shown.values() for slot in mesh["slots"] if slot["base_image"]]
+    assert len(textured) == len(written) - 1, "all but the lamp"
+
+
+def objects_of(stage):
+    """Name of each object -> the UsdPreviewSurface that it wears, by our build of USD."""
+    found = {}
+    for prim in stage.Traverse():
+        if prim.GetAttribute("usdBrdf:label").HasAuthoredValue():
+            material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+            found[prim.GetName()] = material.ComputeSurfaceSource()[0]
+    return found
+
+
+def check_texture(asset, connected, image):
+    """``image`` is the texture that an input has, or None where it has none."""
+    sources = connected.GetConnectedSources()[0] if connected else []
+    assert bool(sources) == (image is not None)
+    if not sources:
+        return
+    texture = UsdShade.Shader(sources[0].source.GetPrim())
+    file = Path(texture.GetInput("file").Get().resolvedPath)
+    assert file.is_relative_to(asset.folder)
+    assert (image["file"], image["colorspace"]) == (file.name, "Non-Color")
+    pixels = read_radiance(file)
+    assert image["size"] == [pixels.shape[1], pixels.shape[0]]
+    # Blender counts rows from below.
+    assert image["pixel"][:3] == pytest.approx(pixels[-1, 0, :3].tolist(), rel=1e-3)
+    scale = texture.GetInput("scale")
+    factor = list(scale.Get())[:3] if scale else [1.0] * 3
+    assert image["factor"] == pytest.approx(factor)

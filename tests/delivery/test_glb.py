@@ -6,14 +6,16 @@ import json
 import os
 import struct
 import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Sdf, Usd
 
 from usdbrdf.delivery.glb import gltf_material, write_glb
 from usdbrdf.delivery.package import PackageOptions, package
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.relighting.model import surfaces_from_model
 from usdbrdf.relighting.surfaces import Surface, constant_map, preview_material
 from usdbrdf.stage.flat_stage import stage_in_look
@@ -72,6 +74,21 @@ def test_materials_in_the_document(exported):
     assert tree["extensionsUsed"] == ["KHR_materials_emissive_strength", "KHR_materials_ior"]
     sampler = tree["samplers"][tree["textures"][pbr["baseColorTexture"]["index"]]["sampler"]]
     assert (sampler["wrapS"], sampler["wrapT"]) == (33071, 33071)
+
+
+def test_lamps_glow_where_the_artist_selected_lights(room, exported, tmp_path):
+    edits = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    Sdf.CreatePrimInLayer(edits, "/room").variantSelections["lights"] = "usdlux"
+    edits.Save()
+    package(room.asset.folder, tmp_path / "lights.glb")
+    assert document(tmp_path / "lights.glb") == document(exported)
+
+
+def test_without_pillow(room, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(EnvironmentFailure, match=r"usdbrdf\[package\].*package\.pillow"):
+        package(room.asset.folder, tmp_path / "new/room.glb")
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("mapping", ["measured", "matched"])

@@ -252,7 +252,7 @@ def test_it_validates(dressed):
 
 def test_it_is_flattened_with_its_meshes_and_without_its_materials(dressed):
     stage = stage_in_look(dressed.asset, "shaded")
-    flat = flattened(stage, dressed.asset, "shaded")
+    flat = flattened(stage, dressed.asset)
     used = set(flat.GetUsedLayers(includeClipLayers=False))
     assert used == {flat.GetRootLayer(), flat.GetSessionLayer()}
     before, after = (UsdGeom.XformCache(Usd.TimeCode.EarliestTime()) for _ in range(2))

@@ -18,7 +18,7 @@ from usdbrdf.stage.schema import plugin_path, register, schema_names, schema_ver
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
 UNITS = (
-    "metres|seconds|pixels|texels|photograph|without unit|pure numbers|W m-2 sr-1|"
+    "metres|seconds|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
     "units of the pixel values|[Nn]umber of|Loss of the fit"
 )
 NAMES = ("Object", "Capture", "Aov", "Texturing", "Shading", "MaterialFit", "Emitter")

@@ -1,10 +1,13 @@
 """validate --fix: cures go into a new layer and nowhere else, and work where it is put."""
 
+import errno
+from dataclasses import replace
+
 import pytest
 from pxr import Sdf, Usd
 
-from tests.validation.faults import FAULTS, edited
-from usdbrdf.errors import UsageError
+from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
+from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.validation.cure_layer import write_cures
 from usdbrdf.validation.standard import open_or_finding
 from usdbrdf.validation.validate import own_findings
@@ -46,6 +49,45 @@ def test_nothing_is_written_where_nothing_can_be_cured(built):
     assert sorted(built.asset.folder.rglob("*")) == before
 
 
+def test_a_record_that_was_edited_is_as_measured_again(built):
+    """The material does not follow what somebody wrote about the measurement."""
+    built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
+    built.write_layer("material")
+    asset = built.asset
+    numbers = [f"{SURFACE}.inputs:{name}" for name in ("roughness", "ior")]
+    numbers.append("/room/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale")
+    record = [f"{CHAIR}.usdBrdf:fit:{name}" for name in ("phi", "psi", "mapping")]
+    sound = _values(asset, *numbers, *record)
+    FAULTS["LobeMatchesFit"](built)
+    opinion(built, CHAIR, "usdBrdf:fit:psi", Types.Float, 1.0)
+    opinion(built, CHAIR, "usdBrdf:fit:mapping", Types.Token, "measured")
+    cured = write_cures(asset, asset.folder / "fixes.usda")
+    assert {finding.rule for finding in cured.findings} == {"usdbrdf.LobeMatchesFit"}
+    with edited(asset.root_layer) as root:
+        root.subLayerPaths.insert(0, "./fixes.usda")
+    assert _values(asset, *numbers, *record) == sound
+    assert own_findings(Usd.Stage.Open(str(asset.root_layer))) == []
+
+
+def test_a_material_of_ours_that_was_edited_follows_the_record_and_the_artist_stays(built):
+    asset = built.asset
+    roughness, ior = (f"{SURFACE}.inputs:{name}" for name in ("roughness", "ior"))
+    sound = _values(asset, roughness)
+    with edited(asset.layer("material")) as layer:
+        layer.GetAttributeAtPath(roughness).default = 0.9
+    opinion(built, SURFACE, "inputs:ior", Types.Float, 1.2)
+    write_cures(asset, asset.folder / "fixes.usda")
+    with edited(asset.root_layer) as root:
+        root.subLayerPaths.insert(0, "./fixes.usda")
+    assert _values(asset, roughness) == pytest.approx(sound)
+    assert _values(asset, ior) == [pytest.approx(1.2)]
+
+
+def _values(asset, *paths):
+    stage = Usd.Stage.Open(str(asset.root_layer))
+    return [stage.GetAttributeAtPath(path).Get() for path in paths]
+
+
 @pytest.mark.parametrize(
     ("place", "code"),
     [
@@ -76,6 +118,27 @@ def test_a_file_that_appears_meanwhile_is_kept(built, monkeypatch):
         write_cures(built.asset, layer)
     assert layer.read_text() == "somebody's"
     assert not list(layer.parent.glob(".tmp-*"))
+
+
+def test_a_disk_that_is_full_leaves_no_name_behind(built, monkeypatch):
+    FAULTS["LookMaterial"](built)
+    monkeypatch.setenv("USDBRDF_FAULT", "enospc@publish:before_replace")
+    with pytest.raises(EnvironmentFailure, match="No space left"):
+        write_cures(built.asset, built.asset.folder / "fixes.usda")
+    assert not list(built.asset.folder.glob("*fixes*"))
+    assert not list(built.asset.folder.glob(".tmp-*"))
+
+
+def test_file_systems_without_hard_links_will_do(built, monkeypatch):
+    FAULTS["LookMaterial"](built)
+
+    def none(*_arguments, **_options):
+        raise OSError(errno.ENOTSUP, "not supported")
+
+    monkeypatch.setattr("os.link", none)
+    layer = built.asset.folder / "fixes.usda"
+    assert write_cures(built.asset, layer).findings
+    assert Sdf.Layer.FindOrOpen(str(layer)).rootPrims
 
 
 def test_the_fault_is_the_artists_to_keep(built):

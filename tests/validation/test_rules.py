@@ -1,5 +1,6 @@
 """Every rule finds its fault and nothing else does; a sound asset has none."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -49,7 +50,19 @@ def test_exactly_the_rule_about_a_fault_finds_it(built, name):
         assert line.startswith(f"{finding.severity.value}: ")
         assert line.endswith(f" [usdbrdf.{name}]")
         assert "\n" not in line
-        assert finding.site.startswith("<") or finding.site.startswith("@")
+        assert re.match(r"\w+: </[^>]*> @/.+\.usd[ac]@: ", line)
+
+
+def test_a_finding_names_the_layer_that_has_the_opinion(built):
+    FAULTS["AllowedTokens"](built)
+    FAULTS["CameraExposure"](built)
+    FAULTS["LayerHeader"](built)
+    asset = built.asset
+    assert {(f.site, f.layer) for f in own(built)} == {
+        (f"<{CHAIR}.usdBrdf:fit:status>", f"@{asset.edits_layer}@"),
+        ("</room/cameras/capture>", f"@{asset.root_layer}@"),
+        ("</room>", f"@{asset.layer('texturing')}@"),
+    }
 
 
 @pytest.mark.parametrize("name", sorted(n for n in FAULTS if BY_NAME[n].cure))

@@ -40,7 +40,34 @@ def test_a_missing_sublayer_is_a_finding(built):
     built.asset.layer("shading").unlink()
     findings = "\n".join(map(str, validate(built.asset.root_layer)))
     assert "shading.usda" in findings
-    assert "[usd.Composition]" in findings
+    assert "[usdValidation:CompositionErrorTest.CompositionError]" in findings
+
+
+def test_a_reference_that_leads_nowhere_is_found_once_and_nothing_is_printed(built, capfd):
+    with edited(built.asset.edits_layer) as layer:
+        prim = Sdf.CreatePrimInLayer(layer, "/room/prop")
+        prim.referenceList.prependedItems = [Sdf.Reference("./gone.usda")]
+    for photograph in built.scan.frames.image_paths:
+        photograph.unlink()
+    capfd.readouterr()
+    findings = validate(built.asset.root_layer)
+    assert capfd.readouterr() == ("", "")
+    (missing,) = [f for f in findings if "gone.usda" in f.message]
+    assert missing.rule == "usdValidation:CompositionErrorTest.CompositionError"
+    assert (missing.site, missing.layer) == ("</room/prop>", f"@{built.asset.root_layer}@")
+    (photographs,) = [f for f in findings if f.rule == "usdbrdf.MissingPhotograph"]
+    assert photographs.message.endswith("does not exist. Nor do 2 more of its photographs.")
+
+
+def test_the_root_layer_names_its_asset_too(built, capfd):
+    folder, root = built.asset.folder, built.asset.root_layer
+    assert main(["validate", str(root)]) == 0
+    assert capfd.readouterr().err == f"{root}: no errors\n"
+    for place in (built.asset.edits_layer, folder / "layers", folder / "gone.usda"):
+        assert main(["validate", str(place)]) == 3
+        told = capfd.readouterr().err
+        assert f"{place}: there is no asset here. Name the folder" in told
+        assert "[asset.missing]" in told
 
 
 def test_what_is_no_layer_is_a_finding(tmp_path):
@@ -50,15 +77,17 @@ def test_what_is_no_layer_is_a_finding(tmp_path):
     assert has_errors([finding])
 
 
-def test_a_layer_that_cannot_be_read_is_a_finding(built, capsys):
+def test_a_layer_that_cannot_be_read_is_a_finding(built, capfd):
     with built.asset.edits_layer.open("a") as file:
         file.write('over "broken" {\n')
     findings = [f for f in validate(built.asset.root_layer) if f.rule == "usd.Open"]
-    assert [f.site for f in findings] == [f"@{built.asset.edits_layer}@"]
+    assert [f.layer for f in findings] == [f"@{built.asset.edits_layer}@"]
     assert "USD cannot open it" in str(findings[0])
     assert "Expected }" in str(findings[0])
     assert main(["validate", str(built.asset.folder)]) == 7
-    assert f"@{built.asset.edits_layer}@: USD cannot open it" in capsys.readouterr().out
+    told = capfd.readouterr()
+    assert f"@{built.asset.edits_layer}@: USD cannot open it" in told.out
+    assert told.err == ""
 
 
 def test_a_missing_file_is_found_once(built):

@@ -28,7 +28,7 @@ def add_package_options(parser: argparse.ArgumentParser) -> None:
         "with --profile arkit",
     )
     add("--max-size", type=int, metavar="PIXELS", help="reduce textures to this longer side")
-    add("--look", default=known.look, metavar="NAME", help="the look that is packed")
+    add("--look", metavar="NAME", help="the look that is packed; default: the one it opens in")
     add(
         "--profile",
         choices=(DEFAULT, ARKIT),

@@ -58,7 +58,7 @@ def write_glb(
         from PIL import Image
     except ImportError as error:
         raise EnvironmentFailure(
-            ".glb needs Pillow, which is not installed. Run: pip install 'usdbrdf[render]'. "
+            ".glb needs Pillow, which is not installed. Run: pip install 'usdbrdf[package]'. "
             "[package.pillow]"
         ) from error
     if not surfaces:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +22,11 @@ from usdbrdf.stage.export import export
 from usdbrdf.stage.flat_stage import (
     fit_for_arkit,
     flattened,
+    lights_of,
+    look_of,
     stage_in_look,
     take_materials_literally,
 )
-from usdbrdf.stage.looks import SHADED
 from usdbrdf.stage.packaged_files import (
     NewTexture,
     file_in_asset,
@@ -32,7 +35,7 @@ from usdbrdf.stage.packaged_files import (
     texture_uses,
     use_texture,
 )
-from usdbrdf.stage.published_surfaces import published_surfaces
+from usdbrdf.stage.published_surfaces import paths_of, published_surfaces
 from usdbrdf.stage.usdz import write_usdz
 
 USDZ, GLB = ".usdz", ".glb"
@@ -42,12 +45,12 @@ DEFAULT, ARKIT = "default", "arkit"
 @dataclass(frozen=True, kw_only=True)
 class PackageOptions:
     """textures "exr" or "png"; None: exr, but png in .glb and for ARKit, which take nothing else.
-    max_size: pixels of a texture's longer side; look: which of the asset's; profile: "default", or
-    "arkit" for AR Quick Look."""
+    max_size: pixels of a texture's longer side; look: which of the asset's, None: the one that it
+    opens in; profile: "default", or "arkit" for AR Quick Look."""
 
     textures: str | None = None
     max_size: int | None = None
-    look: str = SHADED
+    look: str | None = None
     profile: str = DEFAULT
 
 
@@ -63,15 +66,16 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     options = options or PackageOptions()
     textures = _texture_options(output, folder, options)
     asset = Asset.at(folder)
-    flat = flattened(stage_in_look(asset, options.look), asset, options.look)
-    with environment_failures(str(output)):
-        output.parent.mkdir(parents=True, exist_ok=True)
-        if output.suffix.lower() == GLB:
+    glb = output.suffix.lower() == GLB
+    stage = stage_in_look(asset, options.look)
+    flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
+    with environment_failures(str(output)), _folder_of(output):
+        if glb:
             summary = _write_glb(output, flat, asset, textures)
         else:
             summary = _write_usdz(output, flat, asset, textures, options)
         size = output.stat().st_size
-    return {"output": str(output), "look": options.look, "bytes": size, **summary}
+    return {"output": str(output), "look": look_of(stage), "bytes": size, **summary}
 
 
 def _write_usdz(
@@ -100,8 +104,24 @@ def _write_glb(
     take_materials_literally(flat)
     time = Usd.TimeCode.EarliestTime()
     turn = turned_up(str(UsdGeom.GetStageUpAxis(flat)), "Y")
-    surfaces = [surface.moved(turn) for surface in published_surfaces(flat, time, _warn)]
+    subject = asset.root_layer
+    if lights := lights_of(flat):
+        _warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
+    surfaces = [s.moved(turn) for s in published_surfaces(flat, time, _warn, subject)]
     return write_glb(output, surfaces, textures.max_size, _warn)
+
+
+@contextmanager
+def _folder_of(output: Path) -> Iterator[None]:
+    """Make the folders above a file; those that hold nothing at the end go again."""
+    made = [folder for folder in output.parents if not folder.exists()]
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for folder in made:  # the innermost first
+            with suppress(OSError):  # it is not empty, or was never made
+                folder.rmdir()
 
 
 def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: PictureOptions) -> set[str]:

@@ -44,10 +44,14 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
         problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
     except Tf.ErrorException as error:
         raise InputRefused(
-            f"{subject}: USD cannot open it: {in_one_line(error)}. [stage.open]"
+            f"{subject}: USD cannot open it: {in_one_line(error)}. Correct that file, or take an "
+            "earlier copy of it. [stage.open]"
         ) from error
     if problems:
-        raise InputRefused(f"{subject}: the stage does not compose: {problems[0]}. [stage.open]")
+        raise InputRefused(
+            f"{subject}: the stage does not compose: {problems[0]}. Correct that layer, or bring "
+            "back the file that it names. [stage.open]"
+        )
     return stage
 
 

@@ -18,7 +18,10 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.job.stamp import code_version
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.compose import open_edited, open_weaker
-from usdbrdf.stage.looks import VARIANT_SET
+from usdbrdf.stage.lights_layer import EMISSIVE
+from usdbrdf.stage.lights_layer import VARIANT_SET as LIGHTS
+from usdbrdf.stage.looks import SHADED, VARIANT_SET
+from usdbrdf.stage.published_surfaces import paths_of
 from usdbrdf.stage.scopes import Scopes
 
 _PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
@@ -28,37 +31,62 @@ _MAPPING = "usdBrdf:fit:mapping"
 _LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", "BackPlateAPI:")
 
 
-def stage_in_look(asset: Asset, look: str) -> Usd.Stage:
+def stage_in_look(asset: Asset, look: str | None = None) -> Usd.Stage:
     """The asset as everybody opens it, edits included, with a look selected; nothing is written.
+
+    look  None: the one that it opens in, or ``shaded`` where that is no look of the asset
 
     Raises UsageError for a look that it has not, and InputRefused for layers that lie elsewhere
     than in the asset's folder, but for the captured geometry that the scan layer refers to.
     """
+    if asset.folder.is_file():
+        raise InputRefused(
+            f"{asset.folder}: this is a file. Name the asset's folder, {asset.folder.parent}. "
+            "[asset.missing]"
+        )
     if not asset.root_layer.is_file():
-        raise InputRefused(f"{asset.folder}: there is no asset in this folder. [asset.missing]")
+        raise InputRefused(
+            f"{asset.folder}: there is no asset in this folder. Name the folder that usdbrdf "
+            "convert wrote. [asset.missing]"
+        )
     stage = open_edited(asset)
     _refuse_foreign_layers(stage, asset)
     looks = stage.GetDefaultPrim().GetVariantSet(VARIANT_SET)
-    if look not in looks.GetVariantNames():
-        raise UsageError(
-            f"--look {look}: the asset has {', '.join(looks.GetVariantNames()) or 'none'}. "
-            "[package.look]"
+    names = looks.GetVariantNames()
+    if not names:
+        raise InputRefused(
+            f"{asset.folder}: the asset has no look yet. Run usdbrdf convert, which measures its "
+            "textures and materials, first. [package.look]"
         )
+    if look is not None and look not in names:
+        raise UsageError(f"--look {look}: the asset has {', '.join(names)}. [package.look]")
+    chosen = (look, looks.GetVariantSelection(), SHADED, *names)
     stage.SetEditTarget(stage.GetSessionLayer())
-    looks.SetVariantSelection(look)
+    looks.SetVariantSelection(next(name for name in chosen if name in names))
     return stage
 
 
-def flattened(stage: Usd.Stage, asset: Asset, look: str) -> Usd.Stage:
+def look_of(stage: Usd.Stage) -> str:
+    """The look that is selected in a stage of ``stage_in_look``."""
+    return str(stage.GetDefaultPrim().GetVariantSet(VARIANT_SET).GetVariantSelection())
+
+
+def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Usd.Stage:
     """All that the stage composes to, as a new stage of one anonymous layer; its asset paths are
-    absolute and have still to be replaced."""
+    absolute and have still to be replaced.
+
+    with_lights  False where the package can hold none: then lamps glow by their material, also
+                 where the artist selected lights in their place
+    """
     _spread_instances(stage)
+    if not with_lights:
+        _let_lamps_glow(stage)
     layer = stage.Flatten(addSourceFileComment=False)
     flat = Usd.Stage.Open(layer)
     root = flat.GetDefaultPrim()
     layer.documentation = ""
     layer.customLayerData = {
-        "usdbrdf": {"role": "package", "version": code_version(), "look": look}
+        "usdbrdf": {"role": "package", "version": code_version(), "look": look_of(stage)}
     }
     if layer.pseudoRoot.HasInfo("renderSettingsPrimPath"):
         layer.pseudoRoot.ClearInfo("renderSettingsPrimPath")
@@ -80,14 +108,19 @@ def take_materials_literally(flat: Usd.Stage) -> None:
             prim.RemoveProperty(_MAPPING)
 
 
+def lights_of(flat: Usd.Stage) -> list[Usd.Prim]:
+    """All UsdLux lights."""
+    return [prim for prim in flat.TraverseAll() if prim.HasAPI(UsdLux.LightAPI)]
+
+
 def fit_for_arkit(flat: Usd.Stage, warn: Callable[[str], None]) -> None:
     """Y up, and only what AR Quick Look takes: no cameras, no lights."""
     root = flat.GetDefaultPrim()
-    doomed = [p for p in flat.TraverseAll() if p.IsA(UsdGeom.Camera) or p.HasAPI(UsdLux.LightAPI)]
-    lights = sum(prim.HasAPI(UsdLux.LightAPI) for prim in doomed)
+    lights = lights_of(flat)
     if lights:
-        warn(f"{lights} lights are left out: the ARKit profile has none.")
-    for path in sorted((prim.GetPath() for prim in doomed), reverse=True):
+        warn(f"the ARKit profile holds no lights; left out: {paths_of(lights)}.")
+    cameras = [prim for prim in flat.TraverseAll() if prim.IsA(UsdGeom.Camera)]
+    for path in sorted((prim.GetPath() for prim in [*cameras, *lights]), reverse=True):
         flat.RemovePrim(path)
     _remove_empty_scopes(flat)
     if UsdGeom.GetStageUpAxis(flat) != UsdGeom.Tokens.y:
@@ -130,6 +163,18 @@ def _spread_instances(stage: Usd.Stage) -> None:
     while instances := [prim for prim in stage.TraverseAll() if prim.IsInstance()]:
         for prim in instances:
             prim.SetInstanceable(False)
+
+
+def _let_lamps_glow(stage: Usd.Stage) -> None:
+    """Select the variant without lights wherever there is the choice, in the session layer."""
+    paths = [
+        prim.GetPath()
+        for prim in stage.TraverseAll()
+        if EMISSIVE in prim.GetVariantSet(LIGHTS).GetVariantNames()
+    ]
+    for path in paths:
+        if prim := stage.GetPrimAtPath(path):  # the choice above it may have taken it away
+            prim.GetVariantSet(LIGHTS).SetVariantSelection(EMISSIVE)
 
 
 def _keep_bound_materials(flat: Usd.Stage) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from usdbrdf.stage.named_files import named_files
 
 Types = Sdf.ValueTypeNames
 
+# The start of what no path of a file is, such as https://.
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
 
 
@@ -106,6 +109,11 @@ def replace_files(flat: Usd.Stage, new: Mapping[str, str]) -> None:
 
 def file_in_asset(path: str, asset: Asset) -> Path:
     """The file at an absolute path, links followed; InputRefused unless it is in the asset."""
+    if _ADDRESS.match(path):
+        raise InputRefused(
+            f"{path}: files from the network are not packaged. Save it in the asset's folder and "
+            "name that copy in edits.usda. [package.outside]"
+        )
     place = Path(os.path.realpath(asset.folder / path))
     if "<UDIM>" in path:
         raise InputRefused(f"{path}: tiled (UDIM) textures are not packaged. [package.udim]")

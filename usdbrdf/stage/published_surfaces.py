@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -22,20 +23,26 @@ from usdbrdf.stage.triangulate import Triangulation
 
 # Meshes that bring no normals are smooth where their faces meet at less than this.
 _CREASE_ANGLE_DEG = 40.0
+# Prims that a sentence names.
+_MAX_SHOWN = 5
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
 def published_surfaces(
-    stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None]
+    stage: Usd.Stage,
+    time: Usd.TimeCode,
+    warn: Callable[[str], None],
+    subject: Path | None = None,
 ) -> tuple[Surface, ...]:
     """All active, visible meshes, in metres in the stage's world, split where subsets of their
     faces are bound to other materials. Subdivision cages are taken as the surface.
 
-    warn  is told, in sentences, what was left out
+    warn     is told, in sentences, what was left out
+    subject  what these sentences are about; None: the stage's root layer
     """
     surfaces: list[Surface] = []
     transforms = UsdGeom.XformCache(time)
-    left_out: set[str] = set()
+    left_out: list[Usd.Prim] = []
     mappings = mappings_of_materials(stage)
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.PointInstancer):
@@ -46,16 +53,21 @@ def published_surfaces(
         if imageable.ComputePurpose() not in _PURPOSES:
             continue
         if not prim.IsA(UsdGeom.Mesh):
-            left_out.add(str(prim.GetTypeName()))
+            left_out.append(prim)
             continue
         world_from_local = np.array(transforms.GetLocalToWorldTransform(prim)).T
         surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, time, mappings, warn)
     if left_out:
-        warn(
-            f"{stage.GetRootLayer().identifier}: only meshes are rendered; left out: "
-            f"{', '.join(sorted(left_out))}."
-        )
+        about = subject or stage.GetRootLayer().identifier
+        warn(f"{about}: only meshes are taken; left out: {paths_of(left_out)}.")
     return tuple(surfaces)
+
+
+def paths_of(prims: Sequence[Usd.Prim]) -> str:
+    """The first of some prims for a sentence: path and type, and how many more there are."""
+    shown = [f"<{prim.GetPath()}> ({prim.GetTypeName()})" for prim in prims[:_MAX_SHOWN]]
+    more = len(prims) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
 
 
 def metres_from_units(stage: Usd.Stage) -> Double:

@@ -136,6 +136,13 @@ class AssetStage:
         stack = attribute.GetPropertyStack(Usd.TimeCode.Default())
         return bool(stack) and stack[0].layer in self.own_layers
 
+    def measured(self, attribute: Usd.Attribute) -> Any:
+        """The strongest value that a layer of ours has, whoever wins; None without one."""
+        for spec in attribute.GetPropertyStack(Usd.TimeCode.Default()):
+            if spec.layer in self.own_layers and spec.HasDefaultValue():
+                return spec.default
+        return None
+
 
 def record_of(layer: Sdf.Layer) -> dict[str, Any]:
     """``customLayerData.usdbrdf`` of a layer; empty where it has none."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from pxr import Sdf, Usd
 
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.files.atomic import environment_failures, temporary_beside
+from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.header import Provenance, new_layer, read_header
 from usdbrdf.validation.asset_stage import AssetStage
@@ -36,7 +36,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
     _check_place(asset, path)
     stage = open_or_finding(asset.root_layer)
     if isinstance(stage, Finding):
-        raise InputRefused(f"{stage.site}: {stage.message} [{stage.rule}]")
+        raise InputRefused(f"{stage.layer}: {stage.message} [{stage.rule}]")
     with environment_failures(str(path)), temporary_beside(path) as written:
         header = new_layer(read_header(asset.root_layer), Provenance(role="cures", version="1"))
         header.documentation = (
@@ -48,18 +48,24 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         # Stronger than all other layers, in memory alone.
         stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
         stage.SetEditTarget(Usd.EditTarget(cures))
-        before = _curable(stage)
+        # In words before any cure: it may change which layer's opinion wins.
+        before = [(rule, fault, finding_of(rule, fault)) for rule, fault in _curable(stage)]
         applied = [
-            finding_of(rule, fault)
-            for rule, fault in before
+            finding
+            for rule, fault, finding in before
             if rule.cure is not None and rule.cure.apply(fault.site)
         ]
-        after = {finding_of(rule, fault) for rule, fault in _curable(stage)}
-        cured = tuple(finding for finding in dict.fromkeys(applied) if finding not in after)
+        after = {_complaint(finding_of(rule, fault)) for rule, fault in _curable(stage)}
+        cured = tuple(f for f in dict.fromkeys(applied) if _complaint(f) not in after)
         if cured:
             cures.Save()
             _publish(written, path)
     return Cured(layer=path, findings=cured)
+
+
+def _complaint(finding: Finding) -> tuple[str, str, str]:
+    """A finding, whichever layer it is that has the opinion."""
+    return finding.rule, finding.site, finding.message
 
 
 def _check_place(asset: Asset, path: Path) -> None:
@@ -76,11 +82,19 @@ def _check_place(asset: Asset, path: Path) -> None:
 
 
 def _publish(written: Path, path: Path) -> None:
-    """Never over a file that somebody wrote in the meantime: a hard link replaces nothing."""
+    """Never over a file that somebody wrote in the meantime: the name is taken before it is used.
+
+    A hard link would do both at once, but not every file system has them.
+    """
     try:
-        os.link(written, path)
+        path.open("xb").close()
     except FileExistsError as error:
         raise _taken(path) from error
+    try:
+        publish(written, path)
+    except BaseException:
+        path.unlink()
+        raise
 
 
 def _taken(path: Path) -> UsageError:

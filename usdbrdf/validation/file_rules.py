@@ -66,9 +66,15 @@ def _missing_textures(scene: AssetStage) -> Iterator[Fault]:
 
 
 def _missing_photographs(scene: AssetStage) -> Iterator[Fault]:
+    """Each file once, and one fault for all files that an attribute is the first to name."""
+    gone: dict[Site, list[Path]] = defaultdict(list)
     for file, sites in sorted(_missing(scene).items()):
-        if any(_of_camera(scene, site) for site in sites):
-            yield Fault(site=sites[0], message=f"@{file}@ does not exist.")
+        cameras = [site for site in sites if _of_camera(scene, site)]
+        if cameras:
+            gone[cameras[0]].append(file)
+    for site, files in gone.items():
+        more = f" Nor do {len(files) - 1} more of its photographs." if len(files) > 1 else ""
+        yield Fault(site=site, message=f"@{files[0]}@ does not exist.{more}")
 
 
 def _of_camera(scene: AssetStage, site: Site) -> bool:

@@ -23,6 +23,7 @@ _TOLERANCE = 1e-4
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
 _MAPPINGS = (_MEASURED, "matched")
+_RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
 
 def _colour_space(scene: AssetStage) -> Iterator[Fault]:
@@ -79,7 +80,7 @@ def _lobe(scene: AssetStage) -> Iterator[Fault]:
 
 def _recorded_lobe(item: Usd.Prim) -> PreviewLobe | None:
     """What an object's record stands for; None where it tells nothing."""
-    phi, psi = (authored(item, f"usdBrdf:fit:{name}") for name in ("phi", "psi"))
+    phi, psi = (authored(item, name) for name in _RECORD[:2])
     if _mapping(item) not in _MAPPINGS or phi is None or psi is None:
         return None
     in_range = 0 <= phi <= 1 and 0 <= psi <= 1
@@ -109,13 +110,30 @@ def _first(value: Any) -> float:
 
 
 def _show_record(site: Site) -> bool:
-    surface, wanted = AssetStage(site.GetStage()).surface_of(site), _recorded_lobe(site)
-    if surface is None or wanted is None:
+    """The record as it was measured, and the material as that record says."""
+    scene = AssetStage(site.GetStage())
+    surface = scene.surface_of(site)
+    if surface is None:
         return False
-    for shown, value in _shown(surface, wanted):
-        scale = shown.GetTypeName() == Types.Float4
-        shown.Set(Gf.Vec4f(value, value, value, 1.0) if scale else value)
+    _restore_record(scene, site)
+    wanted = _recorded_lobe(site)
+    for shown, value in _shown(surface, wanted) if wanted else ():
+        if scene.is_measured(shown) and abs(_first(shown.Get()) - value) > _TOLERANCE:
+            scale = shown.GetTypeName() == Types.Float4
+            shown.Set(Gf.Vec4f(value, value, value, 1.0) if scale else value)
     return True
+
+
+def _restore_record(scene: AssetStage, item: Usd.Prim) -> None:
+    """What others say of the measurement gives way to what our layers say, be it nothing."""
+    for name in _RECORD:
+        recorded = item.GetAttribute(name)
+        if authored(item, name) is not None and not scene.is_measured(recorded):
+            ours = scene.measured(recorded)
+            if ours is None:
+                recorded.Block()
+            else:
+                recorded.Set(ours)
 
 
 def _emitter_albedo(scene: AssetStage) -> Iterator[Fault]:
@@ -202,7 +220,11 @@ RULES = (
         advice="To change how a surface looks author roughness and ior of its material; leave the "
         "record of the measurement as it is.",
         check=_lobe,
-        cure=Cure(name="ShowRecord", description="roughness, ior, factor", apply=_show_record),
+        cure=Cure(
+            name="ShowRecord",
+            description="the record as measured; roughness, ior and factor that it stands for",
+            apply=_show_record,
+        ),
     ),
     Rule(
         name="EmitterAlbedo",

@@ -66,16 +66,20 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A fault in words: ``site`` is a prim or property in <>, or a layer in @@."""
+    """A fault in words.
+
+    site   the prim or property in <>; of a file its default prim
+    layer  in @@ the file itself; of a property the layer whose opinion wins; else the root layer
+    """
 
     severity: Severity
     site: str
+    layer: str
     message: str
     rule: str
 
     def __str__(self) -> str:
-        where = f"{self.site}: " if self.site else ""
-        return f"{self.severity.value}: {where}{self.message} [{self.rule}]"
+        return f"{self.severity.value}: {self.site} {self.layer}: {self.message} [{self.rule}]"
 
 
 def finding_of(rule: Rule, fault: Fault) -> Finding:
@@ -83,13 +87,24 @@ def finding_of(rule: Rule, fault: Fault) -> Finding:
     return Finding(
         severity=fault.severity or rule.severity,
         site=site_in_words(fault.site),
+        layer=layer_in_words(fault.site),
         message=fault.message,
         rule=f"{PREFIX}.{rule.name}",
     )
 
 
 def site_in_words(site: Site) -> str:
-    """<path> of a prim or a property, @file@ of a layer."""
+    """<path> of a prim or a property; of a layer that of its default prim, </> without one."""
     if isinstance(site, Sdf.Layer):
-        return f"@{site.realPath or site.identifier}@"
+        return f"</{site.defaultPrim.lstrip('/')}>"
     return f"<{site.GetPath()}>"
+
+
+def layer_in_words(site: Site) -> str:
+    """@file@ of a layer, of the one whose opinion of a property wins, or of a prim's stage."""
+    if isinstance(site, Usd.Property):
+        stack = site.GetPropertyStack(Usd.TimeCode.Default())
+        layer = stack[0].layer if stack else site.GetStage().GetRootLayer()
+    else:
+        layer = site if isinstance(site, Sdf.Layer) else site.GetStage().GetRootLayer()
+    return f"@{layer.realPath or layer.identifier}@"

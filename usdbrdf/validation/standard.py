@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
 from usdbrdf.stage.usd_errors import in_one_line
-from usdbrdf.validation.rule import Finding, Severity
+from usdbrdf.validation.rule import Finding, Severity, Site, layer_in_words, site_in_words
 
-OPEN, COMPOSITION = "usd.Open", "usd.Composition"
+OPEN = "usd.Open"
 
 # The plug-ins of usd-core itself: others that are installed may need a network, or a licence.
 _BUILT_IN = frozenset(
@@ -28,27 +29,25 @@ _SEVERITIES = {
 def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
     """The stage, from the files as they are now; or why USD cannot open it."""
     try:
-        stage = Usd.Stage.Open(str(root_layer))
-        for layer in stage.GetUsedLayers():
-            # Another stage of this process may hold a layer from before it was written anew.
-            if not layer.anonymous:
-                layer.Reload()
+        with _no_warnings():
+            stage = Usd.Stage.Open(str(root_layer))
+            for layer in stage.GetUsedLayers():
+                # Another stage of this process may hold a layer from before it was written anew.
+                if not layer.anonymous:
+                    layer.Reload()
     except Tf.ErrorException as error:
         return _not_opened(str(root_layer), error)
     return stage
 
 
 def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """Errors of composition, and those that usd-core's validators find."""
-    for problem in stage.GetCompositionErrors():
-        yield Finding(
-            severity=Severity.ERROR, site="", message=f"{in_one_line(problem)}.", rule=COMPOSITION
-        )
+    """What usd-core's validators find; errors of composition are among it."""
     registry = UsdValidation.ValidationRegistry()
     names = [metadata.name for metadata in _built_in()]
     context = UsdValidation.ValidationContext(validators=registry.GetOrLoadValidatorsByName(names))
     try:
-        errors = context.Validate(stage)
+        with _no_warnings():
+            errors = context.Validate(stage)
     except Tf.ErrorException as failure:
         # A validator opened a layer itself, and the stage's own open had passed over it.
         yield from _unreadable(stage) or [_not_opened(stage.GetRootLayer().realPath, failure)]
@@ -56,9 +55,11 @@ def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
     for error in errors:
         if _is_materialx_unknown(error):
             continue
+        sites = [_site(site) for site in error.GetSites()] or [stage.GetRootLayer()]
         yield Finding(
             severity=_SEVERITIES.get(error.GetType(), Severity.ERROR),
-            site=", ".join(_site(site) for site in error.GetSites()),
+            site=", ".join(site_in_words(site) for site in sites),
+            layer=layer_in_words(sites[0]),
             message=in_one_line(error.GetMessage()),
             rule=error.GetIdentifier(),
         )
@@ -67,7 +68,6 @@ def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
 def standard_rules() -> Iterator[tuple[str, str]]:
     """(name, description) of all that ``standard_findings`` looks for."""
     yield OPEN, "USD can open the root layer, and the layers that it needs."
-    yield COMPOSITION, "All layers, references and payloads of the stage compose."
     for metadata in _built_in():
         yield metadata.name, " ".join(metadata.doc.split())
 
@@ -75,7 +75,8 @@ def standard_rules() -> Iterator[tuple[str, str]]:
 def _not_opened(file: str, error: Tf.ErrorException) -> Finding:
     return Finding(
         severity=Severity.ERROR,
-        site=f"@{file}@",
+        site="</>",
+        layer=f"@{file}@",
         message=f"USD cannot open it: {in_one_line(error)}.",
         rule=OPEN,
     )
@@ -112,9 +113,25 @@ def _is_materialx_unknown(error: UsdValidation.ValidationError) -> bool:
     return all(str(UsdShade.Shader(prim).GetShaderId()).startswith("ND_") for prim in prims)
 
 
-def _site(site: UsdValidation.ValidationErrorSite) -> str:
+def _site(site: UsdValidation.ValidationErrorSite) -> Site:
     if site.IsPrim():
-        return f"<{site.GetPrim().GetPath()}>"
+        return site.GetPrim()
     if site.IsProperty():
-        return f"<{site.GetProperty().GetPath()}>"
-    return f"@{site.GetLayer().identifier}@" if site.GetLayer() else "stage"
+        return site.GetProperty()
+    return site.GetLayer() or site.GetStage().GetRootLayer()
+
+
+@contextmanager
+def _no_warnings() -> Iterator[None]:
+    """USD prints its warnings as it goes; what they are about, the findings name.
+
+    Versions of usd-core without a trap for them print them still.
+    """
+    if not hasattr(Tf, "DiagnosticTrap"):
+        yield
+        return
+    with Tf.DiagnosticTrap() as trap:
+        try:
+            yield
+        finally:
+            trap.ClearWarnings()

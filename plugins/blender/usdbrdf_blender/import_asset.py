@@ -7,7 +7,7 @@ from bpy_extras.io_utils import ImportHelper
 
 from . import usd_asset
 from .import_hook import FILE, ROOT
-from .looks import objects_of, show_look
+from .looks import show_look
 
 
 class USDBRDF_OT_import(bpy.types.Operator, ImportHelper):
@@ -27,8 +27,16 @@ class USDBRDF_OT_import(bpy.types.Operator, ImportHelper):
 
     def execute(self, _context):
         looks = usd_asset.looks_of_file(self.filepath)
-        if not looks:
-            self.report({"ERROR"}, f"{self.filepath}: not an asset of usdbrdf. Choose NAME.usda.")
+        if not looks and not usd_asset.has_facts(self.filepath):
+            self.report(
+                {"ERROR"},
+                f"{self.filepath}: not an asset of usdbrdf. Choose NAME.usda, or a package of it.",
+            )
+            return {"CANCELLED"}
+        if self.look and not looks:
+            self.report(
+                {"ERROR"}, f"{self.filepath}: a package shows one look alone. Leave Look empty."
+            )
             return {"CANCELLED"}
         if self.look and self.look not in looks:
             self.report({"ERROR"}, f"{self.look!r} is not a look. Use one of {', '.join(looks)}.")
@@ -38,16 +46,15 @@ class USDBRDF_OT_import(bpy.types.Operator, ImportHelper):
 
 
 def import_asset(file, look=""):
-    """Import a root layer; ``look`` is one of its looks, or empty for the one that it selects."""
+    """Import a root layer or a package; ``look`` is one of the root layer's looks, or empty for
+    the one that is selected."""
     before = set(bpy.data.objects)
     bpy.ops.wm.usd_import(filepath=file)
-    mine = [item for item in bpy.data.objects if item not in before and ROOT in item]
-    if not mine:
-        return
-    layer, root = mine[0][FILE], mine[0][ROOT]
-    _remove_empty_scopes([item for item in objects_of(layer, root) if item not in before])
-    if look:
-        show_look(layer, root, look)
+    new = [item for item in bpy.data.objects if item not in before]
+    shown = next(((item[FILE], item[ROOT]) for item in new if ROOT in item), None)
+    _remove_empty_scopes(new)
+    if look and shown:
+        show_look(*shown, look)
 
 
 def _remove_empty_scopes(items):
@@ -62,7 +69,7 @@ def _remove_empty_scopes(items):
 
 
 def menu_entry(menu, _context):
-    menu.layout.operator(USDBRDF_OT_import.bl_idname, text="usdbrdf Asset (.usda)")
+    menu.layout.operator(USDBRDF_OT_import.bl_idname, text="usdbrdf Asset (.usda, .usdz)")
 
 
 CLASSES = (USDBRDF_OT_import,)

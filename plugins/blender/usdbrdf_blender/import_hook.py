@@ -7,8 +7,8 @@ import bpy
 
 from . import usd_asset
 
-# On objects and materials: the layer and the prim that they came from. On objects besides: the
-# prim that has the looks, their names, and the one that is shown.
+# On objects and materials: the layer and the prim that they came from. On objects besides, where
+# there are looks: the prim that has them, their names, and the one that is shown.
 FILE, PRIM = "usdbrdf_file", "usdbrdf_prim"
 ROOT, LOOKS, SHOWN = "usdbrdf_root", "usdbrdf_looks", "usdbrdf_look"
 
@@ -25,20 +25,22 @@ class UsdBrdfImport(bpy.types.USDHook):
         file = stage.GetRootLayer().realPath
         for path, imported in context.get_prim_map().items():
             prim = stage.GetPrimAtPath(path)
-            root = usd_asset.look_prim(prim)
-            if root is None:
+            # A package of ours has facts, and no looks to choose from.
+            root, facts = usd_asset.look_prim(prim), usd_asset.facts_of(prim)
+            if root is None and not facts:
                 continue
             for item in imported:
                 if isinstance(item, bpy.types.Object | bpy.types.Material):
                     item[FILE], item[PRIM] = file, str(path)
                 if isinstance(item, bpy.types.Object):
-                    _keep_facts(item, prim, root)
+                    for name, value in facts.items():
+                        item[name] = value
+                    if root is not None:
+                        _keep_looks(item, root)
         return True
 
 
-def _keep_facts(item, prim, root):
-    for name, value in usd_asset.facts_of(prim).items():
-        item[name] = value
+def _keep_looks(item, root):
     looks = root.GetVariantSet(usd_asset.LOOK)
     item[ROOT], item[SHOWN] = str(root.GetPath()), looks.GetVariantSelection()
     item[LOOKS] = list(looks.GetVariantNames())

@@ -43,6 +43,15 @@ def looks_of_file(file):
     return tuple(prim.GetVariantSet(LOOK).GetVariantNames()) if prim else ()
 
 
+def has_facts(file):
+    """Whether anything of ours was authored in a file; not if it cannot be read."""
+    try:
+        stage = open_stage(file)
+    except AssetUnreadable:
+        return False
+    return any(facts_of(prim) for prim in stage.Traverse())
+
+
 def materials_in_look(file, root, look):
     """Mesh path -> what it wears while the prim ``root`` shows ``look``: (material path, faces),
     first the mesh's own material with no faces, then those of its GeomSubsets."""

@@ -129,6 +129,19 @@ def plain_import(file):
     return {"properties": properties(), "surfaces": surfaces()}
 
 
+def package(file):
+    """A package: by the add-on's operator, and by Blender's own."""
+    told = {"plain": plain_import(file)["properties"]}
+    empty_scene()
+    bpy.ops.usdbrdf.import_asset(filepath=file)
+    told["objects"] = {o.name: o.type for o in bpy.data.objects}
+    told["properties"] = properties()
+    select("Stuhl_No_1")
+    told["fit"], told["look"] = drawn("USDBRDF_PT_fit"), drawn("USDBRDF_PT_look")
+    told["no_look"] = refusal(bpy.ops.usdbrdf.import_asset, filepath=file, look="lit")
+    return told
+
+
 def looks(file):
     enable()
     empty_scene()

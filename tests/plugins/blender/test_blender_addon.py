@@ -12,6 +12,7 @@ import pytest
 from pxr import Sdf
 
 from tests.scenes import make_capture
+from usdbrdf.cli import main
 
 BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 HERE = Path(__file__).parent
@@ -118,6 +119,26 @@ def test_what_the_importer_loses_the_hook_keeps(session, room):
         assert lamp["image"] == "lamp.emission.exr"
         assert (lamp["emission_linked"], lamp["emission_strength"]) == (True, 1)
         assert {s["colorspace"] for s in report["surfaces"].values()} == {"Non-Color"}
+
+
+@needs_blender
+def test_a_package_brings_what_was_measured(session, room, tmp_path):
+    file = tmp_path / "room é.usdz"
+    assert main(["package", "-q", str(room.parent), "-o", str(file)]) == 0
+    told = session("package", file)
+    for kept in (told["plain"], told["properties"]):
+        assert kept["Stuhl_No_1"]["usdBrdf:fit:phi"] == 0.25
+        assert kept["Stuhl_No_1"]["usdBrdf:fit:status"] == "measured"
+        assert kept["lamp"]["usdBrdf:emitter:radiance"] == [8, 7, 6]
+        assert "usdbrdf_look" not in kept["Stuhl_No_1"]
+    assert {n for n, kind in told["objects"].items() if kind == "MESH"} == {
+        "Stuhl_No_1",
+        "wall",
+        "lamp",
+    }
+    assert "0.25 ± 0.031 (confidence high)" in labels(told["fit"])
+    assert told["look"] is None
+    assert f"{file}: a package shows one look alone" in told["no_look"]
 
 
 @needs_blender

@@ -129,9 +129,9 @@ class Signal:
     def connect(self, slot):
         self._slots.append(slot)
 
-    def emit(self):
+    def emit(self, *arguments):
         for slot in self._slots:
-            slot()
+            slot(*arguments)
 
 
 class ViewSettings:
@@ -153,9 +153,11 @@ class Selection:
     def __init__(self, root):
         self._root = root
         self._path = Sdf.Path.absoluteRootPath
+        self.signalPrimSelectionChanged = Signal()
 
     def setPrim(self, prim):
-        self._path = prim.GetPath()
+        before, self._path = self._path, prim.GetPath()
+        self.signalPrimSelectionChanged.emit({self._path}, {before})
 
     def getFocusPrim(self):
         return self._root.stage.GetPrimAtPath(self._path)

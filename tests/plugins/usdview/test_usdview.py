@@ -89,7 +89,7 @@ def test_a_look_goes_into_the_session_layer(viewer):
     assert [layer for layer in stage.GetLayerStack() if layer.dirty] == [stage.GetSessionLayer()]
     assert stage.GetEditTarget().GetLayer() == stage.GetRootLayer()
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
-    assert viewer.api.said == ["look: lit"]
+    assert viewer.api.said == ["room, look: lit"]
 
 
 def test_the_menu_follows_the_stage(viewer):
@@ -103,6 +103,32 @@ def test_the_menu_follows_the_stage(viewer):
     viewer.api.dataModel.stage = other
     assert [n for n, entry in viewer.looks.items() if entry.visible] == ["lit", "painted"]
     viewer.api.dataModel.stage = None
+    assert not any(entry.visible for entry in viewer.looks.values())
+
+
+@pytest.mark.parametrize("instanceable", [False, True])
+def test_a_shot_has_the_looks_of_the_asset_that_is_selected(viewer, instanceable):
+    shot = Usd.Stage.CreateInMemory()
+    shot.SetDefaultPrim(shot.DefinePrim("/shot"))
+    for name in ("left", "right"):
+        prim = shot.DefinePrim(f"/shot/{name}", "Xform")
+        prim.GetReferences().AddReference(str(viewer.built.asset.root_layer))
+        prim.SetInstanceable(instanceable)
+    viewer.api.dataModel.selection.setPrim(shot.GetPseudoRoot())
+    viewer.api.dataModel.stage = shot
+    assert not any(entry.visible for entry in viewer.looks.values())
+    viewer.looks["lit"].trigger()
+    assert viewer.api.said == ["Select an asset that has the look lit."]
+    chairs = [f"/shot/{name}/geo/Stuhl_No_1" for name in ("left", "right")]
+    viewer.select(chairs[1])
+    assert viewer.looks["lit"].visible
+    viewer.looks["lit"].trigger()
+    assert viewer.api.said[-1] == "right, look: lit"
+    assert [bound_material(shot, path) for path in chairs] == [
+        "/shot/left/mtl/Stuhl_No_1",
+        "/shot/right/looks/lit/Stuhl_No_1",
+    ]
+    viewer.select("/shot")
     assert not any(entry.visible for entry in viewer.looks.values())
 
 

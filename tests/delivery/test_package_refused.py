@@ -1,0 +1,121 @@
+"""What is not packed, and what is said of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Sdf
+
+from tests.delivery.packing import CHAIR_FILE, edit, packed
+from usdbrdf.delivery.package import package
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
+from usdbrdf.files.images import write_exr
+from usdbrdf.stage.flat_stage import look_of, stage_in_look
+from usdbrdf.stage.usdz import write_usdz
+
+
+@pytest.mark.parametrize(
+    "path", ["/etc/hostname", "../../../../../../../../etc/hostname", "./textures/link.exr"]
+)
+def test_files_outside_are_refused(room, tmp_path, path):
+    secret = tmp_path / "secret.exr"
+    write_exr(secret, np.zeros((2, 2, 3), np.float32))
+    (room.asset.folder / "textures/link.exr").symlink_to(secret)
+    edit(room, CHAIR_FILE.format(path))
+    for name in ("room.usdz", "room.glb"):
+        with pytest.raises(InputRefused, match=r"package\.outside"):
+            packed(room, tmp_path, name)
+        assert not (tmp_path / "out of it" / name).exists()
+
+
+@pytest.mark.parametrize("path", ["https://example.org/a.png", "file:///etc/hostname"])
+def test_addresses_are_refused_as_such(room, tmp_path, path):
+    edit(room, CHAIR_FILE.format(path))
+    with pytest.raises(InputRefused, match=rf"^{path}: files from the network are not packaged"):
+        packed(room, tmp_path)
+
+
+def test_a_refusal_leaves_no_folder_behind(room, tmp_path):
+    edit(room, CHAIR_FILE.format("./gone.exr"))
+    (tmp_path / "there").mkdir()
+    for folder in ("a/b", "there/c", "there"):
+        with pytest.raises(InputRefused, match=r"package\.missing"):
+            package(room.asset.folder, tmp_path / folder / "room.usdz")
+    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "there/c").exists()
+
+
+def test_what_usd_says_of_a_failure_is_told_without_its_source(room, tmp_path):
+    edit(room, 'over "room" { def "prop" ( references = @./gone.usda@ ) {} }')
+    with pytest.raises(InputRefused, match=r"gone\.usda.*or bring back the file"):
+        packed(room, tmp_path)
+    room.asset.edits_layer.write_text('#usda 1.0\nover "room" {')
+    with pytest.raises(InputRefused, match=r"edits\.usda:2:.*Correct") as of_layer:
+        packed(room, tmp_path)
+    room.asset.root_layer.write_text('#usda 1.0\ndef "room" {')
+    with pytest.raises(InputRefused, match=r"room\.usda:2:.*Correct") as of_root:
+        packed(room, tmp_path)
+    with pytest.raises(EnvironmentFailure, match="could not be written") as of_disk:
+        write_usdz(tmp_path / "no folder/x.usdz", tmp_path, [])
+    for told in (of_layer, of_root, of_disk):
+        assert "pxr" not in str(told.value)
+        assert " at line " not in str(told.value)
+
+
+def test_other_attributes_bring_no_file_in(room, tmp_path):
+    edit(room, 'over "room" { custom asset userProperties:note = @/etc/hostname@ }')
+    with pytest.raises(InputRefused, match=r"package\.outside"):
+        packed(room, tmp_path)
+
+
+def test_a_layer_from_elsewhere_is_refused(room, tmp_path):
+    (tmp_path / "mine.usda").write_text('#usda 1.0\nover "room" {}\n')
+    edits = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    edits.subLayerPaths = [str(tmp_path / "mine.usda")]
+    edits.Save()
+    with pytest.raises(InputRefused, match=r"mine\.usda.*package\.outside"):
+        packed(room, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("path", "code"),
+    [("./note.txt", "package.format"), ("./gone.exr", "package.missing"), ("./x.exr", "image")],
+)
+def test_what_is_no_picture_is_refused(room, tmp_path, path, code):
+    (room.asset.folder / "note.txt").write_text("mine")
+    (room.asset.folder / "x.exr").write_text("no picture")
+    edit(room, CHAIR_FILE.format(path))
+    with pytest.raises(InputRefused, match=code):
+        packed(room, tmp_path)
+
+
+def test_an_asset_of_which_nothing_is_measured_yet(synthetic, tmp_path):
+    scan = synthetic.make_scan(tmp_path / "capture")
+    new = synthetic.build(tmp_path / "new", scan, upto="scan").asset
+    with pytest.raises(InputRefused, match=r"no look yet\. Run usdbrdf convert.*package\.look"):
+        package(new.folder, tmp_path / "new.usdz")
+    textured = synthetic.build(tmp_path / "textured", scan, upto="texturing").asset
+    assert look_of(stage_in_look(textured)) == "lit"
+
+
+def test_a_file_in_the_place_of_the_folder(room, tmp_path):
+    with pytest.raises(
+        InputRefused, match=rf"a file\. Name the asset's folder, .*{room.asset.name}"
+    ):
+        package(room.asset.root_layer, tmp_path / "room.usdz")
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("room.zip", {}),
+        ("room.glb", {"profile": "arkit"}),
+        ("room.glb", {"textures": "exr"}),
+        ("room.usdz", {"profile": "arkit", "textures": "exr"}),
+        ("room.usdz", {"max_size": 0}),
+        ("room.usdz", {"look": "sunny"}),
+    ],
+)
+def test_options_that_cannot_be(room, tmp_path, name, options):
+    with pytest.raises(UsageError):
+        packed(room, tmp_path, name, **options)
