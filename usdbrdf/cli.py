@@ -158,7 +158,8 @@ def _relight(chosen: Arguments) -> int:
 
 
 def _package(chosen: Arguments) -> int:
-    summary = package(chosen.asset, chosen.output, package_options(chosen))
+    asset = _asset_at(chosen.asset).folder
+    summary = package(asset, chosen.output, package_options(chosen))
     if chosen.json:
         _print(json.dumps(summary, indent=2))
     say(f"{chosen.output}: written, {summary['bytes']:,} bytes")
