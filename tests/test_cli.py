@@ -406,7 +406,12 @@ def test_signals(number, status, capture, tmp_path, monkeypatch, capsys):
         os.kill(os.getpid(), number)
 
     monkeypatch.setattr(cli, "ingest", killed)
-    assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == status
+    # What starts in the background inherits an interrupt that is ignored.
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == status
+    finally:
+        signal.signal(signal.SIGINT, inherited)
     assert capsys.readouterr().err.endswith("the same command goes on from here.\n")
     assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGTERM) is handler
