@@ -14,7 +14,7 @@ from usdbrdf.geometry.rays import lift_from_surface
 from usdbrdf.material.lit_scene import LitScene
 from usdbrdf.material.predict import non_diffuse_radiance
 from usdbrdf.material.target_frames import points_of_rays
-from usdbrdf.shading.irradiance_kernels import cosine_rays
+from usdbrdf.shading.cosine_rays import cosine_rays
 
 Float = npt.NDArray[np.float32]
 Long = npt.NDArray[np.int64]
@@ -40,8 +40,7 @@ def specular_irradiance(
     """
     count = len(position)
     origin = np.tile(lift_from_surface(position, normal, lit.size), (rays, 1))
-    independent = np.zeros((0, 5)), np.zeros((1, 5)), np.zeros(count, np.int32), seed, identity
-    directions = cosine_rays(normal, independent, 0, rays)
+    directions = cosine_rays(normal, identity, seed, rays)
     points = points_of_rays(lit.rays, lit.scene, origin, directions)
     emits = lit.emission.at(points.face, points.u, points.v)[:, 0] > 0.5
     reflects = np.flatnonzero((points.face >= 0) & ~emits)

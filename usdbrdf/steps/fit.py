@@ -30,10 +30,6 @@ from usdbrdf.steps.step import Step, hash_of_files, hash_of_maps, weaker_layers
 from usdbrdf.steps.surroundings import environment_from_file, environment_hash
 from usdbrdf.steps.texture import FILLED
 
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
-
 
 def fit(asset: Asset, options: FitOptions) -> StageResult:
     """Choose target frames, fit every object, write material.usda."""
