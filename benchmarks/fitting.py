@@ -27,6 +27,7 @@ from usdbrdf.material import fit_views as views
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_measured
 from usdbrdf.steps import fit, fit_objects
+from usdbrdf.texturing.footprints import RINGS
 
 T = TypeVar("T")
 
@@ -86,7 +87,7 @@ def rays_per_sample() -> int:
     """Of one footprint: points of it, times three independent sets, times the mixture's rays."""
     mixture, lobes = views._MIXTURE, 5
     rays = mixture.per_lobe * lobes + mixture.lights + mixture.cosine
-    return 3 * len(views._OFFSETS) * rays
+    return 3 * len(RINGS) * rays
 
 
 def measure(asset: Path, quick: bool) -> dict[str, Any]:
