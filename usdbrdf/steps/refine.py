@@ -59,16 +59,18 @@ def refined_maps(
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
     texels = atlas.texels
-    observed = _observe(run, atlas, lit, frames, lobes, seed)
+    measured_lit = atlas.map("lit")
+    level = _level(measured_lit)
+    observed = _observe(run, atlas, lit, frames, lobes, level, seed)
     measured = np.isfinite(observed.mean[:, 0])
     emission = atlas.map_where_present("emission", 3)
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
-    diffuse = np.where(emissive[:, None], emission, _restored(atlas, observed, known))
+    diffuse = np.where(emissive[:, None], emission, _restored(texels, observed, known, level))
     # What clips in every frame is at least as bright as that.
     coverage = atlas.map("coverage")
     clipped = coverage == CLIPPED
-    diffuse = np.where(clipped, np.maximum(diffuse, atlas.map("lit")), diffuse)
+    diffuse = np.where(clipped, np.maximum(diffuse, measured_lit), diffuse)
     seen = coverage[:, 0] != FILLED
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
@@ -87,18 +89,17 @@ def refined_maps(
     }
 
 
-def _restored(atlas: Atlas, found: RobustMean, known: Bool) -> Float:
-    """(T, 3), W/(m^2 sr), from the means in units of ``_level``; filled in where not ``known``."""
-    level = _level(atlas)[:, None]
-    filled = inpaint(atlas.texels, np.maximum(found.mean * level, 0), known)
-    variance = found.variance * level[:, 0] ** 2
-    return np.maximum(restored(atlas.texels, filled, known, variance, found.footprint), 0)
+def _restored(texels: Texels, found: RobustMean, known: Bool, level: Float) -> Float:
+    """(T, 3), W/(m^2 sr), from the means in units of ``level``; filled in where not ``known``."""
+    filled = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
+    variance = found.variance * level**2
+    return np.maximum(restored(texels, filled, known, variance, found.footprint), 0)
 
 
-def _level(atlas: Atlas) -> Float:
-    """Of each texel, (T,), W/(m^2 sr): its lit radiance."""
-    lit = atlas.map("lit").mean(axis=1)
-    level: Float = np.maximum(lit, max(_DARKEST * float(np.median(lit)), 1e-30))
+def _level(lit: Float) -> Float:
+    """Of each texel, (T,), W/(m^2 sr): its lit radiance (T, 3), and no less than a little."""
+    mean = lit.mean(axis=1)
+    level: Float = np.maximum(mean, max(_DARKEST * float(np.median(mean)), 1e-30))
     return level
 
 
@@ -108,11 +109,12 @@ def _observe(
     lit: LitScene,
     frames: Frames,
     lobes: Lobes,
+    level: Float,
     seed: int,
 ) -> RobustMean:
-    """All frames without their specular light, in units of ``_level``, going on from the last saved
-    state of an interrupted run."""
-    texels, owner, level = atlas.texels, atlas.texels.object_index(), _level(atlas)
+    """All frames without their specular light, in units of ``level`` (T,), going on from the last
+    saved state of an interrupted run."""
+    texels, owner = atlas.texels, atlas.texels.object_index()
     saved = run.latest("refined")
     start, observed = 0, MeanState.empty(len(texels))
     if saved is not None:
