@@ -103,3 +103,12 @@ class RecordedRays:
     def occluded(self, origins: Any, directions: Any, distances: Any) -> Any:
         self.calls.append((origins, directions, distances))
         return self.rays.occluded(origins, directions, distances)
+
+
+def saved_plot(drawing: Any, path: Path) -> Path:
+    """Write a figure of pyplot's to ``path``, and let it go."""
+    from matplotlib import pyplot
+
+    drawing.savefig(path, dpi=120)
+    pyplot.close(drawing)
+    return path

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 from fitting import Fitted, fitted
-from measure import figure, lit_asset, table
+from measure import figure, lit_asset, saved_plot, table
 from peer_optimiser import Settings, optimised
 
 from usdbrdf.errors import EnvironmentFailure
@@ -154,10 +154,7 @@ def plot(results: dict[str, Any], folder: Path) -> Path:
     axes.set(xlabel="CPU seconds", ylabel="mean error, measured objects", xscale="log")
     axes.set_ylim(bottom=0)
     axes.legend()
-    path = folder / "peer.png"
-    drawing.savefig(path, dpi=120)
-    pyplot.close(drawing)
-    return path
+    return saved_plot(drawing, folder / "peer.png")
 
 
 if __name__ == "__main__":

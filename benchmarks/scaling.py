@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import Spent, figure, table, timed
+from measure import Spent, figure, saved_plot, table, timed
 
 import usdbrdf
 from usdbrdf.stage.asset import Asset
@@ -154,10 +154,7 @@ def plot(results: dict[str, Any], folder: Path) -> Path:
         axes.set(xlabel=name)
     all_axes[0, 0].set(ylabel="CPU seconds")
     all_axes[0, 0].legend()
-    path = folder / "scaling.png"
-    drawing.savefig(path, dpi=120)
-    pyplot.close(drawing)
-    return path
+    return saved_plot(drawing, folder / "scaling.png")
 
 
 if __name__ == "__main__":

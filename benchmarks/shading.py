@@ -28,7 +28,17 @@ from typing import Any
 
 import numpy as np
 from irradiance_noise import Sizes, bias, noise, shaded
-from measure import Lit, RecordedRays, figure, lit_asset, median, ratio, side_by_side, table
+from measure import (
+    Lit,
+    RecordedRays,
+    figure,
+    lit_asset,
+    median,
+    ratio,
+    saved_plot,
+    side_by_side,
+    table,
+)
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.shading.irradiance import Sampling, patches_of_texels
@@ -165,10 +175,7 @@ def plot(results: dict[str, Any], folder: Path) -> Path:
     axes.axhline(100 * study["paper"]["rmse"], color="grey", linewidth=0.8, linestyle=":")
     axes.set(xlabel="rays per texel", ylabel="relative RMSE of S (%)")
     axes.legend()
-    path = folder / "shading.png"
-    drawing.savefig(path, dpi=120)
-    pyplot.close(drawing)
-    return path
+    return saved_plot(drawing, folder / "shading.png")
 
 
 if __name__ == "__main__":
