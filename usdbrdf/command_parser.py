@@ -105,6 +105,8 @@ def _add_step_arguments(parser: argparse.ArgumentParser, steps: list[str]) -> No
     else:
         add("output", type=Path, metavar="ASSET", help="asset folder made by ingest")
     options.add_run_options(parser)
+    if "texture" in steps or "fit" in steps:
+        options.add_memory_option(parser)
     if len(steps) > 1:
         options.add_edit_options(parser)
     if "ingest" in steps:

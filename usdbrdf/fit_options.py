@@ -47,5 +47,6 @@ def fit_options(chosen: argparse.Namespace) -> FitOptions:
         mapping=chosen.mapping,
         materialx=chosen.materialx,
         environment=chosen.environment,
+        memory=chosen.memory,
         seed=chosen.seed,
     )

@@ -159,12 +159,16 @@ def add_texture_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="coarsen the default texel size so that the scene has at most N texels",
     )
-    add(
+
+
+def add_memory_option(parser: argparse.ArgumentParser) -> None:
+    """Of the steps that read all frames."""
+    parser.add_argument(
         "--memory",
         type=finite_number,
         metavar="GIB",
-        help="memory for texturing, which then takes as many passes over the frames as that asks "
-        "for; default: three quarters of the machine's",
+        help="memory for texturing and for refining, which then take as many passes over the "
+        "frames as that asks for; default: three quarters of the machine's",
     )
 
 

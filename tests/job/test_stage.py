@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.job import stage
 from usdbrdf.job import stamp as stamp_module
 from usdbrdf.job.stage import run_stage
 
@@ -185,6 +186,27 @@ def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
     for key, array in arrays.items():
         assert loaded[key].dtype == array.dtype
         assert loaded[key].tobytes() == array.tobytes()
+
+
+def test_a_running_state_is_not_saved_all_the_time(tmp_path, monkeypatch):
+    clock, saved = [0.0], []
+    monkeypatch.setattr(stage.time, "monotonic", lambda: clock[0])
+
+    def state():
+        saved.append(clock[0])
+        clock[0] += 1  # a second to save
+        return {"sum": np.zeros(3)}
+
+    def work(run):
+        for frame in range(120):
+            clock[0] += 1
+            run.save_latest_in_time("sum", frame, state)
+        return {}
+
+    run_stage(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    assert saved[0] <= 3  # a state that may be small
+    assert np.diff(saved).min() >= 20
+    assert 3 <= len(saved) <= 6
 
 
 def test_stamp_has_no_time_and_no_absolute_path(asset):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.cameras import pixel_centres
 from usdbrdf.geometry.rays import lift_from_surface
+from usdbrdf.job import stage as stage_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.stage import StageRun
 from usdbrdf.material.lit_scene import LitScene
@@ -40,8 +42,7 @@ Float = npt.NDArray[np.float32]
 CEILING = {"ceiling": (0.125, 0.125, 0.125)}
 # phi, psi. The lamp reflects nothing.
 LOBE = {"floor": (0.2, 0.8), "ceiling": (0.6, 0.4), "walls": (0.3, 0.6), "box": (0.15, 0.9)}
-# The state is saved once, after the 16th frame.
-NUM_FRAMES, FIRST_UNSAVED = 18, 16
+NUM_FRAMES, INTERRUPTED = 18, 15
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -181,7 +182,7 @@ def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_pa
     atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
     run = StageRun(tmp_path, "fit", tmp_path / "work")
     lit = lit_scene(atlas, black_environment())
-    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", 0)
+    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
     which = _reflecting(room, atlas)
     truth = room.clean.map("lit")[which]
     before = _off(atlas.map("lit")[which], truth)
@@ -251,7 +252,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
     run = StageRun(tmp_path, "fit", tmp_path / "work")
-    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", 0)
+    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
     unseen = atlas.map("coverage")[:, 0] == 0
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
     # The base colour is filled in alike, whichever irradiance it is made with.
@@ -351,9 +352,11 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
         starts.append(NUM_FRAMES - len(arguments[4]))
         for done, samples in enumerate(through_all(*arguments, **options)):
             yield samples
-            if len(starts) == 1 and done == FIRST_UNSAVED:
+            if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
+    monkeypatch.setattr(stage_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(stage_module, "_SAVE_SELDOM", 0.0)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())
@@ -361,5 +364,18 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     assert not list((folder / "textures").glob("*.diffuse.exr"))
     with usdbrdf.working_on(folder) as asset:
         usdbrdf.fit(asset, usdbrdf.FitOptions())
-    assert starts == [0, FIRST_UNSAVED]
+    assert starts == [0, INTERRUPTED + 1]
     assert _contents(folder) == _contents(fitted.folder)
+
+
+def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, monkeypatch, capsys):
+    def three(texels, *_):
+        ends = [0, len(texels) // 3, len(texels) // 2, len(texels)]
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    monkeypatch.setattr(refine, "groups_of_texels", three)
+    set_quiet(False)
+    thrice = _fitted(room, "thrice", usdbrdf.FitOptions(memory=1.0))
+    set_quiet(True)
+    assert "3 passes over the frames" in capsys.readouterr().err
+    assert _contents(thrice.folder) == _contents(fitted.folder)

@@ -12,7 +12,7 @@ from tests.physics.surfaces import World, quad, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import passes
-from usdbrdf.texturing.passes import groups_of_texels
+from usdbrdf.texturing.passes import OF_TEXTURING, BytesPerTexel, groups_of_texels
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +32,18 @@ def _frames(width: int = 64, height: int = 48) -> Frames:
     )
 
 
-def _groups(world: World, memory: float | None) -> list[slice]:
-    return groups_of_texels(world.texels, world.scene, _frames(), memory)
+def _groups(world: World, memory: float | None, need: BytesPerTexel = OF_TEXTURING) -> list[slice]:
+    return groups_of_texels(world.texels, world.scene, _frames(), memory, need)
 
 
 def test_one_group_where_memory_suffices(square: World):
     assert _groups(square, 4.0) == [slice(0, 1_200_000)]
 
 
-def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World, monkeypatch):
-    monkeypatch.setattr(passes, "_PER_MAPPED_TEXEL", 50)
+def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World):
     counts = []
     for memory in (1.0, 0.85, 0.78, 0.74, 0.722):
-        groups = _groups(square, memory)
+        groups = _groups(square, memory, OF_TEXTURING._replace(after=50))
         assert groups[0].start == 0
         assert groups[-1].stop == 1_200_000
         assert all(a.stop == b.start for a, b in pairwise(groups))
@@ -54,11 +53,11 @@ def test_less_memory_makes_more_groups_that_hold_every_texel_once(square: World,
     assert counts[-1] >= 4
 
 
-def test_the_maps_of_all_groups_must_fit_as_well(square: World, monkeypatch):
+def test_the_maps_of_all_groups_must_fit_as_well(square: World):
     assert len(_groups(square, 0.9)) == 1
-    monkeypatch.setattr(passes, "_PER_MAPPED_TEXEL", 400)
-    with pytest.raises(EnvironmentFailure, match=r"need \d\.\d GiB"):
-        _groups(square, 0.9)
+    for need in (OF_TEXTURING._replace(after=400), OF_TEXTURING._replace(always=400)):
+        with pytest.raises(EnvironmentFailure, match=r"need \d\.\d GiB"):
+            _groups(square, 0.9, need)
 
 
 def test_a_container_may_have_less_than_the_machine(tmp_path: Path, monkeypatch):

@@ -29,12 +29,29 @@ def publish(staged: Path, final: Path) -> None:
     The staged bytes reach the disk before the name does, so that a power cut cannot leave the
     final name on an empty file. Readers that hold the previous file keep it.
     """
+    move(staged, final)
+    flush_folder(final.parent)
+
+
+def move(staged: Path, final: Path) -> None:
+    """``publish`` of one of many files: the folder is still to be flushed."""
     with staged.open("rb") as file:
         os.fsync(file.fileno())
     fault_point("publish:before_replace")
     os.replace(staged, final)
     fault_point("publish:after_replace")
-    _flush_folder(final.parent)
+
+
+def flush_folder(folder: Path) -> None:
+    """The names in a folder reach the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:  # network file systems that cannot flush a folder say EINVAL
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def sha256_of(path: Path) -> str:
@@ -105,14 +122,3 @@ def environment_failures(subject: str) -> Iterator[None]:
             f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
             "permission, then run the same command again; finished work is kept. [environment.io]"
         ) from error
-
-
-def _flush_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:  # network file systems that cannot flush a folder say EINVAL
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
-    finally:
-        os.close(descriptor)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -22,8 +24,8 @@ Number = TypeVar("Number", bound=np.generic)
 _BORDER = 0.75
 # How far from its triangle's edges a texel's point stays, in texels (less in slivers).
 _INSET = 0.01
-# Texels computed at a time.
-_AT_A_TIME = 1 << 18
+# Texels computed at a time, by each thread.
+_AT_A_TIME = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +141,8 @@ def _surface_points(
     names = ("barycentric", "position", "normal", "geometric_normal", "step_x", "step_y")
     points: dict[str, Float] = {name: np.empty((len(pixel), 3), np.float32) for name in names}
     points["area"] = np.empty(len(pixel), np.float32)
-    for start in range(0, len(pixel), _AT_A_TIME):
+
+    def fill(start: int) -> None:
         some = slice(start, min(start + _AT_A_TIME, len(pixel)))
         own = face[some]
         width = resolution[scene.face_object[own], 0]
@@ -156,6 +159,10 @@ def _surface_points(
         points["geometric_normal"][some] = _unit(geometric, otherwise=normal)
         points["step_x"][some], points["step_y"][some] = step_x, step_y
         points["area"][some] = np.linalg.norm(np.cross(step_x, step_y), axis=-1)
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for _ in pool.map(fill, range(0, len(pixel), _AT_A_TIME)):
+            pass
     return points
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
-from usdbrdf.files.atomic import fault_point, publish, sha256_of
+from usdbrdf.files.atomic import fault_point, flush_folder, move, sha256_of
 from usdbrdf.job.stamp import Stamp, journal_path, stamp_path, write_stamp
 
 # What a layer points at is there before the layer: textures, binary layers, text layers.
@@ -26,12 +27,18 @@ def can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
 def publish_stage(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     """Replace the outputs, delete those that are no longer made, write the stamp, clean up."""
     name = journal.stage
-    for relative in sorted(journal.outputs, key=_place_in_order):
-        _move(folder / "staged" / relative, asset / relative)
-        fault_point(f"stage:{name}:mid_publish")
+    for _, outputs in groupby(sorted(journal.outputs, key=_place_in_order), key=_rank):
+        folders = set()
+        for relative in outputs:
+            folders.add((asset / relative).parent)
+            _move(folder / "staged" / relative, asset / relative)
+            fault_point(f"stage:{name}:mid_publish")
+        for changed in folders:
+            flush_folder(changed)
     for relative in journal.once:
         if not (asset / relative).exists():
             _move(folder / "staged" / relative, asset / relative)
+            flush_folder((asset / relative).parent)
     for relative, hashes in journal.earlier.items():
         retired = asset / relative
         # A file that somebody edited is not deleted, it is no longer only ours.
@@ -49,11 +56,15 @@ def publish_stage(asset: Path, folder: Path, journal: Stamp, order: int) -> None
 def _move(staged: Path, final: Path) -> None:
     if staged.is_file():
         final.parent.mkdir(parents=True, exist_ok=True)
-        publish(staged, final)
+        move(staged, final)
+
+
+def _rank(relative: str) -> int:
+    return _RANK.get(Path(relative).suffix, 0)
 
 
 def _place_in_order(relative: str) -> tuple[int, str]:
-    return _RANK.get(Path(relative).suffix, 0), relative
+    return _rank(relative), relative
 
 
 def _has(path: Path, sha256: str) -> bool:

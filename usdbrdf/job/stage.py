@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,10 @@ from usdbrdf.job.stamp import (
     write_stamp,
 )
 
+# Seconds between saved states of a running computation, and how many times as long as saving one
+# takes: what a kill can cost, and what saving may.
+_SAVE_AFTER, _SAVE_SELDOM = 2.0, 30
+
 
 @dataclass(frozen=True, kw_only=True)
 class StageResult:
@@ -60,6 +65,8 @@ class StageRun:
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
         self._checkpoints = Checkpoints(folder / "checkpoints")
+        # When a running computation's state was saved last, and how long that took.
+        self._saved = time.monotonic(), 0.0
 
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
@@ -102,6 +109,17 @@ class StageRun:
         for other in self._checkpoints.indices(prefix):
             if other != index:
                 self._checkpoints.drop(prefix, other)
+
+    def save_latest_in_time(
+        self, prefix: str, index: int, arrays: Callable[[], Mapping[str, Array]]
+    ) -> None:
+        """``save_latest``, but not so often that it costs more than a few per cent of the time."""
+        last, took = self._saved
+        start = time.monotonic()
+        if start - last >= max(_SAVE_AFTER, _SAVE_SELDOM * took):
+            self.save_latest(prefix, index, arrays())
+            end = time.monotonic()
+            self._saved = end, end - start
 
     def _place(self, relative: str, register: list[str]) -> Path:
         relative = check_relative(relative)

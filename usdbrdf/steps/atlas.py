@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +26,8 @@ Float = npt.NDArray[np.float32]
 
 # Half floats end at 65504. A map that must lose nothing is stored as floats from here on.
 _HALF_UNTIL = 60_000
+# Pictures written at a time.
+_WRITERS = min(4, os.cpu_count() or 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,14 +109,21 @@ class MapWriter:
 
     def write(self, index: int, obj: SceneObject, maps: dict[str, TexelMap]) -> tuple[Aov, ...]:
         """One object's pictures."""
-        aovs = []
-        for name, chosen in maps.items():
-            file = self.asset.texture(obj.identifier, name)
+        files = [self.asset.texture(obj.identifier, name) for name in maps]
+        places = [self.run.output(file) for file in files]
+
+        def written(place: Path, chosen: TexelMap) -> int:
             picture = self.texels.image(index, chosen.values)
             half = not (chosen.exact and float(np.abs(picture).max()) > _HALF_UNTIL)
-            self.clamped += write_exr(self.run.output(file), picture, half=half)
-            aovs.append(Aov(name=name, file=file, scale=chosen.scale, unit=chosen.unit))
-        return tuple(aovs)
+            return write_exr(place, picture, half=half)
+
+        # Compressing takes a core each, and flushing to the disk time.
+        with ThreadPoolExecutor(_WRITERS) as pool:
+            self.clamped += sum(pool.map(written, places, maps.values()))
+        return tuple(
+            Aov(name=name, file=file, scale=chosen.scale, unit=chosen.unit)
+            for file, (name, chosen) in zip(files, maps.items(), strict=True)
+        )
 
     def warn(self) -> None:
         """Say once what was lost, if anything."""

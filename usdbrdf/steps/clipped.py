@@ -29,8 +29,9 @@ Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 Long = npt.NDArray[np.int64]
 
-# Texels that are asked, in all and on one facing of one object.
-_TEXELS, _PER_SEGMENT = 3000, 150
+# Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
+# and how many segments, those that the lamps should light most.
+_TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 # A bright wall that clips is little brighter than its bound.
 _WALL_PRIOR = (0.3, 0.4)
@@ -124,10 +125,14 @@ def _chosen(atlas: Atlas, groups: ClippedGroups, seen: Bool, seed: int) -> tuple
     random = np.random.default_rng(seed)
     # Weighted sampling without replacement: the largest of u^(1/w), by logarithms.
     rank = np.argsort(np.log(random.random(len(usable))) / np.maximum(weight, 1e-30))[::-1]
-    numbers = np.unique(segment)
-    each = int(np.clip(_TEXELS // max(len(numbers), 1), 30, _PER_SEGMENT))
-    picked = [rank[segment[rank] == number][:each] for number in numbers]
-    kept = np.sort(np.concatenate([np.zeros(0, np.int64), *picked]))
+    lit_by_lamps = np.bincount(segment, weight)
+    numbers = np.argsort(-lit_by_lamps, kind="stable")[:_SEGMENTS]
+    numbers = numbers[lit_by_lamps[numbers] > 0]
+    each = int(np.clip(_TEXELS // max(len(numbers), 1), _LEAST_OF_SEGMENT, _PER_SEGMENT))
+    rank = rank[np.isin(segment[rank], numbers)]
+    rank = rank[np.argsort(segment[rank], kind="stable")]
+    place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
+    kept = np.sort(rank[place < each])
     return usable[kept], segment[kept]
 
 

@@ -42,7 +42,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         name="fit",
         role="material",
         parameters={
-            **{key: value for key, value in asdict(options).items() if key != "environment"},
+            **{k: v for k, v in asdict(options).items() if k not in ("environment", "memory")},
             "denoise": lightmap_filter,
         },
         inputs={
@@ -70,9 +70,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":
-            objects = _refined(
-                run, asset, atlas, lit, frames, objects, lightmap_filter, options.seed
-            )
+            objects = _refined(run, asset, atlas, lit, frames, objects, lightmap_filter, options)
         materialx = f"layers/{asset.materialx_layer.name}"
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
@@ -95,14 +93,16 @@ def _refined(
     frames: Frames,
     objects: list[FittedObject],
     lightmap_filter: str,
-    seed: int,
+    options: FitOptions,
 ) -> list[FittedObject]:
     """The objects with maps of L_d, S and base colour that are free of their specular light."""
     lobes = Lobes(
         phi=np.array([item.phi for item in objects], np.float32),
         psi=np.array([item.psi for item in objects], np.float32),
     )
-    maps = refined_maps(run, atlas, lit, frames, lobes, lightmap_filter, seed)
+    maps = refined_maps(
+        run, atlas, lit, frames, lobes, lightmap_filter, options.memory, options.seed
+    )
     writer = MapWriter(run, asset, atlas.texels)
     refined = []
     for i, (obj, item) in enumerate(zip(atlas.scene.objects, objects, strict=True)):

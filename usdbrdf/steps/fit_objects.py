@@ -24,7 +24,7 @@ from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, co
 from usdbrdf.scan.frame_reading import read_frame
 from usdbrdf.scan.scan import Frames
 from usdbrdf.steps.atlas import Atlas
-from usdbrdf.steps.texture import MEASURED
+from usdbrdf.steps.texture import MEASURED, check_memory
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
@@ -46,18 +46,21 @@ class FitOptions:
     was found; "scaled": the target frame alone, L_d times a free factor per channel; "paper": the
     target frame, the paper's residual, its minimum always kept. max_pixels: of the target frame.
     Without evidence the first two write the class prior. mapping: what UsdPreviewSurface is told of
-    phi and psi; materialx: whether MaterialX is told too."""
+    phi and psi; materialx: whether MaterialX is told too; memory in GiB (None: three quarters of
+    the machine's), on which no result depends."""
 
     method: Method = "views"
     max_pixels: int = 1500
     mapping: Mapping = "matched"
     materialx: bool = False
     environment: Path | None = None
+    memory: float | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.max_pixels < 50:
             raise UsageError("--max-pixels: at least 50 are needed. [usage.option]")
+        check_memory(self.memory)
 
 
 @dataclass(frozen=True, kw_only=True)

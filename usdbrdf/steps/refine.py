@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.geometry.texels import Texels
-from usdbrdf.job.progress import progress
+from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageRun
 from usdbrdf.material.lit_scene import LitScene
 from usdbrdf.material.predict import non_diffuse_radiance
@@ -24,6 +24,7 @@ from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing.footprints import footprints, widest
 from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels
 from usdbrdf.texturing.radiance_from_frames import samples_from_frames, spread_order
 from usdbrdf.texturing.restore import restored
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
@@ -33,8 +34,12 @@ Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
-# Rays per texel and frame: the mean over the frames averages their noise out.
-_RAYS = 8
+# Rays per texel and frame: the mean over the frames averages their noise out, so a texel that many
+# frames see needs fewer of each.
+_RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
+# Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
+# sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
+_OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
 # A sample's error, in parts of the texel's lit radiance: what poses, lobes and reading do to it;
 # and in parts of the noise floor, which lies some four deviations of the sensor's noise above zero.
 _RELATIVE_ERROR, _OF_NOISE_FLOOR = 0.03, 0.25
@@ -50,6 +55,7 @@ def refined_maps(
     frames: Frames,
     lobes: Lobes,
     lightmap_filter: str,
+    memory: float | None,
     seed: int,
 ) -> dict[str, TexelMap]:
     """The maps "diffuse", L_d without specular light; "refined_irradiance", S of that and of the
@@ -61,7 +67,7 @@ def refined_maps(
     texels = atlas.texels
     measured_lit = atlas.map("lit")
     level = _level(measured_lit)
-    observed = _observe(run, atlas, lit, frames, lobes, level, seed)
+    observed = _without_lobes(run, atlas, lit, frames, lobes, level, memory, seed)
     measured = np.isfinite(observed.mean[:, 0])
     emission = atlas.map_where_present("emission", 3)
     emissive: Bool = np.any(emission > 0, axis=1)
@@ -103,6 +109,42 @@ def _level(lit: Float) -> Float:
     return level
 
 
+def _without_lobes(
+    run: StageRun,
+    atlas: Atlas,
+    lit: LitScene,
+    frames: Frames,
+    lobes: Lobes,
+    level: Float,
+    memory: float | None,
+    seed: int,
+) -> RobustMean:
+    """All frames without their specular light, in units of ``level`` (T,), in as many passes as
+    memory asks for."""
+    textures = _bytes_of(lit) // len(atlas.texels)
+    need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
+    groups = groups_of_texels(atlas.texels, atlas.scene, frames, memory, need)
+    if len(groups) > 1:
+        say(f"fit: {len(groups)} passes over the frames, for lack of memory")
+    samples = atlas.map("samples")[:, 0]
+    found = RobustMean.empty(len(atlas.texels))
+    for part in groups:
+
+        def means(part: slice = part) -> dict[str, Float]:
+            observed = _observe(run, atlas, lit, frames, lobes, level, samples, seed, part)
+            return dict(vars(robust_mean(observed)))
+
+        if len(groups) == 1:
+            return RobustMean(**means())
+        found.put(part, run.checkpoint(f"means-{part.start}-{part.stop}", means))
+    return found
+
+
+def _bytes_of(lit: LitScene) -> int:
+    """What the light takes beside scene and texels."""
+    return lit.radiance.pixels.nbytes + lit.emission.pixels.nbytes + lit.lights.corners.nbytes
+
+
 def _observe(
     run: StageRun,
     atlas: Atlas,
@@ -110,26 +152,34 @@ def _observe(
     frames: Frames,
     lobes: Lobes,
     level: Float,
+    samples: Float,
     seed: int,
-) -> RobustMean:
-    """All frames without their specular light, in units of ``level`` (T,), going on from the last
-    saved state of an interrupted run."""
+    part: slice,
+) -> MeanState:
+    """Some texels in all frames, going on from the last saved state of an interrupted run; samples
+    (T,): how many frames see each."""
     texels, owner = atlas.texels, atlas.texels.object_index()
-    saved = run.latest("refined")
-    start, observed = 0, MeanState.empty(len(texels))
+    name = f"refined-{part.start}-{part.stop}"
+    saved = run.latest(name)
+    start, observed = 0, MeanState.empty(part.stop - part.start)
     if saved is not None:
         start, observed = saved[0] + 1, MeanState(**saved[1])
     # The mean starts from its first samples, which must not all show one highlight.
     order = spread_order(len(frames))[start:]
-    samples = samples_from_frames(texels, atlas.scene, lit.rays, frames, order)
-    bar = progress(samples, total=len(order), label="fit: refine", unit="frames")
+    shown = samples_from_frames(texels, atlas.scene, lit.rays, frames, order, part)
+    bar = progress(shown, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
         pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
-        own, unit = owner[some.texel], level[some.texel]
-        specular = non_diffuse_radiance(
-            lit, _seen_from(texels, some.texel, pose[:3, 3]), lobes.phi[own], lobes.psi[own], _RAYS,
-            seed + len(frames) + some.frame,
-        )  # fmt: skip
+        unit = level[some.texel]
+        specular = np.empty_like(some.radiance)
+        often = samples[some.texel] >= _MANY_FRAMES
+        for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
+            texel = some.texel[which]
+            specular[which] = non_diffuse_radiance(
+                lit, _seen_from(texels, texel, pose[:3, 3]), lobes.phi[owner[texel]],
+                lobes.psi[owner[texel]], rays, seed + len(frames) + some.frame,
+                texel.astype(np.int64),
+            )  # fmt: skip
         covered = footprints(texels, some.texel, pose, lens)
         noise = _OF_NOISE_FLOOR * np.float32(frames.noise_floor_radiance[some.frame]) / unit
         # A wide view of a texel says less of it than its noise tells.
@@ -137,14 +187,13 @@ def _observe(
         deviation = np.hypot(_RELATIVE_ERROR, noise) * wide
         update(
             observed,
-            some.texel,
+            some.texel - np.int32(part.start),
             (some.radiance - specular) / unit[:, None],
             deviation.astype(np.float32),
             covered,
         )
-        if done % 16 == 15:
-            run.save_latest("refined", done, observed.arrays())
-    return robust_mean(observed)
+        run.save_latest_in_time(name, done, observed.arrays)
+    return observed
 
 
 def _seen_from(texels: Texels, which: Int, eye: Double) -> SurfacePoints:

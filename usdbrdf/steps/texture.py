@@ -30,7 +30,7 @@ from usdbrdf.stage.texturing_layer import write_texturing_layer
 from usdbrdf.steps.atlas import MapWriter, TexelMap
 from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
-from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.passes import Measured, groups_of_texels, measured_arrays
 from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
@@ -42,8 +42,6 @@ Bool = npt.NDArray[np.bool_]
 MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
-# Frames between saved states: of many texels these are large.
-_SMALL, _SAVE_SMALL, _SAVE_LARGE = 500_000, 16, 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,10 +64,15 @@ class TextureOptions:
             raise UsageError(
                 f"--max-texels {self.max_texels}: at least 1 is needed. [usage.option]"
             )
-        if self.memory is not None and not self.memory > 0:
-            raise UsageError(f"--memory {self.memory}: not above 0. [usage.option]")
+        check_memory(self.memory)
         if not 0 < self.quantile < 1:
             raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
+
+
+def check_memory(memory: float | None) -> None:
+    """Raises UsageError where ``memory``, in GiB, is given and none."""
+    if memory is not None and not memory > 0:
+        raise UsageError(f"--memory {memory}: not above 0. [usage.option]")
 
 
 def texture(asset: Asset, options: TextureOptions) -> StageResult:
@@ -156,10 +159,8 @@ def _observe(
     if saved is not None:
         start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
     steps = radiance_from_frames(texels, scene, rays, frames, observed, quantile, start, part=part)
-    every = _SAVE_SMALL if len(observed.clipped) <= _SMALL else _SAVE_LARGE
     for done in progress(steps, total=len(frames) - start, label="texture", unit="frames"):
-        if done % every == every - 1:
-            run.save_latest(name, done, observed.arrays())
+        run.save_latest_in_time(name, done, observed.arrays)
     return observed
 
 
@@ -177,11 +178,11 @@ def _found(texels: Texels, seen: Measured) -> _Found:
     measured = seen.count > 0
     clipped = ~measured & (seen.clipped > 0)
     _check_seen(measured, clipped)
-    lit = _with_lower_bounds(texels, seen.median, measured, clipped, seen.lower_bound)
+    lit, mean = _filled_in(texels, seen, measured, clipped)
     coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
     maps = {
         "lit": TexelMap(lit, 1.0, "W/(m^2 sr)", exact=True),
-        "mean": TexelMap(inpaint(texels, seen.mean, measured), 1.0, "W/(m^2 sr)"),
+        "mean": TexelMap(mean, 1.0, "W/(m^2 sr)"),
         "spread": TexelMap(np.nan_to_num(seen.spread), 1.0, "W/(m^2 sr)"),
         "samples": TexelMap(seen.count.astype(np.float32), 1 / 32, "1"),
         "coverage": TexelMap(coverage, 1.0, "1"),
@@ -264,15 +265,19 @@ def _record(
     )
 
 
-def _with_lower_bounds(
-    texels: Texels, median: Float, measured: Bool, clipped: Bool, lower_bound: Float
-) -> Float:
-    """L_d everywhere: measured, or inpainted from what was measured on the same object, but where
-    every frame clipped at least what saturates them. An object that only ever clipped is known by
-    those bounds alone."""
+def _filled_in(
+    texels: Texels, seen: Measured, measured: Bool, clipped: Bool
+) -> tuple[Float, Float]:
+    """L_d and the mean everywhere: measured, or inpainted from what was measured on the same
+    object, but where every frame clipped at least what saturates them. An object that only ever
+    clipped is known by those bounds alone."""
     owner = texels.object_index()
     has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0
     bounded = clipped & ~has_measured[owner]
-    known = np.where(bounded[:, None], lower_bound[:, None], median)
-    lit = inpaint(texels, known, measured | bounded)
-    return np.where(clipped[:, None], np.maximum(lit, lower_bound[:, None]), lit)
+    least = seen.lower_bound[:, None]
+    lit, mean = inpaint_alike(
+        texels,
+        [np.where(bounded[:, None], least, values) for values in (seen.median, seen.mean)],
+        measured | bounded,
+    )
+    return np.where(clipped[:, None], np.maximum(lit, least), lit), mean

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -10,6 +12,7 @@ from usdbrdf.geometry.texels import Texels
 
 Float = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
+Long = npt.NDArray[np.int64]
 
 _NEIGHBOURS = 8
 # A normal that differs by 90 degrees counts as this share of the object's size in distance: the
@@ -19,6 +22,9 @@ _NORMAL_WEIGHT = 0.25
 _ZERO = 1e-6
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18
+# Of more known texels than this in an object, evenly many are left out: among so many the nearest
+# is never far.
+_MOST_SOURCES = 1 << 18
 
 
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
@@ -29,14 +35,13 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
     nothing is known, or only black, becomes zero. Values in another unit give the same fill in that
     unit.
     """
-    filled = np.where(known[:, None], values, 0).astype(np.float32)
-    if not known.any():
-        return filled
-    positive = filled[filled > 0]
-    if not len(positive):
-        return filled
-    floor = float(_ZERO * np.median(positive, overwrite_input=True))
-    del positive
+    return inpaint_alike(texels, [values], known)[0]
+
+
+def inpaint_alike(texels: Texels, maps: Sequence[Float], known: Bool) -> list[Float]:
+    """``inpaint`` of several maps that are known at the same texels."""
+    filled = [np.where(known[:, None], values, 0).astype(np.float32) for values in maps]
+    floors = [_floor(values) for values in filled]
     orphans = []
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
@@ -48,34 +53,41 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
             continue
         position = texels.position[own]
         weight = _NORMAL_WEIGHT * float(np.linalg.norm(np.ptp(position, axis=0)))
-        filled[missing] = _nearest_mean(texels, values, source, missing, weight, floor)
-    if orphans:
-        filled[np.concatenate(orphans)] = _nearest_mean(
-            texels, values, np.flatnonzero(known), np.concatenate(orphans), 0.0, floor
-        )
+        _fill(texels, filled, floors, source, missing, weight)
+    if orphans and known.any():
+        _fill(texels, filled, floors, np.flatnonzero(known), np.concatenate(orphans), 0.0)
     return filled
 
 
-def _nearest_mean(
+def _floor(values: Float) -> float:
+    """What zero counts as among ``values`` (T, 3); 0 where they are all black."""
+    positive = values[values > 0]
+    return float(_ZERO * np.median(positive, overwrite_input=True)) if len(positive) else 0.0
+
+
+def _fill(
     texels: Texels,
-    values: Float,
-    source: npt.NDArray[np.int64],
-    missing: npt.NDArray[np.int64],
+    filled: Sequence[Float],
+    floors: Sequence[float],
+    source: Long,
+    missing: Long,
     normal_weight: float,
-    floor: float,
-) -> Float:
-    def feature(index: npt.NDArray[np.int64]) -> Float:
+) -> None:
+    """Set the ``missing`` texels of all maps from the nearest of ``source``."""
+
+    def feature(index: Long) -> Float:
         return np.concatenate(
             [texels.position[index], normal_weight * texels.normal[index]], axis=-1
         )
 
+    source = source[:: -(-len(source) // _MOST_SOURCES)]
     tree = cKDTree(feature(source))
     k = min(_NEIGHBOURS, len(source))
-    means = np.empty((len(missing), 3), np.float32)
     for start in range(0, len(missing), _AT_A_TIME):
         some = missing[start : start + _AT_A_TIME]
         _, nearest = tree.query(feature(some), k=k, workers=-1)
-        neighbours = values[source[nearest.reshape(len(some), k)]]
-        logarithm = np.log(np.maximum(neighbours, floor))
-        means[start : start + _AT_A_TIME] = np.exp(logarithm.mean(axis=1))
-    return means
+        neighbours = source[nearest.reshape(len(some), k)]
+        for values, floor in zip(filled, floors, strict=True):
+            if floor > 0:
+                logarithm = np.log(np.maximum(values[neighbours], floor))
+                values[some] = np.exp(logarithm.mean(axis=1))

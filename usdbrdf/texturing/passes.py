@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,16 +28,27 @@ _GIB = 1 << 30
 _CONTAINER = Path("/sys/fs/cgroup/memory.max")
 # Without --memory this share of the machine's.
 _SHARE = 0.75
-# Bytes. Of a texel in the present group: its running statistics (120), and its place among the
-# blocks of texels while these are sorted out. Of every texel: its results, and in their place, when
-# all groups are done, what becomes of them while the maps are made. Of a triangle: Embree's tree.
-# Of a pixel: frames read ahead, and what the present one sees. Of the process: interpreter,
-# libraries and compiled code.
-_PER_GROUPED_TEXEL, _PER_RESULT, _PER_MAPPED_TEXEL = 180, 48, 200
+# Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
+# Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
 _PROCESS = _GIB // 2
 # A pass costs reading all frames: groups smaller than this are not worth it.
 _SMALLEST_GROUP = 250_000
+
+
+class BytesPerTexel(NamedTuple):
+    """grouped: of a texel in the present group; result: of every texel; after: in place of both,
+    when all groups are done; always: of every texel, beside these."""
+
+    grouped: int
+    result: int
+    after: int
+    always: int = 0
+
+
+# Running statistics (120) and a texel's place among the blocks of texels while these are sorted
+# out; then what becomes of the results while the maps are made.
+OF_TEXTURING = BytesPerTexel(grouped=180, result=48, after=200)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +101,11 @@ def measured_arrays(observed: Observation, quantile: float) -> dict[str, npt.NDA
 
 
 def groups_of_texels(
-    texels: Texels, scene: Scene, frames: Frames, memory: float | None
+    texels: Texels,
+    scene: Scene,
+    frames: Frames,
+    memory: float | None,
+    need: BytesPerTexel = OF_TEXTURING,
 ) -> list[slice]:
     """As few groups of consecutive texels as fit, with scene and texels, into ``memory`` GiB
     (None: three quarters of the machine's).
@@ -99,18 +114,18 @@ def groups_of_texels(
     """
     limit = (memory or _SHARE * _machine_gib()) * _GIB
     held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
-    held += _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
-    mapped = held + _PER_MAPPED_TEXEL * len(texels)
-    held += _PER_RESULT * len(texels)
+    held += _PER_PIXEL * int(frames.resolution.prod(axis=1).max()) + need.always * len(texels)
+    after = held + need.after * len(texels)
+    held += need.result * len(texels)
     smallest = min(len(texels), _SMALLEST_GROUP)
-    needed = max(held + _PER_GROUPED_TEXEL * smallest, mapped)
+    needed = max(held + need.grouped * smallest, after)
     if needed > limit:
         raise EnvironmentFailure(
             f"{len(texels):,} texels and {len(scene.triangles):,} triangles need "
             f"{needed / _GIB:.1f} GiB, the limit is {limit / _GIB:.1f}. Allow more with --memory, "
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
         )
-    most = max(smallest, int((limit - held) / _PER_GROUPED_TEXEL), 1)
+    most = max(smallest, int((limit - held) / need.grouped), 1)
     count = -(-len(texels) // most)
     ends = [k * len(texels) // count for k in range(count + 1)]
     return [slice(low, high) for low, high in pairwise(ends)]

@@ -12,6 +12,7 @@ the samples weighted by their precision: how blurred it is.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,8 @@ _BATCH = 5
 _OUTLYING, _STEPS = 2.5, 6
 # A sample whose distance from the mean is less than this share of its error says nothing of it.
 _LEFT = 0.05
+# Texels whose mean is worked out at a time.
+_AT_A_TIME = 1 << 18
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +84,19 @@ class RobustMean:
     variance: Float
     footprint: Float
 
+    @classmethod
+    def empty(cls, num_texels: int) -> RobustMean:
+        return cls(
+            mean=np.empty((num_texels, 3), np.float32),
+            variance=np.empty(num_texels, np.float32),
+            footprint=np.empty((num_texels, 3), np.float32),
+        )
+
+    def put(self, part: slice, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Set the texels of ``part``."""
+        for name, values in arrays.items():
+            getattr(self, name)[part] = values
+
 
 def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
     """Add one sample to each of the listed texels, in place.
@@ -98,19 +114,26 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
 
 def robust_mean(state: MeanState) -> RobustMean:
     """Of all samples so far; ``state`` stays as it is."""
+    found = RobustMean.empty(len(state.count))
+    for start in range(0, len(state.count), _AT_A_TIME):
+        part = slice(start, start + _AT_A_TIME)
+        some = {name: values[part] for name, values in state.arrays().items()}
+        found.put(part, _means(MeanState(**some)))
+    return found
+
+
+def _means(state: MeanState) -> dict[str, Float]:
     mean, weight, scatter = state.mean.copy(), state.weight.copy(), state.scatter.copy()
     _add_rest(state.waiting, state.count, mean, weight, scatter)
     # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
     pull, inlying = scatter.T.astype(np.float64) / 3
     count = np.maximum(state.count, 1)
     variance = pull / np.maximum(np.maximum(inlying, state.precision / count), 1e-30) ** 2
-    return RobustMean(
-        mean=np.where(state.count[:, None] > 0, mean, np.nan).astype(np.float32),
-        variance=variance.astype(np.float32),
-        footprint=(state.footprint / np.maximum(state.precision, 1e-30)[:, None]).astype(
-            np.float32
-        ),
-    )
+    return {
+        "mean": np.where(state.count[:, None] > 0, mean, np.nan),
+        "variance": variance,
+        "footprint": state.footprint / np.maximum(state.precision, 1e-30)[:, None],
+    }
 
 
 @parallel_kernel
