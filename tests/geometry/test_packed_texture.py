@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.geometry.packed_texture import packed_colour, packed_place
+from usdbrdf.geometry.packed_texture import (
+    AHEAD,
+    colour_looked_at,
+    empty_looks,
+    fetch_face,
+    look_at,
+    packed_colour,
+    packed_place,
+)
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
 
 
@@ -27,3 +35,23 @@ def test_packed_texture_reads_the_same_values():
         for where in zip(face, u, v, strict=True)
     ]
     np.testing.assert_allclose(found, texture.at(face, u, v), rtol=0, atol=3e-5)
+    # What is asked for ahead is the same.
+    looks = empty_looks()
+    for i, where in enumerate(zip(face[:AHEAD], u, v, strict=False)):
+        fetch_face(texture.packed, where[0])
+        look_at(texture.packed, looks, i, *where)
+    ahead = [colour_looked_at(texture.packed, looks, i) for i in range(AHEAD)]
+    np.testing.assert_allclose(ahead, found[:AHEAD], rtol=0, atol=2e-7)
+
+
+def test_no_face_lies_on_two_lines_of_the_cache():
+    texture = SurfaceTexture(
+        pixels=np.zeros((1, 3), np.float32),
+        corner_pixel=np.zeros((5, 3, 2), np.float32),
+        first_pixel=np.zeros(5, np.int64),
+        size=np.ones((5, 2), np.int32),
+    )
+    pixels, faces, places = texture.packed
+    assert pixels.ctypes.data % 64 == faces.ctypes.data % 64 == 0
+    assert faces.strides[0] == 32
+    assert places.ctypes.data == faces.ctypes.data

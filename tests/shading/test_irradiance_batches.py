@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.shading import irradiance
+from usdbrdf.shading import incoming_light, irradiance
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 from usdbrdf.shading.light_groups import picked
@@ -61,7 +61,8 @@ def test_batches_and_tasks_do_not_matter(monkeypatch: pytest.MonkeyPatch, estima
 
     def found(points: int, batch: int) -> Irradiance:
         monkeypatch.setattr(irradiance, "_POINTS", points)
-        monkeypatch.setattr(irradiance, "_BATCH", batch)
+        monkeypatch.setattr(incoming_light, "_LIGHT_POINTS", points // 2)
+        monkeypatch.setattr(incoming_light, "_BATCH", batch)
         return _shaded(world, lit, sampling)
 
     whole = found(1 << 20, 1 << 20)

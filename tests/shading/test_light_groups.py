@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.shading import irradiance
+from usdbrdf.shading import incoming_light
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.irradiance_batches import pick_triangles
+from usdbrdf.shading.light_batches import pick_triangles
 from usdbrdf.shading.light_groups import LightGroups, light_groups, weighed_groups
 from usdbrdf.shading.lights import Lights
 
@@ -79,7 +79,7 @@ def test_picks_follow_the_density_and_leave_a_uniform_number():
     chosen, left = np.zeros(count, np.uint32), np.zeros(count, np.float32)
     favour = np.zeros(count, np.float32)
     picks = groups.arrays, patch, cumulative, guide, ratio
-    pick_triangles(picks, 0, even, chosen, favour, left)
+    pick_triangles(picks, 0, 0, even, chosen, favour, left)
     power = np.diff(groups.cumulative, prepend=0)
     expected = power * ratio[0, groups.of_face[groups.face]]
     np.testing.assert_allclose(np.bincount(chosen, minlength=300) / count, expected, atol=3e-5)
@@ -126,9 +126,9 @@ def test_unbiased_at_few_rays_and_nearer_than_by_power(monkeypatch: pytest.Monke
         patches, count = len(points[2]) - 1, bounds.shape[1]
         return (
             np.tile(start[1:], (patches, 1)),
-            np.zeros((patches, count), np.int32),
+            np.zeros((patches, count), np.int16),
             np.ones((patches, count), np.float32),
         )
 
-    monkeypatch.setattr(irradiance, "weighed_groups", by_power)
+    monkeypatch.setattr(incoming_light, "weighed_groups", by_power)
     assert ((ours - 1) ** 2).mean() < 0.7 * ((estimates() - 1) ** 2).mean()

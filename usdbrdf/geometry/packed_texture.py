@@ -1,7 +1,7 @@
 """A texture of the surface laid out for random access: what is read together lies together.
 
 A look-up waits for memory: it reads one line of it for the triangle, and one or two for each of two
-rows of pixels.
+rows of pixels. Loops of many look-ups ask for all of these before they read the first.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf.geometry.prefetch import prefetch
 from usdbrdf.kernel import loop
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+Bits = npt.NDArray[np.uint32]
 Long = npt.NDArray[np.int64]
 
 # pixels (P, 4) float32; per triangle (F, 8) float32: pixel of its first corner, edges to the others
@@ -22,15 +24,23 @@ Long = npt.NDArray[np.int64]
 # and height, 16 bits each.
 PackedArrays: TypeAlias = tuple[Float, Float, Int]
 
+# Places of a texture that many look-ups of a loop keep, and their distances to the next row and
+# to the left and upper pixel's middle.
+Looks: TypeAlias = tuple[Bits, Bits, Float, Float]
+
+# Places to ask for before the first is read: few enough to be in the nearest cache then.
+AHEAD = 128
+# Bytes of a line of the cache.
+_LINE = 64
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 def packed_arrays(pixels: Float, corner_pixel: Float, first_pixel: Long, size: Int) -> PackedArrays:
     """What ``SurfaceTexture`` holds, laid out anew."""
     # A row and a pixel more than there are, all 0: an atlas of one column or row has no neighbours.
-    padded = np.zeros((len(pixels) + int(size[:, 0].max(initial=1)) + 2, 4), np.float32)
+    padded = _zeros(len(pixels) + int(size[:, 0].max(initial=1)) + 2, 4)
     padded[: len(pixels), :3] = pixels
-    faces = np.zeros((len(size), 8), np.float32)
+    faces = _zeros(len(size), 8)
     faces[:, 0:2] = corner_pixel[:, 0] - 0.5
     faces[:, 2:4] = corner_pixel[:, 1] - corner_pixel[:, 0]
     faces[:, 4:6] = corner_pixel[:, 2] - corner_pixel[:, 0]
@@ -38,6 +48,13 @@ def packed_arrays(pixels: Float, corner_pixel: Float, first_pixel: Long, size: I
     places[:, 6] = first_pixel
     places[:, 7] = size[:, 0] | size[:, 1] << 16
     return padded, faces, places
+
+
+def _zeros(rows: int, columns: int) -> Float:
+    """(rows, columns) float32 that start with a line of the cache, so that no face lies on two."""
+    bytes_ = np.zeros(rows * columns * 4 + _LINE, np.uint8)
+    first = -bytes_.ctypes.data % _LINE
+    return bytes_[first : first + rows * columns * 4].view(np.float32).reshape(rows, columns)
 
 
 @loop
@@ -80,3 +97,35 @@ def packed_colour(
         a * p[k, 1] + b * p[right, 1] + c * p[low, 1] + d * p[low_right, 1],
         a * p[k, 2] + b * p[right, 2] + c * p[low, 2] + d * p[low_right, 2],
     )
+
+
+@loop
+def empty_looks() -> Looks:
+    """Room for AHEAD places of a texture."""
+    place, width = np.empty(AHEAD, np.uint32), np.empty(AHEAD, np.uint32)
+    return place, width, np.empty(AHEAD, np.float32), np.empty(AHEAD, np.float32)
+
+
+@loop
+def fetch_face(texture: PackedArrays, f: int) -> None:
+    """Ask for the memory that ``look_at`` will read."""
+    prefetch(texture[1], unsigned(f))
+
+
+@loop
+def look_at(texture: PackedArrays, looks: Looks, i: int, f: int, u: float, v: float) -> None:
+    """Keep a place as the i-th of ``looks``, and ask for its pixels' memory."""
+    place, width, fx, fy = looks
+    place[i], width[i], fx[i], fy[i] = packed_place(texture, f, u, v)
+    low = unsigned(place[i] + width[i])
+    prefetch(texture[0], place[i])
+    prefetch(texture[0], unsigned(place[i] + 1))
+    prefetch(texture[0], low)
+    prefetch(texture[0], unsigned(low + 1))
+
+
+@loop
+def colour_looked_at(texture: PackedArrays, looks: Looks, i: int) -> tuple[float, float, float]:
+    """``packed_colour`` at the i-th of ``looks``."""
+    place, width, fx, fy = looks
+    return packed_colour(texture, place[i], width[i], fx[i], fy[i])

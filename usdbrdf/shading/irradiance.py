@@ -7,8 +7,9 @@ eq. 10). Two estimators:
 ``mis``     as many cosine-distributed directions as points picked on the bright triangles, combined
             by the balance heuristic (E. Veach and L. Guibas, "Optimally combining sampling
             techniques for Monte Carlo rendering", 1995). Which triangles are picked is up to each
-            patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the patch and
-            the texel: neighbouring texels trace nearly parallel rays, which Embree likes.
+            patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the scene,
+            the patch and the texel (``patch_draws``): neighbouring texels trace nearly parallel
+            rays, which Embree likes.
 
 Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
 ``mis``: points that happen to agree stop early. Tests bound this by 1e-3 of S.
@@ -20,7 +21,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -29,31 +30,26 @@ from usdbrdf.geometry.rays import RayScene, lift_from_surface
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.irradiance_batches import (
-    PickArrays,
-    add_cosine_batch,
-    add_light_batch,
-    cosine_batch,
-    frames_of,
-    light_batch,
-    mean_and_error,
-    scrambles_of_points,
-)
-from usdbrdf.shading.light_groups import weighed_groups
+from usdbrdf.shading.incoming_light import BLOCKS, IncomingLight, Points, whole_patches
+from usdbrdf.shading.irradiance_batches import mean_and_error
 from usdbrdf.shading.lights import Lights
-from usdbrdf.shading.warps import sobol_bits
+from usdbrdf.shading.patch_draws import (
+    STRATA,
+    independent_draws,
+    interleaved,
+    patch_draws,
+    strata_of_texels,
+)
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Long = npt.NDArray[np.int64]
-Bits = npt.NDArray[np.uint32]
+Short = npt.NDArray[np.int16]
 
-_BLOCKS = 4
 _FIRST_ROUND = 64
-# Points that a thread takes at a time, and rays that it makes, traces and adds up at a time: enough
-# to make the calls cheap, few enough to stay in the cache of its core.
-_POINTS, _BATCH = 1 << 10, 1 << 14
+# Points that a thread takes at a time: near points' nearly parallel rays follow each other.
+_POINTS = 1 << 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,14 +84,16 @@ class Irradiance:
 
 
 def patches_of_texels(texels: Texels) -> tuple[Long, Int]:
-    """Texels in the order of 8 x 8 blocks of their atlas: order (T,), and the patch of each
-    texel in that order, (T,) int32 ascending from 0."""
+    """Texels in the order of 8 x 8 blocks of their atlas, near blocks near: order (T,), and the
+    patch of each texel in that order, (T,) int32 ascending from 0. Within a patch they are in the
+    order of the strata that suit them."""
     owner = texels.object_index()
     local = texels.pixel - texels.first_pixel[owner]
     width = texels.resolution[owner, 0]
     x, y = local % width, local // width
-    order = np.lexsort((x % 8, y % 8, x // 8, y // 8, owner))
-    key = np.stack([owner, y // 8, x // 8], axis=-1)[order]
+    block = interleaved(x // 8, y // 8)
+    order = np.lexsort((strata_of_texels(x % 8, y % 8), block, owner))
+    key = np.stack([owner, block], axis=-1)[order]
     patch = np.concatenate([[0], np.cumsum((np.diff(key, axis=0) != 0).any(axis=1))])
     return order, patch.astype(np.int32)
 
@@ -121,65 +119,63 @@ def irradiance_at(
     """
     # A point's number within its patch of at most 64: so no two points of the scene share their
     # random numbers, and a point draws the same ones whatever tile it comes in.
-    identity = 64 * patch.astype(np.int64) + np.arange(len(patch)) - np.searchsorted(patch, patch)
+    first = np.flatnonzero(np.diff(patch, prepend=-1))
+    size = np.diff(first, append=len(patch))
+    number = np.arange(len(patch)) - np.repeat(first, size)
+    identity = 64 * patch.astype(np.int64) + number
+    stratum = (STRATA * number // np.repeat(size, size)).astype(np.int32)
     floor = np.zeros(len(patch)) if dark is None else dark.astype(np.float64)
-    light = _Light(rays, radiance, lights, environment, sampling)
+    techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
+    rounds = _rounds(sampling, techniques)
+    light = IncomingLight(
+        rays=rays,
+        radiance=radiance,
+        lights=lights,
+        environment=environment,
+        draws=independent_draws(sampling.seed)
+        if sampling.estimator == "cosine"
+        else patch_draws(sampling.seed, rounds[0][1], rounds[-1][1]),
+        techniques=techniques,
+    )
 
     def traced(part: slice) -> Irradiance:
         origin = lift_from_surface(position[part], normal[part], scene_size)
-        points = _Points(origin, normal[part], patch[part], identity[part], floor[part])
-        return _irradiance_of(points, light, sampling)
+        points = Points(
+            origin, normal[part], patch[part], identity[part], stratum[part], floor[part],
+            _numbers(patch[part]),
+        )  # fmt: skip
+        return _irradiance_of(points, light, rounds, sampling.standard_error)
 
-    with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
-        found = list(pool.map(traced, _whole_patches(patch)))
+    threads = os.cpu_count() or 1
+    count = min(_POINTS, max(1, len(patch) // (4 * threads)))
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        found = list(pool.map(traced, whole_patches(patch, count)))
     names = [field.name for field in fields(Irradiance)]
     return Irradiance(**{n: np.concatenate([getattr(part, n) for part in found]) for n in names})
 
 
-def _whole_patches(patch: Int) -> list[slice]:
-    """Ranges of about _POINTS points that cut no patch."""
-    starts = np.flatnonzero(np.diff(patch, prepend=-1))
-    wanted = np.searchsorted(starts, np.arange(0, int(starts[-1]) + 1, _POINTS))
-    firsts = [int(first) for first in np.unique(starts[wanted])]
-    return [slice(first, last) for first, last in pairwise([*firsts, len(patch)])]
-
-
-class _Points(NamedTuple):
-    """Points of whole patches: origins of their rays and normals (P, 3), patches, random numbers'
-    identities and least S to hold errors against, (P,)."""
-
-    origin: Float
-    normal: Float
-    patch: Int
-    identity: Long
-    floor: Double
-
-    def of(self, which: Any) -> _Points:
-        return _Points(*(values[which] for values in self))
-
-
-def _irradiance_of(points: _Points, light: _Light, sampling: Sampling) -> Irradiance:
+def _irradiance_of(
+    points: Points, light: IncomingLight, rounds: list[tuple[int, int]], standard_error: float
+) -> Irradiance:
     """Rounds of samples, each as many as all before, until every patch has enough."""
     count = len(points.origin)
     mean, error = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    sums, escaped = np.zeros((2, _BLOCKS, count, 3)), np.zeros(count)
+    sums, escaped = np.zeros((2, BLOCKS, count, 3)), np.zeros(count)
     active: Any = slice(None)
-    rounds = _rounds(sampling, light.techniques)
+    picks = light.picks(points)
     for first, last in rounds:
         if first:
             sums[:, 0] += sums[:, 1]
             sums[:, 1] = sums[:, 2] + sums[:, 3]
             sums[:, 2:] = 0
-        light.add(points, first, last, sums, escaped)
+        light.add(points, picks, (first, last), sums, escaped)
         found, scatter = mean_and_error(sums, last)
         mean[active], error[active], share[active] = found, scatter, escaped / last
         done[active] = light.techniques * last
         if last == rounds[-1][1]:
             break
-        noisy = np.flatnonzero(
-            _noisy(points.patch, found, scatter, sampling.standard_error, points.floor)
-        )
+        noisy = np.flatnonzero(_noisy(points.patch, found, scatter, standard_error, points.floor))
         if not len(noisy):
             break
         if len(noisy) < len(escaped):
@@ -209,84 +205,6 @@ def _noisy(patch: Int, mean: Double, error: Double, target: float, dark: Double)
     return (np.sqrt(square) > target * np.maximum(level, floor))[index]
 
 
-class _Light:
-    """All that brings light, and the two techniques that look for it."""
-
-    def __init__(
-        self,
-        rays: RayScene,
-        radiance: SurfaceTexture,
-        lights: Lights,
-        environment: Environment,
-        sampling: Sampling,
-    ) -> None:
-        independent = sampling.estimator == "cosine"
-        self.rays = rays
-        self.radiance = radiance.packed
-        self.environment = environment.arrays
-        self.lights = lights.arrays
-        self.seed = sampling.seed
-        self.techniques = 1 if independent or not len(lights.face) else 2
-        self.groups = lights.groups
-        log2_count = int(np.ceil(np.log2(max(sampling.max_rays, 2))))
-        self.sobol = sobol_bits(0 if independent else log2_count)[independent:]
-        first_round = _rounds(sampling, self.techniques)[0][1]
-        self.own_bits = _own_bits(first_round)
-
-    def add(self, points: _Points, first: int, last: int, sums: Double, escaped: Double) -> None:
-        """Trace samples first..last of each point and add them to sums (2, 4, P, 3), one for each
-        technique, and escaped (P,)."""
-        frames = frames_of(points.normal)
-        scrambles = scrambles_of_points(points.patch, points.identity, self.seed, self.own_bits)
-        draws = self.sobol, scrambles, self.seed, points.identity
-        picks = self._picks(points)
-        step = max(1, _BATCH // len(points.origin))
-        for start in range(first, last, step):
-            stop = min(start + step, last)
-            block = _block_of(np.arange(start, stop), first, last)
-            origins, directions = cosine_batch(points.origin, frames, draws, start, stop)
-            hits = self.rays.closest(origins, directions)
-            add_cosine_batch(
-                self.radiance, self.environment, self.lights, picks, points.normal,
-                directions, (hits.face, hits.u, hits.v, hits.distance), block, sums[0], escaped,
-            )  # fmt: skip
-            if self.techniques == 2:
-                *segments, lit = light_batch(
-                    picks, points.origin, points.normal, draws, start, stop
-                )
-                blocked = self.rays.occluded(*segments)
-                add_light_batch(self.radiance, lit, blocked, block, sums[1])
-
-    def _picks(self, points: _Points) -> PickArrays:
-        starts = np.flatnonzero(np.diff(points.patch, prepend=-1))
-        number = np.repeat(
-            np.arange(len(starts), dtype=np.int32), np.diff(starts, append=len(points.patch))
-        )
-        if self.techniques == 1:
-            none = np.zeros((0, 0))
-            return self.groups.arrays, number, none, none.astype(np.int32), none.astype(np.float32)
-        first_point = np.append(starts, len(points.patch))
-        weighed = weighed_groups(
-            self.groups.start, self.groups.bounds, points.origin, points.normal, first_point
-        )
-        return self.groups.arrays, number, *weighed
-
-
-def _own_bits(samples: int) -> Bits:
-    """Which bits of its scrambles a point has for itself, (2,).
-
-    In every run of 2^m Sobol points each cell of a grid of 2^m cells holds one. Where in the cells
-    is a point's own; which cell comes when is its patch's, so that the patch's rays of one sample
-    stay nearly parallel and yet its points' errors are independent.
-    """
-    shared = (samples & -samples).bit_length() - 1
-    high = (shared + 1) // 2
-    return np.array([(1 << 32 - high) - 1, (1 << 32 - (shared - high)) - 1], np.uint32)
-
-
-def _block_of(sample: Long, first: int, last: int) -> Long:
-    """The first round fills all four blocks; each later one the last two (the first two then hold
-    what came before)."""
-    if first == 0:
-        return sample * _BLOCKS // last
-    return 2 + (sample - first) * 2 // (last - first)
+def _numbers(patch: Int) -> Int:
+    """Which of the patches here, counted from 0, (P,)."""
+    return np.cumsum(np.diff(patch, prepend=patch[0]) != 0, dtype=np.int32)

@@ -23,22 +23,27 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf.geometry.packed_texture import unsigned
 from usdbrdf.kernel import loop
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
+Short = npt.NDArray[np.int16]
 Long = npt.NDArray[np.int64]
+Bytes = npt.NDArray[np.uint8]
 
 _GROUPS = 512
+# Steps of a patch's guide per group: picking then seldom has to look further.
+_STEPS = 4
 # Share of the picks that follow power alone.
 _BY_POWER = 0.1
 # Texels of a patch that its groups are weighed at.
 _WEIGHED_AT = 8
 
 # What the kernels take of LightGroups, in this order: face, cumulative, guide, start, of_face,
-# triangles.
-GroupArrays: TypeAlias = tuple[Int, Double, Int, Double, Int, Float]
+# triangles, is_light.
+GroupArrays: TypeAlias = tuple[Int, Double, Int, Double, Int, Float, Bytes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +58,8 @@ class LightGroups:
     bounds      (8, G) float32: centre, mean normal, radius, spread of the normals
     triangles   (K, 16) float32: first corner, edges to the others, normal, density per m^2 when
                 picked by power; what is read together lies together
+    is_light    (F / 8,) uint8, a bit for each triangle of the scene, the lowest first: few enough
+                to stay in the cache
     """
 
     face: Int
@@ -62,10 +69,14 @@ class LightGroups:
     of_face: Int
     bounds: Float
     triangles: Float
+    is_light: Bytes
 
     @property
     def arrays(self) -> GroupArrays:
-        return self.face, self.cumulative, self.guide, self.start, self.of_face, self.triangles
+        return (
+            self.face, self.cumulative, self.guide, self.start, self.of_face, self.triangles,
+            self.is_light,
+        )  # fmt: skip
 
 
 def light_groups(
@@ -101,6 +112,7 @@ def light_groups(
         of_face=of_face,
         bounds=_bounds(parts, power, corners, normals),
         triangles=triangles,
+        is_light=np.packbits(density > 0, bitorder="little"),
     )
 
 
@@ -141,49 +153,61 @@ def _bounds(parts: list[Long], power: Double, corners: Double, normals: Double) 
 @loop
 def weighed_groups(
     start: Double, bounds: Float, origin: Float, normal: Float, first_point: Long
-) -> tuple[Double, Int, Float]:
+) -> tuple[Double, Short, Float]:
     """For Q patches, whose points start at ``first_point`` (Q + 1,): the groups' cumulative
     probabilities (Q, G), guides to these as ``LightGroups.guide`` is one, and how much more likely
     than by power they are, (Q, G)."""
     count, patches = bounds.shape[1], len(first_point) - 1
     cumulative = np.empty((patches, count))
-    guide = np.empty((patches, 2 * count), np.int32)
+    guide = np.empty((patches, _STEPS * count), np.int16)
     ratio = np.empty((patches, count), np.float32)
     own, weight = np.empty(count, np.float32), np.empty(count, np.float32)
-    power = np.diff(start)
+    power = np.diff(start).astype(np.float32)
     for q in range(patches):
         weight[:] = 0
         first, points = first_point[q], first_point[q + 1] - first_point[q]
         reach = _reach(origin[first : first + points])
         for i in range(_WEIGHED_AT):
-            # One in each row of a patch of 8 x 8, each in another column.
-            column = (i & 1) * 4 + (i & 2) + (i >> 2)
-            k = first + ((i * _WEIGHED_AT + column) * points) // _WEIGHED_AT**2
+            # In the order of strata these lie one in each row and each column of a patch of 8 x 8.
+            k = first + ((i * _WEIGHED_AT + i * 5 % _WEIGHED_AT) * points) // _WEIGHED_AT**2
             _add_importance(bounds, power, (origin[k], normal[k], reach), own, weight)
-        total = 0.0
+        total = _dot(weight, power)
+        scale = np.float32((1 - _BY_POWER) / total if total > 0 else 0)
+        least = np.float32(_BY_POWER if total > 0 else 1)
         for g in range(count):
-            total += weight[g] * power[g]
-        reached, at = 0.0, 0
+            ratio[q, g] = least + scale * weight[g]
+        reached = 0.0
         for g in range(count):
-            ratio[q, g] = _BY_POWER + (1 - _BY_POWER) * weight[g] / total if total > 0 else 1.0
-            reached += ratio[q, g] * power[g]
+            reached += float(ratio[q, g]) * (start[g + 1] - start[g])
             cumulative[q, g] = reached
-            while at < 2 * count and at < reached * 2 * count:
-                guide[q, at] = g
-                at += 1
-        guide[q, at:] = count - 1
+        _fill_guide(cumulative[q], guide[q])
     return cumulative, guide, ratio
 
 
 @loop
-def picked(cumulative: Double, guide: Int, pick: float) -> int:
+def _fill_guide(cumulative: Double, guide: Short) -> None:
+    """guide[i] = the first of which the cumulative probability exceeds i / len(guide)."""
+    steps = len(guide)
+    guide[:] = 0
+    for g in range(len(cumulative) - 1):
+        after = math.ceil(cumulative[g] * steps)
+        if after < steps:
+            guide[after] = g + 1
+    largest = guide[0]
+    for i in range(steps):
+        largest = max(largest, guide[i])
+        guide[i] = largest
+
+
+@loop
+def picked(cumulative: Double, guide: Int | Short, pick: float) -> int:
     """The first of which the cumulative probability exceeds ``pick``."""
     last = len(cumulative) - 1
-    which: int = guide[min(int(pick * len(guide)), len(guide) - 1)]
-    while which > 0 and cumulative[which - 1] > pick:
-        which -= 1
+    which = unsigned(guide[unsigned(min(int(pick * len(guide)), len(guide) - 1))])
+    while which > 0 and cumulative[unsigned(which - 1)] > pick:
+        which = unsigned(which - 1)
     while which < last and cumulative[which] <= pick:
-        which += 1
+        which = unsigned(which + 1)
     return which
 
 
@@ -200,22 +224,40 @@ def _reach(points: Float) -> float:
 
 @loop
 def _add_importance(
-    bounds: Float, power: Double, at: tuple[Float, Float, float], own: Float, weight: Float
+    bounds: Float, power: Float, at: tuple[Float, Float, float], own: Float, weight: Float
 ) -> None:
     """weight (G,) += importance per power of each group to the point and normal ``at``, scaled so
     that every point weighs as much as the next; ``own`` (G,) is overwritten."""
     x, n, c = at[0], at[1], np.float32(at[2])
-    zero, total = np.float32(0), 0.0
+    x0, x1, x2, n0, n1, n2 = x[0], x[1], x[2], n[0], n[1], n[2]
+    zero = np.float32(0)
     for g in range(len(weight)):
-        dx, dy, dz = bounds[0, g] - x[0], bounds[1, g] - x[1], bounds[2, g] - x[2]
+        dx, dy, dz = bounds[0, g] - x0, bounds[1, g] - x1, bounds[2, g] - x2
         r = bounds[6, g]
         square = dx * dx + dy * dy + dz * dz
-        received = dx * n[0] + dy * n[1] + dz * n[2] + r
+        received = dx * n0 + dy * n1 + dz * n2 + r
         facing = bounds[7, g] * np.float32(math.sqrt(square)) + r + c
         facing -= dx * bounds[3, g] + dy * bounds[4, g] + dz * bounds[5, g]
         square += r * r + c * c
         own[g] = max(received, zero) * max(facing, zero) / (square * square)
-        total += own[g] * power[g]
+    total = _dot(own, power)
     if total > 0:
+        scale = np.float32(1 / total)
         for g in range(len(weight)):
-            weight[g] += own[g] / total
+            weight[g] += own[g] * scale
+
+
+@loop
+def _dot(a: Float, b: Float) -> float:
+    """Their scalar product, by eight sums side by side: one alone would wait for itself."""
+    sums = np.zeros(8, np.float32)
+    whole = len(a) - len(a) % 8
+    for first in range(0, whole, 8):
+        for i in range(8):
+            sums[i] += a[first + i] * b[first + i]
+    total = 0.0
+    for i in range(8):
+        total += sums[i]
+    for i in range(whole, len(a)):
+        total += a[i] * b[i]
+    return total
