@@ -7,9 +7,9 @@ points of the surface. At those whose texels were all seen at least three times,
 triangle and are not emissive, on objects that do not emit, the maps are read bilinearly and
 compared:
 
-    irradiance           with E
-    lit, diffuse         with albedo / pi * E
-    albedo, base_color   with albedo
+    irradiance, refined_irradiance   with E
+    lit, diffuse                     with albedo / pi * E
+    albedo, base_color               with albedo
 
 Printed as JSON, for all points, those within 4.5 cm of another object (`contacts`), the `rest`, and
 each object: median error and median absolute error, relative, of the channels' mean and of each
@@ -134,7 +134,7 @@ def compared_maps(
     light = reference["E"][places.row].astype(np.float64)
     albedo = reference["albedo"][places.row].astype(np.float64)
     truth = {"irradiance": light, "lit": albedo / np.pi * light, "albedo": albedo}
-    truth |= {"diffuse": truth["lit"], "base_color": albedo}
+    truth |= {"refined_irradiance": light, "diffuse": truth["lit"], "base_color": albedo}
     truth = {name: truth[name] for name in truth if everywhere(atlas, name)}
     found = {
         name: places.values(surface_texture(atlas.texels, atlas.scene.face_object, atlas.map(name)))

@@ -157,6 +157,3 @@ def surface_points(points: Points, rays: int) -> tuple[mi.Interaction3f, mi.Fram
     origin.p = mi.Point3f(repeated(points.position))
     origin.n = mi.Normal3f(repeated(points.geometric_normal))
     return origin, mi.Frame3f(repeated(points.normal))
-
-
-# ---- how much light ----------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.material import observations
 from usdbrdf.material.lit_scene import LitScene, View
 from usdbrdf.material.observations import Follower
+from usdbrdf.material.patches import SIDE
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.lights import lights_from_radiance
 
@@ -26,7 +27,7 @@ def floor() -> World:
     ])  # fmt: skip
 
 
-def _lit(world: World, lamp: int | None = None) -> LitScene:
+def _lit(world: World, lamp: int | None = None, size: float | None = None) -> LitScene:
     lit = np.full((len(world.texels), 3), 0.5, np.float32)
     if lamp is not None:
         lit[world.texels.of_object(lamp)] = 50
@@ -34,7 +35,7 @@ def _lit(world: World, lamp: int | None = None) -> LitScene:
     return LitScene(
         scene=world.scene, rays=world.rays, radiance=texture,
         lights=lights_from_radiance(world.scene, world.texels, lit), emission=texture,
-        environment=black_environment(), size=world.size,
+        environment=black_environment(), size=size or world.size,
     )  # fmt: skip
 
 
@@ -72,6 +73,25 @@ def test_all_frames_are_followed_where_there_is_room(floor: World):
     assert set(found.frame) == set(range(6))
     np.testing.assert_array_equal(found.radiance, 1 + found.frame[:, None] * np.ones((1, 3)))
     np.testing.assert_array_equal(found.noise, 0.25 * found.frame)
+
+
+def test_on_a_plane_a_sample_is_the_mean_over_a_square(floor: World):
+    # Pixels and texels of 1/12 m: a square of four texels is as many pixels.
+    pixels = 48
+    view = View(
+        radiance=np.random.default_rng(0).random((pixels, pixels, 3)).astype(np.float32),
+        valid=np.ones((pixels, pixels), bool),
+        world_from_camera=look_at(np.array([0.0, -0.01, 2.0]), np.zeros(3)),
+        intrinsics=np.array([24.0, 24.0, 24.0, 24.0]),
+    )
+    hall = _lit(floor, size=20.0)
+    follower = Follower(hall, floor.texels, np.ones(len(floor.texels), bool), 1, 0)
+    follower.add(view, np.zeros((pixels, pixels), bool), 0.0)
+    radiance = follower._radiance[0][follower._seen[0]]
+    assert len(radiance) > 300
+    # Sixteen pixels' means, read bilinearly: at most a sixteenth of the variance.
+    np.testing.assert_allclose(radiance.mean(), view.radiance.mean(), atol=0.03)
+    assert radiance.var() < view.radiance.var() / SIDE**2
 
 
 def test_beyond_the_bound_frames_are_taken_evenly(floor: World, monkeypatch):

@@ -7,6 +7,7 @@ holds the specular light that is seen from everywhere, then enters as incident l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 
@@ -97,7 +98,7 @@ def _footprints(
         enough = _several_views(some.texel[kept])
         return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(RINGS))))
 
-    kept, points = whole(observed, _FOOTPRINT)
+    kept, points = whole(observed, _width(texels, observed, view_of))
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
@@ -112,6 +113,16 @@ def _footprints(
     return observed, [points]
 
 
+def _width(texels: Texels, observed: Observations, view_of: Callable[[int], View]) -> float:
+    """Standard deviation of what the samples spread over, in pixels: the footprint of a single
+    texel's, and the square that others are the mean of."""
+    if observed.side[0] <= 1:
+        return _FOOTPRINT
+    pixel = _pixel_size(texels.position[observed.texel], observed.frame, view_of)
+    square = observed.side[0] * math.sqrt(float(np.median(texels.area[observed.texel])) / 12)
+    return math.hypot(_FOOTPRINT, square / pixel)
+
+
 def _samples(
     lit: LitScene,
     texels: Texels,
@@ -120,9 +131,10 @@ def _samples(
     view_of: Callable[[int], View],
 ) -> ViewSamples:
     position = texels.position[observed.texel]
-    # Views cut a pattern differently: its contrast within the footprint is an error of the sample.
+    # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
+    # or, of a square's mean, that along its rim.
     shown = lit.radiance.at(points.face, points.u, points.v)
-    contrast = shown.reshape(len(position), len(RINGS), 3).std(axis=1)
+    contrast = shown.reshape(len(position), len(RINGS), 3).std(axis=1) / observed.side[:, None]
     return ViewSamples(
         texel=np.unique(observed.texel, return_inverse=True)[1].astype(np.int64),
         frame=observed.frame.astype(np.int64),

@@ -2,12 +2,13 @@
 
 A lobe shows in how a texel's radiance changes with the view. So, of every object, some thousand
 texels are followed through all frames, and those are kept on which the light in the mirror
-direction changes most between the frames that see them, along with as many taken at random.
+direction changes most between the frames that see them, along with as many taken at random. On
+flat objects a sample is the mean over a square of texels: see ``patches``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from usdbrdf.geometry.rays import lift_from_surface
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.material.lit_scene import LitScene, View
+from usdbrdf.material.patches import sides_of_samples
 from usdbrdf.shading.warps import patch_shifts
 from usdbrdf.texturing.samples_from_frame import SAMPLE, first_surfaces, samples_from_frame
 
@@ -43,13 +45,14 @@ class Observations:
     """M samples of texels by frames, sorted by object and texel.
 
     texel (M,) int32; frame (M,) int32; radiance (M, 3) float32; noise (M,) float32, the frame's
-    noise floor
+    noise floor; side (M,) float32, of the square that the sample is the mean of, in texels
     """
 
     texel: Int
     frame: Int
     radiance: Float
     noise: Float
+    side: Float
 
     def of_texels(self, own: slice) -> Observations:
         """Those of one object's texels."""
@@ -70,9 +73,13 @@ class Follower:
     def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
         self._lit = lit
+        side, usable = sides_of_samples(texels, usable, lit.size)
         self._index, rows = _texels_to_follow(texels, usable, frames, seed)
-        self._texels = texels.take(self._index)
         self._owner = texels.object_index()[self._index]
+        self._side = side[self._owner]
+        own = texels.take(self._index)
+        across = self._side[:, None]
+        self._texels = replace(own, step_x=across * own.step_x, step_y=across * own.step_y)
         # Offsets of the proxy's half vectors, the same for all texels so that views compare.
         self._jitter = _PROXY_ALPHA * (2 * patch_shifts(_PROXY_RAYS, 3, seed) - 1)
         # Row of a frame in the tables; what was not seen there is zero.
@@ -122,6 +129,7 @@ class Follower:
             frame=self._frame[row].astype(np.int32),
             radiance=self._radiance[row, column],
             noise=self._noise[row],
+            side=self._side[column],
         )
 
     def target_frames(self, texels: Texels) -> Int:

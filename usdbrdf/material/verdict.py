@@ -10,8 +10,8 @@ from usdbrdf.material.prior import PRIOR_ERROR, with_prior
 
 # From this evidence on a fit is a measurement; below the lower one the frames do not tell one
 # material from another. On fifteen captures with known materials, most of them halves and thirds of
-# others, frames' errors alone reached 0.18 on objects without a highlight, and fits with 0.2 to 0.3
-# were off by up to 0.23 in psi, those with 0.35 to 0.4 by at most 0.06 in phi and 0.09 in psi.
+# others, frames' errors alone reached 0.15 on objects without a highlight, and fits of flat objects
+# with 0.2 to 0.3 were off by up to 0.21 in psi, those with 0.35 to 0.5 by at most 0.05 and 0.08.
 MIN_EVIDENCE, SOME_EVIDENCE = 0.35, 0.2
 # A parameter is known if its standard deviation is at most this.
 MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.17
