@@ -16,14 +16,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import subprocess
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from blender import in_blender
 from pxr import Sdf, Usd, UsdGeom
 
 import usdbrdf  # noqa: F401  (registers the schemas)
@@ -42,7 +41,6 @@ from usdbrdf.stage.scopes import Scopes
 from usdbrdf.steps.atlas import Atlas
 
 AS_WRITTEN = "as written"
-SCRIPT = Path(__file__).with_name("blender_views.py")
 
 
 def main() -> None:
@@ -112,15 +110,7 @@ def render(layer: Path, views: Views, count: int, quality: tuple[int, bool], out
             for i in range(count)
         ],
     }
-    document = out / "job.json"
-    document.write_text(json.dumps(job))
-    hidden = ("PYTHONPATH", "PXR_PLUGINPATH_NAME")
-    subprocess.run(
-        [os.environ["USDBRDF_BPY_PYTHON"], str(SCRIPT), str(document)],
-        env={k: v for k, v in os.environ.items() if k not in hidden},
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    in_blender("blender_views", out, job)
 
 
 def figures(folder: Path, views: Views, count: int, exposure: float) -> dict[str, Any]:

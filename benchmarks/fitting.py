@@ -10,8 +10,6 @@ What the fit step does besides, the refined maps, is in `scaling.py`.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -20,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from measure import Spent, figure, lit_asset, table, timed
+from measure import Spent, figure, lit_asset, parser_of, report, timed
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.material import fit_views as views
@@ -33,17 +31,8 @@ T = TypeVar("T")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("asset", type=Path)
-    parser.add_argument("-o", "--output", type=Path, help="folder for the JSON")
-    parser.add_argument("--quick", action="store_true", help="the first six objects only")
-    options = parser.parse_args()
-    results = measure(options.asset, options.quick)
-    print(json.dumps(results, indent=2))
-    print(table(results["figures"]))
-    if options.output:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "fitting.json").write_text(json.dumps(results, indent=2) + "\n")
+    options = parser_of(__doc__, "asset", quick="the first six objects only").parse_args()
+    report("fitting", measure(options.asset, options.quick), options.output)
     return 0
 
 

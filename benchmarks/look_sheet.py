@@ -9,14 +9,12 @@ others is shown as the look says.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from blender import in_blender
 from pxr import Gf, Sdf, Usd, UsdLux
 
 import usdbrdf  # noqa: F401  (registers the schemas)
@@ -65,14 +63,7 @@ def picture(asset: Asset, look: str, frame: int, work: Path) -> np.ndarray:
         "layer": layer.realPath,
         "frames": [{"camera": camera, "time": frame, "width": WIDTH, "out": str(file)}],
     }
-    document = work / "job.json"
-    document.write_text(json.dumps(job))
-    subprocess.run(
-        [os.environ["USDBRDF_BPY_PYTHON"], Path(__file__).with_name("storm_views.py"), document],
-        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    in_blender("storm_views", work, job)
     return to_display_srgb8(read_radiance(file)[..., :3], exposure_scale=1.0)
 
 

@@ -11,13 +11,12 @@ each sphere, and the mean of its FLIP against the first row.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from blender import in_blender
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
 import usdbrdf  # noqa: F401  (registers the schemas)
@@ -169,18 +168,6 @@ def cycles(layer: Path, folder: Path) -> np.ndarray:
     }
     in_blender("blender_views", folder, job)
     return read_radiance(folder / "view_00.exr")[..., :3]
-
-
-def in_blender(program: str, folder: Path, job: dict[str, object]) -> None:
-    document = folder / "job.json"
-    document.write_text(json.dumps(job))
-    hidden = ("PYTHONPATH", "PXR_PLUGINPATH_NAME")
-    subprocess.run(
-        [os.environ["USDBRDF_BPY_PYTHON"], Path(__file__).with_name(f"{program}.py"), document],
-        env={k: v for k, v in os.environ.items() if k not in hidden},
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,10 @@
-"""What the speed benchmarks share: clocks, ratios measured side by side, figures, their table."""
+"""What the speed benchmarks share: command line, clocks, ratios measured side by side, figures,
+their table and files."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -112,3 +115,32 @@ def saved_plot(drawing: Any, path: Path) -> Path:
     drawing.savefig(path, dpi=120)
     pyplot.close(drawing)
     return path
+
+
+def parser_of(
+    description: str | None, *paths: str, quick: str | None = None
+) -> argparse.ArgumentParser:
+    """The command line: ``paths`` by position, -o and --quick, which ``quick`` explains."""
+    parser = argparse.ArgumentParser(description=(description or "").split("\n")[0])
+    for name in paths:
+        parser.add_argument(name, type=Path)
+    parser.add_argument("-o", "--output", type=Path, help="folder for what is printed, and plots")
+    parser.add_argument("--quick", action="store_true", help=quick)
+    return parser
+
+
+def report(
+    name: str,
+    results: dict[str, Any],
+    folder: Path | None,
+    plot: Callable[[dict[str, Any], Path], Path] | None = None,
+) -> None:
+    """Print ``results`` and the table of their figures; write NAME.json and the plot."""
+    print(json.dumps(results, indent=2))
+    print(table(results["figures"]))
+    if folder is None or "skipped" in results:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(results, indent=2) + "\n")
+    if plot is not None:
+        plot(results, folder)

@@ -5,34 +5,41 @@
 
 ASSET was shaded, TRUTH_FOLDER holds its capture's true phi and psi, as `samples/study/truth` does.
 The peer optimises the same two parameters of the same lobe (usdbrdf/relighting/lobe_plugin.py, so
-nothing has to be converted) and has the same input: the frames, and the lit texture L_d as what
-every surface sends out and is lit by. Its settings:
+nothing has to be converted) against the same frames. It is lit by the lit texture L_d, as our fit
+is. As the diffuse radiance, which our fit eliminates, it is given the asset's refined map
+`diffuse`, free of specular light: the best case for the peer, which owes it to our fit and does not
+pay for it (where ours used a class prior, the map holds that prior's). `--diffuse lit` gives it L_d
+there too, the best that is known before any fit. Its settings:
 
     variant     llvm_ad_rgb; integrator prb (detached sampling) with one reflection, L_d as a
                 textured area emitter on every mesh, multiple importance sampling
     parameters  phi and psi of all objects that do not shine, together, from 0.5 each, kept within
                 [0.02, 1] and [0, 1]
-    optimiser   mi.ad.Adam, learning rate 0.03, a fifth of it from half of the most epochs on
-    step        four frames in full resolution, 16 paths per pixel, other seeds in each; relative
-                squared error without clipped pixels, lamps and the outlines of objects
-    stop        when the parameters' means over two epochs (all frames once) in turn differ by less
-                than 0.01 on average, or after 12 epochs, or at the time limit
+    optimiser   mi.ad.Adam, learning rate 0.03, a third of it after three checks
+    step        eight frames in full resolution as one batch of cameras, one path per pixel, other
+                seeds in each; relative squared error without clipped pixels, lamps and the outlines
+                of objects
+    stop        when the parameters' means over 15 steps (all frames twice) differ by less than 0.01
+                on average from those of the check before, or at a limit
 
-Ours is the fit step's own fit: one pass over the frames and every object. Both are read without
-class priors. Errors are means over the objects that ours calls measured, and over all.
+Four paths per pixel of four frames a step came no closer on the sample in the same time.
+
+Time is CPU seconds of all threads, without loading scene and frames and without compiling. The
+peer's is counted until it stops, and in hindsight until its errors are within 0.01 of its last.
+Ours is the fit step's own fit: one pass over the frames, reading them included, and every object's
+rays, grid and uncertainties. Both are read without class priors. Errors are means over the objects
+that ours calls measured, and over all.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fitting import Fitted, fitted
-from measure import figure, lit_asset, saved_plot, table
+from measure import figure, lit_asset, parser_of, report, saved_plot
 from peer_optimiser import Settings, optimised
 
 from usdbrdf.errors import EnvironmentFailure
@@ -40,27 +47,19 @@ from usdbrdf.evaluation.truth import known_objects
 from usdbrdf.relighting.variant import mitsuba_variant
 
 SETTINGS = Settings()
-QUICK = Settings(most_epochs=1, limit_s=60.0)
+QUICK = Settings(most_checks=1, limit_s=60.0)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("asset", type=Path)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("-o", "--output", type=Path, help="folder for JSON and plot")
-    parser.add_argument("--quick", action="store_true")
+    parser = parser_of(__doc__, "asset", "truth")
+    parser.add_argument("--diffuse", choices=("diffuse", "lit"), default="diffuse")
     options = parser.parse_args()
-    results = measure(options.asset, options.truth, options.quick)
-    print(json.dumps(results, indent=2))
-    print(table(results["figures"]))
-    if options.output and "skipped" not in results:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "peer.json").write_text(json.dumps(results, indent=2) + "\n")
-        plot(results, options.output)
+    results = measure(options.asset, options.truth, options.quick, options.diffuse)
+    report("peer", results, options.output, plot)
     return 0
 
 
-def measure(asset: Path, truth: Path, quick: bool) -> dict[str, Any]:
+def measure(asset: Path, truth: Path, quick: bool, diffuse: str = "diffuse") -> dict[str, Any]:
     settings = QUICK if quick else SETTINGS
     try:
         mi = mitsuba_variant()
@@ -76,7 +75,7 @@ def measure(asset: Path, truth: Path, quick: bool) -> dict[str, Any]:
     labels = [name for name, one in objects.items() if np.isfinite(one.found["numbers"][0])]
     measured = [name for name in labels if objects[name].record.status == "measured"]
     found = {name: parameters(objects[name]) for name in labels}
-    steps = optimised(mi, asset, lit, labels, settings)
+    compiling, checks = optimised(mi, asset, lit, diffuse, labels, settings)
 
     def errors(values: dict[str, Any], names: list[str]) -> list[float]:
         off = [np.abs(np.subtract(values[n], (known[n]["phi"], known[n]["psi"]))) for n in names]
@@ -85,8 +84,10 @@ def measure(asset: Path, truth: Path, quick: bool) -> dict[str, Any]:
     def both(values: dict[str, Any]) -> dict[str, list[float]]:
         return {"measured": errors(values, measured), "all": errors(values, labels)}
 
-    last = steps[-1]
+    last = checks[-1]
+    course = [{**check.spent._asdict(), "errors": both(check.values)} for check in checks]
     results = {
+        "diffuse": diffuse,
         "objects": len(labels),
         "measured": measured,
         "settings": settings._asdict(),
@@ -94,9 +95,11 @@ def measure(asset: Path, truth: Path, quick: bool) -> dict[str, Any]:
         "peer": {
             **last.spent._asdict(),
             "converged": last.converged,
-            "epochs": len(steps),
+            "steps": len(checks) * settings.steps_per_check,
+            "compiling": compiling._asdict(),
+            "settled": settled(course),
             "errors": both(last.values),
-            "course": [{**s.spent._asdict(), "errors": both(s.values)} for s in steps],
+            "course": course,
         },
     }
     results["parameters"] = {
@@ -116,6 +119,14 @@ def parameters(one: Fitted) -> tuple[float, float]:
     return float(phi), float(psi)
 
 
+def settled(course: list[dict[str, Any]]) -> dict[str, float]:
+    """Time of the first check from which on the mean errors stay within 0.01 of the last ones."""
+    off = np.array([one["errors"]["measured"] for one in course]).mean(axis=1)
+    within = off < off[-1] + 0.01
+    first = len(within) - int(np.argmin(within[::-1])) if not within.all() else 0
+    return {clock: course[first][clock] for clock in ("cpu", "wall")}
+
+
 def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     ours, peer = results["ours"], results["peer"]
     how = "converged" if peer["converged"] else "stopped at its limit"
@@ -124,6 +135,7 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
             f"peer's time over ours, CPU (peer {how})", peer["cpu"] / ours["cpu"], "x", least=10
         ),
         figure("the same by the clock", peer["wall"] / ours["wall"], "x"),
+        figure("the same until it had settled, CPU", peer["settled"]["cpu"] / ours["cpu"], "x"),
         figure("ours, CPU", ours["cpu"], "s"),
         figure("peer, CPU", peer["cpu"], "s"),
     ]

@@ -10,8 +10,6 @@ seconds; a step's fixed cost makes it smaller, so that of the largest doubling i
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import subprocess
 import sys
@@ -21,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import Spent, figure, saved_plot, table, timed
+from measure import Spent, figure, parser_of, report, saved_plot, timed
 
 import usdbrdf
 from usdbrdf.stage.asset import Asset
@@ -47,17 +45,8 @@ RESOLUTION = ("--width", "320", "--height", "240")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("-o", "--output", type=Path, help="folder for JSON and plot")
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    results = measure(options.quick)
-    print(json.dumps(results, indent=2))
-    print(table(results["figures"]))
-    if options.output:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "scaling.json").write_text(json.dumps(results, indent=2) + "\n")
-        plot(results, options.output)
+    options = parser_of(__doc__).parse_args()
+    report("scaling", measure(options.quick), options.output, plot)
     return 0
 
 

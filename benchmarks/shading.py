@@ -18,8 +18,6 @@ Times are medians of turns taken side by side, CPU seconds of all threads and wa
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -34,16 +32,19 @@ from measure import (
     figure,
     lit_asset,
     median,
+    parser_of,
     ratio,
+    report,
     saved_plot,
     side_by_side,
-    table,
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.shading.irradiance import Sampling, patches_of_texels
 
 THREADS = os.cpu_count() or 1
+# Places of the scene that throughput is measured at.
+RUNS = 16
 
 
 FULL = Sizes(1 << 15, 7, 3000, 1 << 13, 64)
@@ -51,18 +52,8 @@ QUICK = Sizes(1 << 15, 3, 800, 1 << 12, 24)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("asset", type=Path)
-    parser.add_argument("-o", "--output", type=Path, help="folder for JSON and plot")
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    results = measure(options.asset, options.quick)
-    print(json.dumps(results, indent=2))
-    print(table(results["figures"]))
-    if options.output:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "shading.json").write_text(json.dumps(results, indent=2) + "\n")
-        plot(results, options.output)
+    options = parser_of(__doc__, "asset").parse_args()
+    report("shading", measure(options.asset, options.quick), options.output, plot)
     return 0
 
 
@@ -83,7 +74,7 @@ def measure(asset: Path, quick: bool) -> dict[str, Any]:
 
 
 def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
-    order, patch = (values[: sizes.traced] for values in patches_of_texels(lit.atlas.texels))
+    order, patch = spread(*patches_of_texels(lit.atlas.texels), sizes.traced)
     sampling = Sampling(standard_error=0, max_rays=64, seed=1)
     recorded = RecordedRays(lit.scene.rays)
     shaded(lit, order, patch, sampling, recorded)
@@ -105,6 +96,16 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         "of_embreex": ratio(embree, ours)._asdict(),
         "patches_over_random_order": ratio(random, patches)._asdict(),
     }
+
+
+def spread(order: np.ndarray, patch: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """About ``count`` texels of the whole scene: RUNS runs of whole patches, evenly spaced."""
+    starts = np.flatnonzero(np.diff(patch, prepend=-1))
+    last = max(len(order) - count // RUNS, 1)
+    firsts = starts[np.searchsorted(starts, np.linspace(0, last, RUNS + 1)[:-1].astype(int))]
+    runs = [np.arange(first, min(first + count // RUNS, len(order))) for first in firsts]
+    kept = np.unique(np.concatenate(runs))
+    return order[kept], patch[kept]
 
 
 def embreex(lit: Lit, calls: list[tuple[Any, Any, Any]]) -> None:

@@ -1,30 +1,20 @@
 """Cycles and Hydra Storm, each in Blender's own process, which must not see our build of USD."""
 
 import json
-import os
-import subprocess
 from pathlib import Path
 
 import numpy as np
 
+from tests.blender import in_blender
 from usdbrdf.files.images import read_radiance
 
-BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 _PROGRAMS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 def _run(program, job, folder):
     document = folder / f"{program}.json"
     document.write_text(json.dumps(job))
-    done = subprocess.run(
-        [BLENDER, str(_PROGRAMS / f"{program}.py"), str(document)],
-        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    in_blender(_PROGRAMS / f"{program}.py", document, folder=folder, timeout=300)
 
 
 def cycles(layer, views, folder, *, samples, surroundings):

@@ -1,41 +1,28 @@
 """What Blender makes of an asset: textures, roughness and index of refraction on every object."""
 
 import json
-import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
+from tests.blender import in_blender, needs_blender
 from tests.nondestruction.conftest import convert, photographed
 from usdbrdf.files.images import read_radiance
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.stage.asset import Asset
 
-BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 SCRIPT = Path(__file__).with_name("blender_report.py")
 FOLDERS = ["room", "Zimmer é 椅子 (1)"]
 
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
-)
+pytestmark = needs_blender
 
 
 def blender_report(layer, tmp_path):
-    """Import a layer in Blender's own process, which must not see our build of USD."""
-    done = subprocess.run(
-        [BLENDER, str(SCRIPT), str(layer)],
-        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    said = in_blender(SCRIPT, layer, folder=tmp_path)
     # Blender may have a last word of its own.
-    return json.loads(next(x for x in done.stdout.splitlines() if x.startswith("{")))
+    return json.loads(next(x for x in said.splitlines() if x.startswith("{")))
 
 
 def report_of(built, tmp_path, look):

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
-from tests.dcc.renderers import BLENDER, storm
+from tests.blender import needs_blender
+from tests.dcc.renderers import storm
 from usdbrdf.files.images import write_exr
 from usdbrdf.stage.material_layer import write_material_layer
 
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
-)
+pytestmark = needs_blender
 
 
 def picture(built, folder, *, materialx):

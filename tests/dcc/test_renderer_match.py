@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
-from tests.dcc.renderers import BLENDER, cycles, storm
+from tests.blender import needs_blender
+from tests.dcc.renderers import cycles, storm
 from usdbrdf.material.renderer_match import cycles_albedo, fitted_albedo, storm_albedo
 from usdbrdf.stage.preview_surface import preview_surface_from_fit, surface
 
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
-)
+pytestmark = needs_blender
 
 PHI, PSI = (0.05, 0.1, 0.3, 0.6, 1.0), (0.25, 0.5, 1.0)
 ANGLES = np.radians([10, 45, 75])

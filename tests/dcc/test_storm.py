@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from tests.dcc.renderers import BLENDER, storm
+from tests.blender import needs_blender
+from tests.dcc.renderers import storm
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.preview_surface import surface
 
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
-)
+pytestmark = needs_blender
 MOVED = "Zimmer é 椅子 (1)"
 WIDTH, FOCAL = 96, 1.5  # of the picture in pixels, of the lens in widths of the picture
 EYE = np.array([0.0, -8.0, 1.5])

@@ -1,22 +1,9 @@
-"""The small asset of the stage's tests, with maps whose texels differ, to be packed."""
-
-import importlib.util
-import sys
-from pathlib import Path
+"""The small asset of the tests, with maps whose texels differ, to be packed."""
 
 import numpy as np
 import pytest
 
 from usdbrdf.files.images import write_exr
-
-_PATH = Path(__file__).resolve().parents[1] / "stage" / "conftest.py"
-_SPEC = importlib.util.spec_from_file_location("stage_fixtures", _PATH)
-_FIXTURES = importlib.util.module_from_spec(_SPEC)
-sys.modules["stage_fixtures"] = _FIXTURES
-_SPEC.loader.exec_module(_FIXTURES)
-
-synthetic = _FIXTURES.synthetic
-built = _FIXTURES.built
 
 
 @pytest.fixture

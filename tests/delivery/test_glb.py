@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
+from tests.blender import in_blender, needs_blender
 from usdbrdf.delivery.glb import gltf_material, write_glb
 from usdbrdf.delivery.package import PackageOptions, package
 from usdbrdf.errors import EnvironmentFailure
@@ -23,7 +22,6 @@ from usdbrdf.stage.published_surfaces import published_surfaces
 
 pytest.importorskip("PIL", reason="Pillow is not installed")
 
-BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 OPEN_IN_BLENDER = """
 import json, sys
 import bpy
@@ -197,18 +195,10 @@ def test_a_specular_colour_is_told(capsys):
     assert "index of refraction" in told[0]
 
 
-@pytest.mark.skipif(not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with bpy")
+@needs_blender
 def test_blender_reads_it(exported, tmp_path):
-    done = subprocess.run(
-        [BLENDER, "-c", OPEN_IN_BLENDER, str(exported)],
-        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    line = next(x for x in done.stdout.splitlines() if x.startswith("FOUND"))
+    said = in_blender("-c", OPEN_IN_BLENDER, exported, folder=tmp_path)
+    line = next(x for x in said.splitlines() if x.startswith("FOUND"))
     found = json.loads(line[5:])
     assert set(found) == {"Stuhl_No_1", "wall", "lamp"}
     chair, lamp = found["Stuhl_No_1"], found["lamp"]

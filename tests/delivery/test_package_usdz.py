@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import time
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdMedia
 
+from tests.blender import in_blender, needs_blender
 from tests.delivery.packing import TIME, edit, extracted, members, packed, surfaces_of
 from usdbrdf.cli import main
 from usdbrdf.delivery.package import PackageOptions, package
@@ -20,8 +20,6 @@ from usdbrdf.files.images import image_size, write_exr
 from usdbrdf.stage.flat_stage import stage_in_look
 from usdbrdf.stage.packaged_files import texture_uses
 from usdbrdf.validation.standard import standard_findings
-
-BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 
 ARKIT_CHECK = """
 import json, sys
@@ -204,11 +202,11 @@ def test_the_command(room, tmp_path, capsys):
     assert not inside.exists()
 
 
-@pytest.mark.skipif(not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with bpy")
+@needs_blender
 def test_arkit_complies_and_blender_finds_every_texture(room, tmp_path):
     output = packed(room, tmp_path, profile="arkit")
-    assert json.loads(in_blender(ARKIT_CHECK, output, tmp_path)) == []
-    images = json.loads(in_blender(OPEN_IN_BLENDER, packed(room, tmp_path), tmp_path))
+    assert said_in_blender(ARKIT_CHECK, output, tmp_path) == []
+    images = said_in_blender(OPEN_IN_BLENDER, packed(room, tmp_path), tmp_path)
     assert set(images) == {
         "Stuhl_No_1.base_color.exr", "wall.base_color.exr", "lamp.emission.exr",
     }  # fmt: skip
@@ -216,15 +214,7 @@ def test_arkit_complies_and_blender_finds_every_texture(room, tmp_path):
     assert images["lamp.emission.exr"][2:] == pytest.approx([8, 4, 2])
 
 
-def in_blender(script, file, folder):
-    """The last line that a script says in Blender's own process."""
-    done = subprocess.run(
-        [BLENDER, "-c", script, str(file)],
-        env={k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PXR_PLUGINPATH_NAME")},
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return next(x for x in reversed(done.stdout.splitlines()) if x.startswith(("{", "[")))
+def said_in_blender(script, file, folder):
+    """The last JSON that a script prints in Blender's own process."""
+    lines = in_blender("-c", script, file, folder=folder).splitlines()
+    return json.loads(next(x for x in reversed(lines) if x.startswith(("{", "["))))

@@ -1,9 +1,7 @@
 """The add-on in a real Blender: import, looks, panels, and a conversion in the background."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -11,17 +9,13 @@ from pathlib import Path
 import pytest
 from pxr import Sdf
 
+from tests.blender import in_blender, needs_blender
 from tests.scenes import make_capture
 from usdbrdf.cli import main
 
-BLENDER = os.environ.get("USDBRDF_BPY_PYTHON", "")
 HERE = Path(__file__).parent
 # Nothing that a user types is plain ASCII.
 FOLDER = "Zimmer é 椅子 (1)"
-
-needs_blender = pytest.mark.skipif(
-    not BLENDER, reason="USDBRDF_BPY_PYTHON names no interpreter with the module bpy"
-)
 
 
 @pytest.fixture(scope="module")
@@ -37,16 +31,15 @@ def session(tmp_path_factory, source):
     shutil.copytree(source, installed, ignore=shutil.ignore_patterns("__pycache__"))
 
     def run(scenario, *arguments):
-        done = subprocess.run(
-            [BLENDER, str(HERE / "session.py"), scenario, *map(str, arguments)],
-            env={**_clean_environment(), "BLENDER_USER_RESOURCES": str(resources)},
-            cwd=resources,
-            capture_output=True,
-            text=True,
+        said = in_blender(
+            HERE / "session.py",
+            scenario,
+            *arguments,
+            folder=resources,
             timeout=300,  # the first conversion on a machine compiles its kernels
+            BLENDER_USER_RESOURCES=str(resources),
         )
-        assert done.returncode == 0, done.stdout + done.stderr
-        report = next(x for x in done.stdout.splitlines() if x.startswith("REPORT "))
+        report = next(x for x in said.splitlines() if x.startswith("REPORT "))
         return json.loads(report.removeprefix("REPORT "))
 
     return run
@@ -74,11 +67,6 @@ def program(tmp_path):
     path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m usdbrdf "$@"\n')
     path.chmod(0o755)
     return path
-
-
-def _clean_environment():
-    ours = ("PYTHONPATH", "PXR_PLUGINPATH_NAME")
-    return {k: v for k, v in os.environ.items() if k not in ours}
 
 
 def labels(seen):
@@ -302,21 +290,11 @@ def test_cancel(session, program, tmp_path):
 
 @needs_blender
 def test_blender_builds_the_extension(source, tmp_path):
-    found = subprocess.run(
-        [BLENDER, "-c", "import bpy; print(bpy.utils.system_resource('SCRIPTS'))"],
-        env=_clean_environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    tool = Path(found.stdout.splitlines()[0], "addons_core", "bl_pkg", "cli", "blender_ext.py")
-    done = subprocess.run(
-        [BLENDER, str(tool), "build", "--source-dir", str(source), "--output-dir", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    where = "import bpy; print(bpy.utils.system_resource('SCRIPTS'))"
+    scripts = in_blender("-c", where, folder=tmp_path).splitlines()[0]
+    tool = Path(scripts, "addons_core", "bl_pkg", "cli", "blender_ext.py")
+    folders = ("--source-dir", source, "--output-dir", tmp_path)
+    in_blender(tool, "build", *folders, folder=tmp_path)
     [package] = tmp_path.glob("*.zip")
     with zipfile.ZipFile(package) as archive:
         assert {"__init__.py", "blender_manifest.toml"} <= set(archive.namelist())

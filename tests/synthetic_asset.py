@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from usdbrdf.files.images import write_exr, write_preview_png
 from usdbrdf.scan.scan import Frames, ObjectLabel, Scan, ScanMesh
@@ -242,14 +240,3 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
     write_edits(asset.edits_layer, asset, header)
     write_root(asset.root_layer, asset, header)
     return built
-
-
-@pytest.fixture(scope="session")
-def synthetic():
-    """The functions above, for tests that need other assets than ``built``."""
-    return SimpleNamespace(make_scan=make_scan, build=build, box=box)
-
-
-@pytest.fixture
-def built(tmp_path):
-    return build(tmp_path / "out" / "room", make_scan(tmp_path / "capture"))
