@@ -381,3 +381,16 @@ def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, mon
     set_quiet(True)
     assert "3 passes over the frames" in capsys.readouterr().err
     assert _contents(thrice.folder) == _contents(fitted.folder)
+
+
+def test_of_texels_that_many_frames_see_some_samples_are_enough():
+    texel = np.arange(40_000, dtype=np.int32)
+    samples = np.repeat(np.float32([5, 24, 48, 96]), 10_000)
+    frames = [refine._taken(texel, samples, frame, 7) for frame in range(48)]
+    share = np.mean(frames, axis=0).reshape(4, -1)
+    assert (share[:2] == 1).all()
+    np.testing.assert_allclose(share[2:].mean(axis=1), [0.5, 0.25], atol=0.005)
+    # Independent from frame to frame, and of what else is asked for.
+    np.testing.assert_allclose(share[2:].std(axis=1), np.sqrt([0.25 / 48, 0.1875 / 48]), rtol=0.05)
+    some = np.arange(25_000, 40_000, 7)
+    np.testing.assert_array_equal(refine._taken(texel[some], samples[some], 3, 7), frames[3][some])

@@ -18,6 +18,7 @@ from usdbrdf.material.lit_scene import LitScene
 from usdbrdf.material.predict import non_diffuse_radiance
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.scan.scan import Frames
+from usdbrdf.shading.warps import shifts_of
 from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, TexelMap
 from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
@@ -34,9 +35,12 @@ Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
-# Rays per texel and frame: the mean over the frames averages their noise out, so a texel that many
-# frames see needs fewer of each.
+# Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
+# see needs fewer of each.
 _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
+# Of a texel that more frames see than this, so many are taken on the average, spread over all: what
+# is left of their noise is far below the other errors.
+_MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
 # sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
@@ -169,31 +173,42 @@ def _observe(
     shown = samples_from_frames(texels, atlas.scene, lit.rays, frames, order, part)
     bar = progress(shown, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
+        taken = _taken(some.texel, samples[some.texel], some.frame, seed)
+        texel, radiance = some.texel[taken], some.radiance[taken]
         pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
-        unit = level[some.texel]
-        specular = np.empty_like(some.radiance)
-        often = samples[some.texel] >= _MANY_FRAMES
+        specular = np.empty_like(radiance)
+        often = samples[texel] >= _MANY_FRAMES
         for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
-            texel = some.texel[which]
+            own = texel[which]
             specular[which] = non_diffuse_radiance(
-                lit, _seen_from(texels, texel, pose[:3, 3]), lobes.phi[owner[texel]],
-                lobes.psi[owner[texel]], rays, seed + len(frames) + some.frame,
-                texel.astype(np.int64),
+                lit, _seen_from(texels, own, pose[:3, 3]), lobes.phi[owner[own]],
+                lobes.psi[owner[own]], rays, seed + len(frames) + some.frame, own.astype(np.int64),
             )  # fmt: skip
-        covered = footprints(texels, some.texel, pose, lens)
-        noise = _OF_NOISE_FLOOR * np.float32(frames.noise_floor_radiance[some.frame]) / unit
-        # A wide view of a texel says less of it than its noise tells.
-        wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-        deviation = np.hypot(_RELATIVE_ERROR, noise) * wide
-        update(
-            observed,
-            some.texel - np.int32(part.start),
-            (some.radiance - specular) / unit[:, None],
-            deviation.astype(np.float32),
-            covered,
-        )
+        unit, covered = level[texel], footprints(texels, texel, pose, lens)
+        deviation = _deviation(unit, covered, float(frames.noise_floor_radiance[some.frame]))
+        values = (radiance - specular) / unit[:, None]
+        update(observed, texel - np.int32(part.start), values, deviation, covered)
         run.save_latest_in_time(name, done, observed.arrays)
     return observed
+
+
+def _deviation(unit: Float, covered: Float, noise_floor: float) -> Float:
+    """Of the errors of samples, (M,), in units of their texels' ``unit``, with footprints
+    ``covered`` (M, 3)."""
+    noise = np.float32(_OF_NOISE_FLOOR * noise_floor) / unit
+    # A wide view of a texel says less of it than its noise tells.
+    wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
+    return np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+
+
+def _taken(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
+    """Which of the texels (M,), which so many frames show as ``samples`` (M,) says, are taken from
+    this frame: what becomes of a texel depends on nothing but its number."""
+    taken: Bool = samples <= _MOST_SAMPLES
+    many = np.flatnonzero(~taken)
+    chance = shifts_of(texel[many].astype(np.int64), 1, seed + frame)[:, 0]
+    taken[many] = chance * samples[many] < _MOST_SAMPLES
+    return taken
 
 
 def _seen_from(texels: Texels, which: Int, eye: Double) -> SurfacePoints:
