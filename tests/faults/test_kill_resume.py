@@ -34,8 +34,7 @@ usdbrdf.steps.trace._TILE = {TILE}
 from usdbrdf.cli import main
 sys.exit(main(sys.argv[1:]))
 """
-# 20 frames: texturing saves its state once, after the 16th.
-NUM_FRAMES, FIRST_UNSAVED = 20, 16
+NUM_FRAMES = 20
 # Enough for four objects and a lamp, and for pixels to fit to.
 OPTIONS = {
     "ingest": [],
@@ -200,8 +199,8 @@ def resumed(base, undisturbed, case, calls):
 
 
 def test_texturing_goes_on_after_the_last_saved_frame(resumed):
-    found = resumed("texture", "checkpoint:2")  # the first are the charts
-    assert found == {"radiance_from_frames": 1, "first frame": FIRST_UNSAVED}
+    found = resumed("texture", "checkpoint:2")  # the first are the charts; then the first frame
+    assert found == {"radiance_from_frames": 1, "first frame": 1}
 
 
 def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resumed):

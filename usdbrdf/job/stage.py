@@ -9,6 +9,7 @@ The stamp comes last. Hold ``folder_lock`` around it: nothing here expects compa
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import time
@@ -65,8 +66,9 @@ class StageRun:
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
         self._checkpoints = Checkpoints(folder / "checkpoints")
-        # When a running computation's state was saved last, and how long that took.
-        self._saved = time.monotonic(), 0.0
+        # When a running computation's state was saved last, and how long that took: the first is
+        # saved at once, which tells.
+        self._saved = -math.inf, 0.0
 
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
