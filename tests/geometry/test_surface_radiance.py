@@ -35,10 +35,11 @@ def test_a_linear_function_of_the_position_comes_back_on_a_flat_chart():
     expected = 2 + _positions(world, face, u, v) @ slope
     found = texture.at(face, u, v)
     # Half a texel from the border the texture is constant: clamped, not extrapolated.
-    corners = texture.corner_pixel[face]
+    corners = world.texels.corner_pixel[face]
+    size = world.texels.resolution[world.scene.face_object[face]]
     weights = np.stack([1 - u - v, u, v], axis=-1)
     pixel = (weights[:, :, None] * corners).sum(axis=1)
-    inner = ((pixel >= 0.5) & (pixel <= texture.size[face] - 0.5)).all(axis=1)
+    inner = ((pixel >= 0.5) & (pixel <= size - 0.5)).all(axis=1)
     assert inner.sum() > 2500
     # Texels on a triangle's edge may stand for a point some hundredths of a texel off it.
     np.testing.assert_allclose(found[inner], expected[inner], atol=2e-3)

@@ -35,11 +35,18 @@ _LINE = 64
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-def packed_arrays(pixels: Float, corner_pixel: Float, first_pixel: Long, size: Int) -> PackedArrays:
-    """What ``SurfaceTexture`` holds, laid out anew."""
+def packed_arrays(
+    values: Float, shown: Int, corner_pixel: Float, first_pixel: Long, size: Int
+) -> PackedArrays:
+    """The layout of ``values`` (T, 3), of which the atlases' pixels show ``shown`` (P,) (-1: none).
+
+    corner_pixel (F, 3, 2) float32: the faces' corners in pixels of their own atlas; first_pixel
+    (F,): where that starts; size (F, 2): its width and height
+    """
     # A row and a pixel more than there are, all 0: an atlas of one column or row has no neighbours.
-    padded = _zeros(len(pixels) + int(size[:, 0].max(initial=1)) + 2, 4)
-    padded[: len(pixels), :3] = pixels
+    pixels = _zeros(len(shown) + int(size[:, 0].max(initial=1)) + 2, 4)
+    pixels[: len(shown), :3] = values[np.maximum(shown, 0)]
+    pixels[: len(shown)][shown < 0] = 0
     faces = _zeros(len(size), 8)
     faces[:, 0:2] = corner_pixel[:, 0] - 0.5
     faces[:, 2:4] = corner_pixel[:, 1] - corner_pixel[:, 0]
@@ -47,7 +54,7 @@ def packed_arrays(pixels: Float, corner_pixel: Float, first_pixel: Long, size: I
     places = faces.view(np.int32)
     places[:, 6] = first_pixel
     places[:, 7] = size[:, 0] | size[:, 1] << 16
-    return padded, faces, places
+    return pixels, faces, places
 
 
 def _zeros(rows: int, columns: int) -> Float:
@@ -67,7 +74,8 @@ def unsigned(number: int) -> int:
 def packed_place(
     texture: PackedArrays, f: int, u: float, v: float
 ) -> tuple[int, int, float, float]:
-    """As ``surface_radiance.texture_place``, with the distance to the next row of pixels."""
+    """Where a texture is read at barycentric (u, v) of face f: the upper left of four pixels, the
+    distance to the next row of pixels, and how far the place is from its middle, in pixels."""
     _, faces, places = texture
     # Unsigned: the compiler need not think of places counted from the end.
     f = unsigned(f)

@@ -97,7 +97,7 @@ class IncomingLight:
         )
         draws = self.draws.sobol, scrambles, self.draws.seed, points.identity
         groups = self.lights.groups.arrays, points.row, *picks
-        radiance = self.radiance.packed
+        radiance = self.radiance.arrays
         for start, stop, block in _batches(samples, len(points.origin)):
             origins, directions = cosine_batch(points.origin, frames, draws, start, stop)
             hits = self.rays.closest(origins, directions)
