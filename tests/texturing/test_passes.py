@@ -10,9 +10,15 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.job.memory import GIB
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import passes
 from usdbrdf.texturing.passes import OF_TEXTURING, BytesPerTexel, groups_of_texels
+
+
+@pytest.fixture(autouse=True)
+def _small_process(monkeypatch):
+    monkeypatch.setattr(passes, "resident_bytes", lambda: 0)
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +66,11 @@ def test_the_maps_of_all_groups_must_fit_as_well(square: World):
             _groups(square, 0.9, need)
 
 
-def test_a_container_may_have_less_than_the_machine(tmp_path: Path, monkeypatch):
-    machine = passes._machine_gib()
-    monkeypatch.setattr(passes, "_CONTAINER", tmp_path / "memory.max")
-    for text, expected in (("max", machine), (str(1 << 29), 0.5)):
-        (tmp_path / "memory.max").write_text(text + "\n")
-        assert passes._machine_gib() == pytest.approx(expected, rel=0.5 if text == "max" else 1e-9)
+def test_what_the_process_holds_already_counts(square: World, monkeypatch):
+    need = OF_TEXTURING._replace(after=50)
+    assert len(_groups(square, 0.9, need)) == 1
+    monkeypatch.setattr(passes, "resident_bytes", lambda: int(0.72 * GIB))
+    assert len(_groups(square, 0.9, need)) == 2
 
 
 def test_too_little_memory_is_refused_with_what_is_needed(square: World):
@@ -74,8 +79,8 @@ def test_too_little_memory_is_refused_with_what_is_needed(square: World):
 
 
 def test_the_machines_memory_is_the_default(square: World, monkeypatch):
-    monkeypatch.setattr(passes, "_machine_gib", lambda: 1.2)
+    monkeypatch.setattr(passes, "machine_bytes", lambda: 1.2 * GIB)
     assert _groups(square, None) == _groups(square, 0.9)
-    monkeypatch.setattr(passes, "_machine_gib", lambda: 0.5)
+    monkeypatch.setattr(passes, "machine_bytes", lambda: 0.5 * GIB)
     with pytest.raises(EnvironmentFailure, match=r"limit is 0\.4"):
         _groups(square, None)

@@ -28,6 +28,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.documents import json_text
 from usdbrdf.job.checkpoints import Checkpoints
+from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.publishing import can_publish, publish_stage
 from usdbrdf.job.stamp import (
     Stamp,
@@ -175,6 +176,7 @@ def run_stage(
         fault_point(f"stage:{name}:before_publish")
         write_stamp(journal_path(asset, name), finished)
         publish_stage(asset, folder, finished, order)
+        give_back_freed()
         return StageResult(summary=summary, reran=True, reason=reason)
 
 

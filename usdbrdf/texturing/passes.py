@@ -3,11 +3,8 @@ frames. What a texel gets does not depend on its group."""
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +13,7 @@ import numpy.typing as npt
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels
+from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.radiance_from_frames import Observation
@@ -24,14 +22,12 @@ Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
 
-_GIB = 1 << 30
-_CONTAINER = Path("/sys/fs/cgroup/memory.max")
 # Without --memory this share of the machine's.
 _SHARE = 0.75
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
-_PROCESS = _GIB // 2
+_PROCESS = GIB // 2
 # A pass costs reading all frames: groups smaller than this are not worth it.
 _SMALLEST_GROUP = 250_000
 
@@ -112,9 +108,12 @@ def groups_of_texels(
 
     Raises EnvironmentFailure where not even the smallest groups do.
     """
-    limit = (memory or _SHARE * _machine_gib()) * _GIB
+    limit = memory * GIB if memory else _SHARE * machine_bytes()
     held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
-    held += _PER_PIXEL * int(frames.resolution.prod(axis=1).max()) + need.always * len(texels)
+    held += need.always * len(texels)
+    # Whoever called may hold more, and an allocator keeps some of what was freed.
+    give_back_freed()
+    held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
     after = held + need.after * len(texels)
     held += need.result * len(texels)
     smallest = min(len(texels), _SMALLEST_GROUP)
@@ -122,7 +121,7 @@ def groups_of_texels(
     if needed > limit:
         raise EnvironmentFailure(
             f"{len(texels):,} texels and {len(scene.triangles):,} triangles need "
-            f"{needed / _GIB:.1f} GiB, the limit is {limit / _GIB:.1f}. Allow more with --memory, "
+            f"{needed / GIB:.1f} GiB, the limit is {limit / GIB:.1f}. Allow more with --memory, "
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
         )
     most = max(smallest, int((limit - held) / need.grouped), 1)
@@ -133,11 +132,3 @@ def groups_of_texels(
 
 def _bytes(table: Scene | Texels) -> int:
     return sum(a.nbytes for a in vars(table).values() if isinstance(a, np.ndarray))
-
-
-def _machine_gib() -> float:
-    """The machine's memory, or less where a container may have less."""
-    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with suppress(OSError, ValueError):  # no such file, or "max"
-        machine = min(machine, int(_CONTAINER.read_text()))
-    return machine / _GIB
