@@ -383,6 +383,15 @@ def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, mon
     assert _contents(thrice.folder) == _contents(fitted.folder)
 
 
+def test_too_little_memory_is_no_reason_to_stop_at_the_end(room: Room, fitted: Asset, capsys):
+    set_quiet(False)
+    narrow = _fitted(room, "narrow", usdbrdf.FitOptions(memory=0.01))
+    set_quiet(True)
+    assert "warning: " in (said := capsys.readouterr().err)
+    assert "the limit is 0.0" in said
+    assert _contents(narrow.folder) == _contents(fitted.folder)
+
+
 def test_of_texels_that_many_frames_see_some_samples_are_enough():
     texel = np.arange(40_000, dtype=np.int32)
     samples = np.repeat(np.float32([5, 24, 48, 96]), 10_000)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageRun
@@ -25,7 +26,7 @@ from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing.footprints import footprints, widest
 from usdbrdf.texturing.inpaint import inpaint
-from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, smallest_groups
 from usdbrdf.texturing.radiance_from_frames import samples_from_frames, spread_order
 from usdbrdf.texturing.restore import restored
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
@@ -127,7 +128,11 @@ def _without_lobes(
     memory asks for."""
     textures = _bytes_of(lit) // len(atlas.texels)
     need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
-    groups = groups_of_texels(atlas.texels, atlas.scene, frames, memory, need)
+    try:
+        groups = groups_of_texels(atlas.texels, atlas.scene, frames, memory, need)
+    except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
+        say(f"warning: {short}")
+        groups = smallest_groups(atlas.texels)
     if len(groups) > 1:
         say(f"fit: {len(groups)} passes over the frames, for lack of memory")
     samples = atlas.map("samples")[:, 0]

@@ -124,9 +124,18 @@ def groups_of_texels(
             f"{needed / GIB:.1f} GiB, the limit is {limit / GIB:.1f}. Allow more with --memory, "
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
         )
-    most = max(smallest, int((limit - held) / need.grouped), 1)
-    count = -(-len(texels) // most)
-    ends = [k * len(texels) // count for k in range(count + 1)]
+    return _groups(len(texels), max(smallest, int((limit - held) / need.grouped), 1))
+
+
+def smallest_groups(texels: Texels) -> list[slice]:
+    """For whom too little memory is no reason to stop."""
+    return _groups(len(texels), _SMALLEST_GROUP)
+
+
+def _groups(count: int, most: int) -> list[slice]:
+    """Consecutive ranges of nearly equal length, none longer than ``most``."""
+    number = -(-count // most)
+    ends = [k * count // number for k in range(number + 1)]
     return [slice(low, high) for low, high in pairwise(ends)]
 
 
