@@ -78,6 +78,7 @@ def refined_maps(
     emissive: Bool = np.any(emission > 0, axis=1)
     known = measured & ~emissive
     diffuse = np.where(emissive[:, None], emission, _restored(texels, observed, known, level))
+    del observed  # several times as large as a map
     # What clips in every frame is at least as bright as that.
     coverage = atlas.map("coverage")
     clipped = coverage == CLIPPED
