@@ -28,7 +28,7 @@ def resident_bytes() -> int:
 
 
 def give_back_freed() -> None:
-    """Freed memory goes back to the system, which glibc would keep for later: after a million texels
-    were textured two fifths of all that the process held."""
+    """Freed memory goes back to the system, which glibc would keep for later: after texturing a
+    million texels two fifths of all that the process held."""
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
