@@ -40,6 +40,7 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.shading.incoming_light import whole_patches
 from usdbrdf.shading.irradiance import Sampling, patches_of_texels
 
 THREADS = os.cpu_count() or 1
@@ -100,11 +101,9 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
 
 def spread(order: np.ndarray, patch: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """About ``count`` texels of the whole scene: RUNS runs of whole patches, evenly spaced."""
-    starts = np.flatnonzero(np.diff(patch, prepend=-1))
-    last = max(len(order) - count // RUNS, 1)
-    firsts = starts[np.searchsorted(starts, np.linspace(0, last, RUNS + 1)[:-1].astype(int))]
-    runs = [np.arange(first, min(first + count // RUNS, len(order))) for first in firsts]
-    kept = np.unique(np.concatenate(runs))
+    parts = whole_patches(patch, count // RUNS)
+    evenly = np.linspace(0, len(parts), RUNS, endpoint=False).astype(int)
+    kept = np.concatenate([np.arange(len(patch))[parts[k]] for k in np.unique(evenly)])
     return order[kept], patch[kept]
 
 

@@ -88,11 +88,11 @@ def _change(
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED)
     order, patch = patches_of_texels(texels)
 
-    def tile(first: int, last: int) -> dict[str, npt.NDArray[Any]]:
-        index = order[first:last]
+    def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
+        index = order[part]
         position, normal = texels.position[index], texels.normal[index]
         diffuse = irradiance_at(
-            lit.rays, texture, lights, black_environment(), position, normal, patch[first:last],
+            lit.rays, texture, lights, black_environment(), position, normal, patch[part],
             sampling, lit.size,
         )  # fmt: skip
         specular = specular_irradiance(
@@ -101,10 +101,10 @@ def _change(
         )  # fmt: skip
         return {"change": diffuse.mean + specular}
 
-    tiles = list(tiles_of_patches(patch))
+    tiles = tiles_of_patches(patch)
     changes = [
-        run.checkpoint(f"refined-{number}", partial(tile, first, last))["change"]
-        for number, (first, last) in enumerate(
+        run.checkpoint(f"refined-{number}", partial(tile, part))["change"]
+        for number, part in enumerate(
             progress(tiles, total=len(tiles), label="fit: shade", unit="tiles")
         )
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -16,6 +15,7 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageRun
 from usdbrdf.shading.denoise import denoise_lightmap
 from usdbrdf.shading.environment import Environment
+from usdbrdf.shading.incoming_light import whole_patches
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 from usdbrdf.shading.lights import lights_from_radiance
 from usdbrdf.steps.atlas import Atlas
@@ -44,37 +44,29 @@ def trace_irradiance(
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
     order, patch = patches_of_texels(texels)
-    tiles = list(tiles_of_patches(patch))
+    tiles = tiles_of_patches(patch)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
-    def tile(first: int, last: int) -> dict[str, npt.NDArray[Any]]:
-        index = order[first:last]
+    def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
+        index = order[part]
         found = irradiance_at(
             rays, radiance, lights, environment, texels.position[index], texels.normal[index],
-            patch[first:last], sampling, size, dark[index],
+            patch[part], sampling, size, dark[index],
         )  # fmt: skip
         return dict(vars(found))
 
     parts: dict[str, list[npt.NDArray[Any]]] = {}
-    for number, (first, last) in enumerate(
-        progress(tiles, total=len(tiles), label="shade", unit="tiles")
-    ):
-        done = run.checkpoint(f"tile-{number}", partial(tile, first, last))
+    for number, part in enumerate(progress(tiles, total=len(tiles), label="shade", unit="tiles")):
+        done = run.checkpoint(f"tile-{number}", partial(tile, part))
         for name, values in done.items():
             parts.setdefault(name, []).append(values)
     back = np.argsort(order)
     return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
 
 
-def tiles_of_patches(patch: npt.NDArray[np.int32]) -> Iterator[tuple[int, int]]:
+def tiles_of_patches(patch: npt.NDArray[np.int32]) -> list[slice]:
     """Ranges of about _TILE texels that do not cut a patch."""
-    starts = np.flatnonzero(np.diff(patch, prepend=-1))
-    first = 0
-    while first < len(patch):
-        after = np.searchsorted(starts, first + _TILE)
-        last = int(starts[after]) if after < len(starts) else len(patch)
-        yield first, last
-        first = last
+    return whole_patches(patch, _TILE)
 
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
