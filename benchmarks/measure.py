@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from usdbrdf.geometry.rays import RayScene
 from usdbrdf.material.lit_scene import LitScene
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.stage.asset import Asset
@@ -89,23 +88,6 @@ class Lit(NamedTuple):
 def lit_asset(folder: Path) -> Lit:
     atlas = atlas_from_stage(open_measured(Asset.at(folder)))
     return Lit(atlas, lit_scene(atlas, black_environment()))
-
-
-class RecordedRays:
-    """A RayScene that keeps all rays that it was given: (origins, directions, None or distances)
-    of every call, in their order."""
-
-    def __init__(self, rays: RayScene) -> None:
-        self.rays = rays
-        self.calls: list[tuple[Any, Any, Any]] = []
-
-    def closest(self, origins: Any, directions: Any) -> Any:
-        self.calls.append((origins, directions, None))
-        return self.rays.closest(origins, directions)
-
-    def occluded(self, origins: Any, directions: Any, distances: Any) -> Any:
-        self.calls.append((origins, directions, distances))
-        return self.rays.occluded(origins, directions, distances)
 
 
 def saved_plot(drawing: Any, path: Path) -> Path:

@@ -6,7 +6,7 @@ ASSET was shaded. Measured are
 
     throughput  rays per second of the whole estimator (make rays, trace them, add up) over those of
                 embreex when it is called with the very same rays in the same order and nothing else
-    order       embreex with rays in our order, one sample's rays after the other's over patches of
+    order       rays traced in our order, one sample's rays after the other's over patches of
                 8 x 8 texels, against the same rays in random order
     noise       relative RMSE of S against a converged one for 10,000 independent cosine-distributed
                 rays (the paper's) and for ours with and without the lightmap filter; rays and time
@@ -22,13 +22,15 @@ import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+from unittest import mock
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from irradiance_noise import Sizes, bias, noise, shaded
 from measure import (
     Lit,
-    RecordedRays,
     figure,
     lit_asset,
     median,
@@ -40,8 +42,16 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.geometry.packed_texture import AHEAD
+from usdbrdf.geometry.rays import RayScene
+from usdbrdf.shading import incoming_light
 from usdbrdf.shading.incoming_light import whole_patches
 from usdbrdf.shading.irradiance import Sampling, patches_of_texels
+from usdbrdf.shading.light_by_direction import cosine_directions, frames_of
+from usdbrdf.shading.light_by_picks import empty_room, empty_segments, light_segments, turns
+
+# Origins, directions (R, 3); distances (R,) of rays to lights, None for first hits.
+Call: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 THREADS = os.cpu_count() or 1
 # Places of the scene that throughput is measured at.
@@ -77,16 +87,14 @@ def measure(asset: Path, quick: bool) -> dict[str, Any]:
 def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     order, patch = spread(*patches_of_texels(lit.atlas.texels), sizes.traced)
     sampling = Sampling(standard_error=0, max_rays=64, seed=1)
-    recorded = RecordedRays(lit.scene.rays)
-    shaded(lit, order, patch, sampling, recorded)
-    calls = recorded.calls
+    calls, scene = rays_of(lit, order, patch, sampling), embreex_scene(lit.scene.rays)
     ours, embree = side_by_side(
-        [lambda: shaded(lit, order, patch, sampling), lambda: embreex(lit, calls)], sizes.turns
+        [lambda: shaded(lit, order, patch, sampling), lambda: embreex(scene, calls)], sizes.turns
     )
     first_hits = [call for call in calls if call[2] is None]
     mixed = in_random_order(first_hits)
     patches, random = side_by_side(
-        [lambda: embreex(lit, first_hits), lambda: embreex(lit, mixed)], sizes.turns
+        [lambda: traced(lit, first_hits), lambda: traced(lit, mixed)], sizes.turns
     )
     rays = sum(len(call[0]) for call in calls)
     per_ray = {name: median(times) / rays for name, times in (("ours", ours), ("embreex", embree))}
@@ -107,22 +115,68 @@ def spread(order: np.ndarray, patch: np.ndarray, count: int) -> tuple[np.ndarray
     return order[kept], patch[kept]
 
 
-def embreex(lit: Lit, calls: list[tuple[Any, Any, Any]]) -> None:
-    """Nothing but Embree's answers, by as many threads as the estimator has."""
-    trace = lit.scene.rays._scene.run
+def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) -> list[Call]:
+    """All rays that the estimator traces, in its order: a call for each of its loops' calls."""
+    calls: list[Call] = []
 
-    def one(call: tuple[Any, Any, Any]) -> None:
+    def by_direction(*arguments: Any) -> None:
+        origin, normal, draws, start, block = arguments[4:9]
+        frames, room, found = frames_of(normal), np.empty((3, AHEAD), np.float32), []
+        for first, sample in turns(len(origin), len(block)):
+            origins = origin[first : first + AHEAD]
+            directions = np.empty_like(origins)
+            cosine_directions(frames, draws, start + sample, first, directions, room)
+            found.append((origins, directions))
+        origins, directions = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        calls.append((origins, directions, None))
+
+    def by_picks(*arguments: Any) -> None:
+        picks, origin, normal, draws, start, block = arguments[2:8]
+        room, segments, found = empty_room(), empty_segments(), []
+        for first, sample in turns(len(origin), len(block)):
+            last = min(first + AHEAD, len(origin))
+            count = light_segments(
+                picks, origin, normal, draws, start + sample, first, last, room, segments
+            )
+            found.append((origin[segments[0][:count]], segments[-1][:count].copy()))
+        origins, ways = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        calls.append((origins, ways, np.full(len(ways), 0.9999, np.float32)))
+
+    instead = {"add_light_by_direction": by_direction, "add_light_by_picks": by_picks}
+    with mock.patch.multiple(incoming_light, **instead):
+        shaded(lit, order, patch, sampling)
+    return [call for call in calls if len(call[0])]
+
+
+def embreex_scene(rays: RayScene) -> EmbreeScene:
+    scene = EmbreeScene(robust=True)
+    TriangleMesh(scene, rays.points, rays.triangles)
+    # Embree commits within the first query, which is not safe from two threads at once.
+    scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+    return scene
+
+
+def embreex(scene: EmbreeScene, calls: list[Call]) -> None:
+    """Nothing but embreex's answers, by as many threads as the estimator has."""
+
+    def one(call: Call) -> None:
         origins, directions, distances = call
         if distances is None:
-            trace(origins, directions, output=True)
+            scene.run(origins, directions, output=True)
         else:
-            trace(origins, directions, dists=distances, query="OCCLUDED")
+            scene.run(origins, directions, dists=distances, query="OCCLUDED")
 
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         list(pool.map(one, calls))
 
 
-def in_random_order(calls: list[tuple[Any, Any, Any]]) -> list[tuple[Any, Any, Any]]:
+def traced(lit: Lit, calls: list[Call]) -> None:
+    """First hits alone, as the estimator traces them."""
+    with ThreadPoolExecutor(max_workers=THREADS) as pool:
+        list(pool.map(lambda call: lit.scene.rays.closest(*call[:2]), calls))
+
+
+def in_random_order(calls: list[Call]) -> list[Call]:
     """The same rays, in as many calls."""
     origins, directions = (np.concatenate(parts) for parts in list(zip(*calls, strict=True))[:2])
     order = np.random.default_rng(0).permutation(len(origins))

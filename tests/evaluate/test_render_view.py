@@ -33,10 +33,8 @@ def test_the_baseline_is_the_radiance_of_what_lies_behind_each_pixel(room, seen)
     y = LENS[3] - LENS[1] * local[:, 1] / -local[:, 2]
     inside = (local[:, 2] < 0) & (x > 0) & (x < SIZE[0]) & (y > 0) & (y < SIZE[1])
     towards = (POSE[:3, 3] - centres).astype(np.float32)
-    length = np.linalg.norm(towards, axis=1).astype(np.float32)
-    free = ~seen.lit.rays.occluded(
-        (centres + 1e-3 * towards).astype(np.float32), towards / length[:, None], length * 0.99
-    )
+    start = (centres + 1e-3 * towards).astype(np.float32)
+    free = seen.lit.rays.closest(start, towards).distance > 0.99
     checked = np.flatnonzero(inside & free)
     shown = fine.baseline[y[checked].astype(int), x[checked].astype(int)]
     close = np.abs(shown - table[scene.face_object[checked]]).max(axis=1) < 0.01

@@ -7,6 +7,8 @@ import pytest
 
 from tests.physics.surfaces import World, box, quad, room, sphere, world_of
 from usdbrdf.errors import UsdBrdfError
+from usdbrdf.geometry import rays as rays_module
+from usdbrdf.geometry.embree import occlusion
 from usdbrdf.geometry.rays import RayScene, lift_from_surface
 
 
@@ -47,7 +49,9 @@ def test_occlusion_ends_where_it_is_told(triangle: RayScene):
     # The triangle is at distance 3; anything up to 2.99 is free, 3.01 is not.
     origins = _f32(*[(0.5, 0.25, 3)] * 3)
     directions = _f32((0, 0, -1), (0, 0, -1), (0, 0, 1))
-    blocked = triangle.occluded(origins, directions, np.array([2.99, 3.01, 100], np.float32))
+    blocked = [
+        _blocked(triangle, origins, directions, d)[k] for k, d in enumerate((2.99, 3.01, 100))
+    ]
     np.testing.assert_array_equal(blocked, [False, True, False])
 
 
@@ -63,9 +67,35 @@ def test_many_rays_give_the_same_as_few():
     some = world.rays.closest(origins[part], directions[part])
     np.testing.assert_array_equal(whole.face[part], some.face)
     np.testing.assert_array_equal(whole.distance[part], some.distance)
-    blocked = world.rays.occluded(origins, directions, whole.distance * np.float32(0.999))
-    assert not blocked.any()
-    assert world.rays.occluded(origins, directions, whole.distance * np.float32(1.001)).all()
+    way = directions * whole.distance[:, None]
+    assert not _blocked(world.rays, origins, way, 0.999).any()
+    assert _blocked(world.rays, origins, way, 1.001).all()
+
+
+def _blocked(rays: RayScene, origins: np.ndarray, directions: np.ndarray, far: float) -> np.ndarray:
+    blocked = np.empty(len(origins), np.bool_)
+    start = np.arange(len(origins), dtype=np.int32)
+    occlusion(rays.address, origins, start, directions, far, blocked)
+    return blocked
+
+
+def test_origins_are_taken_in_turns(triangle: RayScene, monkeypatch: pytest.MonkeyPatch):
+    origins = _f32((0.5, 0.25, 3), (5, 5, 3), (0.5, 0.25, 1))
+    down = np.tile(_f32((0, 0, -1)), (12, 1))
+    for chunk in (1 << 16, 4):
+        monkeypatch.setattr(rays_module, "_CHUNK", chunk)
+        hits = triangle.closest(origins, down)
+        np.testing.assert_array_equal(hits.face, [0, -1, 0] * 4)
+        np.testing.assert_allclose(hits.distance[hits.face == 0], [3, 1] * 4, rtol=1e-6)
+
+
+def test_no_ray_leaves_a_closed_room_far_from_the_origin():
+    # Through edges and corners of many triangles, where float32 steps by 6e-5 m.
+    at = np.array([1e3, -1e3, 1e3])
+    world = world_of([sphere(at, 2, 48, 96, (96, 48))])
+    rng = np.random.default_rng(5)
+    directions = rng.standard_normal((200_000, 3)).astype(np.float32)
+    assert (world.rays.closest(at[None].astype(np.float32), directions).face >= 0).all()
 
 
 @pytest.mark.parametrize(

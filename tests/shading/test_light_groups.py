@@ -10,7 +10,7 @@ from tests.physics.surfaces import World, box, room, world_of
 from usdbrdf.shading import incoming_light
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.light_batches import pick_triangles
+from usdbrdf.shading.light_by_picks import pick_triangles
 from usdbrdf.shading.light_groups import LightGroups, light_groups, weighed_groups
 from usdbrdf.shading.lights import Lights
 
@@ -45,7 +45,8 @@ def test_every_triangle_has_one_group_whose_bounds_hold_it(count: int):
     lights = _soup(count)
     groups = light_groups(*lights.arrays)
     np.testing.assert_array_equal(np.sort(groups.face), lights.face)
-    of = groups.of_face[groups.face]
+    np.testing.assert_array_equal(groups.of_face[groups.face], np.arange(count))
+    of = groups.triangles[:, 13].astype(int)
     assert (np.diff(of) >= 0).all()
     assert of.max() + 1 == groups.bounds.shape[1] <= 512
     far = np.linalg.norm(lights.corners[groups.face] - groups.bounds[:3, of].T[:, None], axis=-1)
@@ -63,7 +64,7 @@ def test_densities_of_a_patch_integrate_to_one():
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(*edges), axis=1) / 2
     for q in range(2):
-        density = lights.density * ratio[q, groups.of_face]
+        density = lights.density * ratio[q, groups.triangles[groups.of_face, 13].astype(int)]
         assert (density * area).sum() == pytest.approx(1, abs=1e-5)
         assert density.min() >= 0.099 * lights.density.min()  # none is left out
     assert np.abs(ratio[0] - ratio[1]).max() > 1  # the two patches favour different lights
@@ -81,9 +82,9 @@ def test_picks_follow_the_density_and_leave_a_uniform_number():
     picks = groups.arrays, patch, cumulative, guide, ratio
     pick_triangles(picks, 0, 0, even, chosen, favour, left)
     power = np.diff(groups.cumulative, prepend=0)
-    expected = power * ratio[0, groups.of_face[groups.face]]
+    expected = power * ratio[0, groups.triangles[:, 13].astype(int)]
     np.testing.assert_allclose(np.bincount(chosen, minlength=300) / count, expected, atol=3e-5)
-    np.testing.assert_array_equal(favour, ratio[0, groups.of_face[groups.face[chosen]]])
+    np.testing.assert_array_equal(favour, ratio[0, groups.triangles[chosen, 13].astype(int)])
     assert left.min() >= 0
     assert left.max() < 1
     np.testing.assert_allclose(np.histogram(left, 8, (0, 1))[0] / count, 1 / 8, atol=5e-3)

@@ -15,6 +15,7 @@ from usdbrdf.geometry.prefetch import prefetch
 from usdbrdf.kernel import loop
 
 Float = npt.NDArray[np.float32]
+Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint32]
 Long = npt.NDArray[np.int64]
@@ -137,3 +138,21 @@ def colour_looked_at(texture: PackedArrays, looks: Looks, i: int) -> tuple[float
     """``packed_colour`` at the i-th of ``looks``."""
     place, width, fx, fy = looks
     return packed_colour(texture, place[i], width[i], fx[i], fy[i])
+
+
+@loop
+def add_looked_at(
+    texture: PackedArrays, looks: Looks, i: int, weight: float, total: Double, k: int
+) -> None:
+    """total[k] += weight times what is found at the i-th of ``looks``; total (P, 4), whose last
+    column is nothing but what makes a row as wide as the processor's numbers."""
+    place, width, fx, fy = looks
+    p, left = texture[0], place[i]
+    right, low = unsigned(left + 1), unsigned(left + width[i])
+    low_right = unsigned(low + 1)
+    x, y = weight * fx[i], fy[i]
+    rest = weight - x
+    gy = _ONE - y
+    a, b, c, d = rest * gy, x * gy, rest * y, x * y
+    for n in range(4):
+        total[k, n] += a * p[left, n] + b * p[right, n] + c * p[low, n] + d * p[low_right, n]

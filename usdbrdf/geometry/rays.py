@@ -1,4 +1,4 @@
-"""Embree: closest hits and occlusion over the triangle soup. The only importer of embreex."""
+"""Closest hits over the triangle soup."""
 
 from __future__ import annotations
 
@@ -7,21 +7,17 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from usdbrdf.errors import UsdBrdfError
+from usdbrdf.geometry.embree import EmbreeScene, closest_hits
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
 
-# embreex traces one ray at a time and releases the GIL: chunks this long keep every core busy
-# while the Python overhead of a call stays far below a per cent.
+# Rays are traced one at a time without Python's lock: chunks this long keep every core busy.
 _CHUNK = 1 << 16
 BOX_FACES = 64
 
@@ -56,13 +52,9 @@ class RayScene:
             raise UsdBrdfError("a ray scene needs at least one triangle")
         if triangles.min() < 0 or triangles.max() >= len(points) or not np.isfinite(points).all():
             raise UsdBrdfError("a ray scene got a face index out of range or a non-finite vertex")
-        self.points: Float = np.ascontiguousarray(points, np.float32)
-        self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
-        self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, self.points, self.triangles)
+        self._scene = EmbreeScene(points, triangles)
+        self.points, self.triangles = self._scene.points, self._scene.triangles
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
-        # Embree commits lazily inside the first query, which is not safe from two threads at once.
-        self.closest(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
 
     @cached_property
     def boxes(self) -> Float:
@@ -76,37 +68,32 @@ class RayScene:
             high = np.maximum(high, np.maximum.reduceat(at, first))
         return np.stack([low, high], axis=1)
 
+    @property
+    def address(self) -> int:
+        """What the compiled loops of ``embree`` know the scene by, as long as this object lives."""
+        return self._scene.address
+
     def closest(self, origins: Float, directions: Float) -> Hits:
-        """First hit of each ray; origins and directions (R, 3) float32 in the world frame."""
-        if len(origins) <= _CHUNK:
-            found = self._scene.run(origins, directions, output=True)
-            return Hits(face=found["primID"], u=found["u"], v=found["v"], distance=found["tfar"])
-        face = np.full(len(origins), -1, np.int32)
-        u, v, distance = (np.zeros(len(origins), np.float32) for _ in range(3))
+        """First hit of R rays: directions (R, 3), origins (R, 3) or (P, 3), ray r from r % P, all
+        float32 in the world frame."""
+        count = len(directions)
+        face, (u, v, distance) = np.empty(count, np.int32), np.empty((3, count), np.float32)
+
+        in_turn = len(origins) < count
 
         def trace(part: slice) -> None:
-            found: dict[str, Any] = self._scene.run(origins[part], directions[part], output=True)
-            face[part] = found["primID"]
-            u[part], v[part], distance[part] = found["u"], found["v"], found["tfar"]
+            closest_hits(
+                self._scene.address, origins if in_turn else origins[part], directions[part],
+                face[part], u[part], v[part], distance[part],
+            )  # fmt: skip
 
-        self._in_chunks(len(origins), trace)
+        self._in_chunks(count, len(origins) if in_turn else 1, trace)
         return Hits(face=face, u=u, v=v, distance=distance)
 
-    def occluded(self, origins: Float, directions: Float, distances: Float) -> Bool:
-        """True where anything lies between 0 and ``distances`` along each ray, (R,) bool."""
-        blocked = np.zeros(len(origins), np.bool_)
-
-        def trace(part: slice) -> None:
-            found = self._scene.run(
-                origins[part], directions[part], dists=distances[part], query="OCCLUDED"
-            )
-            blocked[part] = found >= 0
-
-        self._in_chunks(len(origins), trace)
-        return blocked
-
-    def _in_chunks(self, count: int, trace: Callable[[slice], None]) -> None:
-        parts = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
+    def _in_chunks(self, count: int, whole: int, trace: Callable[[slice], None]) -> None:
+        """Rays 0 to count in parts of a multiple of ``whole``."""
+        step = max(1, _CHUNK // whole) * whole
+        parts = [slice(start, min(start + step, count)) for start in range(0, count, step)]
         if len(parts) == 1:
             trace(parts[0])
         else:

@@ -1,8 +1,8 @@
-"""The light that arrives at points: both techniques' rays, made, traced and added up."""
+"""The light that arrives at points, by both techniques; its mean and error."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
+from usdbrdf.kernel import loop
 from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.irradiance_batches import add_cosine_batch, cosine_batch, frames_of
-from usdbrdf.shading.light_batches import add_light_batch, light_batch
+from usdbrdf.shading.light_by_direction import add_light_by_direction
+from usdbrdf.shading.light_by_picks import add_light_by_picks
 from usdbrdf.shading.light_groups import weighed_groups
 from usdbrdf.shading.lights import Lights
 from usdbrdf.shading.patch_draws import PatchDraws, scrambles_of_points
@@ -26,13 +27,10 @@ Short = npt.NDArray[np.int16]
 Long = npt.NDArray[np.int64]
 
 # Cumulative chances of the groups of lights, guides to these and ratios, a row for each patch, as
-# in ``light_batches.PickArrays``.
+# in ``light_by_picks.PickArrays``.
 Picks: TypeAlias = tuple[Double, Short, Float]
 
 BLOCKS = 4
-# Points whose patches' tables of lights stay in the cache of a core together, and rays that are
-# made, traced and added up at a time: enough to make the calls cheap, few enough for the cache.
-_LIGHT_POINTS, _BATCH = 1 << 10, 1 << 14
 
 
 class Points(NamedTuple):
@@ -91,39 +89,21 @@ class IncomingLight:
     ) -> None:
         """Trace samples first to last of each point and add them to sums (2, 4, P, 3), one for each
         technique, and escaped (P,)."""
-        frames = frames_of(points.normal)
         scrambles = scrambles_of_points(
             points.patch, points.stratum, points.identity, self.draws.seed, self.draws.shared
         )
         draws = self.draws.sobol, scrambles, self.draws.seed, points.identity
         groups = self.lights.groups.arrays, points.row, *picks
-        radiance = self.radiance.arrays
-        for start, stop, block in _batches(samples, len(points.origin)):
-            origins, directions = cosine_batch(points.origin, frames, draws, start, stop)
-            hits = self.rays.closest(origins, directions)
-            add_cosine_batch(
-                radiance, self.environment.arrays, self.lights.arrays, groups, points.normal,
-                directions, (hits.face, hits.u, hits.v, hits.distance), block, sums[0], escaped,
-            )  # fmt: skip
-        if self.techniques == 1:
-            return
-        for part in whole_patches(points.patch, _LIGHT_POINTS):
-            for start, stop, block in _batches(samples, part.stop - part.start):
-                *segments, lit = light_batch(
-                    groups, points.origin, points.normal, draws, (part.start, part.stop),
-                    start, stop,
-                )  # fmt: skip
-                blocked = self.rays.occluded(*segments)
-                add_light_batch(radiance, lit, blocked, block, sums[1])
-
-
-def _batches(samples: tuple[int, int], points: int) -> Iterator[tuple[int, int, Long]]:
-    """First and last sample of batches of about _BATCH rays, and their samples' blocks."""
-    first, last = samples
-    step = max(1, _BATCH // points)
-    for start in range(first, last, step):
-        stop = min(start + step, last)
-        yield start, stop, _block_of(np.arange(start, stop), first, last)
+        radiance, scene = self.radiance.arrays, self.rays.address
+        start, block = samples[0], _block_of(np.arange(*samples), *samples)
+        add_light_by_direction(
+            scene, radiance, self.environment.arrays, groups, points.origin, points.normal, draws,
+            start, block, sums[0], escaped,
+        )  # fmt: skip
+        if self.techniques == 2:
+            add_light_by_picks(
+                scene, radiance, groups, points.origin, points.normal, draws, start, block, sums[1]
+            )
 
 
 def _block_of(sample: Long, first: int, last: int) -> Long:
@@ -132,3 +112,22 @@ def _block_of(sample: Long, first: int, last: int) -> Long:
     if first == 0:
         return sample * BLOCKS // last
     return 2 + (sample - first) * 2 // (last - first)
+
+
+@loop
+def mean_and_error(sums: Double, samples: int) -> tuple[Double, Double]:
+    """Mean of ``samples`` in all, and its standard error from the four blocks, (P, 3) each; sums
+    (2, 4, P, 3), one for each technique."""
+    count = sums.shape[2]
+    mean, error = np.empty((count, 3)), np.empty((count, 3))
+    block = np.empty(4)
+    for k in range(count):
+        for c in range(3):
+            for b in range(4):
+                block[b] = (sums[0, b, k, c] + sums[1, b, k, c]) * (4 / samples)
+            centre = (block[0] + block[1] + block[2] + block[3]) / 4
+            square = 0.0
+            for b in range(4):
+                square += (block[b] - centre) ** 2
+            mean[k, c], error[k, c] = centre, math.sqrt(square / 12)
+    return mean, error

@@ -30,8 +30,13 @@ from usdbrdf.geometry.rays import RayScene, lift_from_surface
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.shading.environment import Environment
-from usdbrdf.shading.incoming_light import BLOCKS, IncomingLight, Points, whole_patches
-from usdbrdf.shading.irradiance_batches import mean_and_error
+from usdbrdf.shading.incoming_light import (
+    BLOCKS,
+    IncomingLight,
+    Points,
+    mean_and_error,
+    whole_patches,
+)
 from usdbrdf.shading.lights import Lights
 from usdbrdf.shading.patch_draws import (
     STRATA,
@@ -161,7 +166,7 @@ def _irradiance_of(
     count = len(points.origin)
     mean, error = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    sums, escaped = np.zeros((2, BLOCKS, count, 3)), np.zeros(count)
+    sums, escaped = np.zeros((2, BLOCKS, count, 4)), np.zeros(count)
     active: Any = slice(None)
     picks = light.picks(points)
     for first, last in rounds:

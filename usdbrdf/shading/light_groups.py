@@ -54,10 +54,10 @@ class LightGroups:
     cumulative  (K,) float64, probability of picking one of the first k, by power
     guide       (8 K,) int32, ``cumulative`` at even steps, so that picking is a look-up
     start       (G + 1,) float64, ``cumulative`` where each group starts and the last ends
-    of_face     (F,) int32, group of each triangle of the scene that is a light
+    of_face     (F,) int32, each triangle's place among the lights, -1 where it is none
     bounds      (8, G) float32: centre, mean normal, radius, spread of the normals
     triangles   (K, 16) float32: first corner, edges to the others, normal, density per m^2 when
-                picked by power; what is read together lies together
+                picked by power, group; what is read together lies together
     is_light    (F / 8,) uint8, a bit for each triangle of the scene, the lowest first: few enough
                 to stay in the cache
     """
@@ -94,8 +94,8 @@ def light_groups(
     order = np.concatenate(parts) if parts else np.zeros(0, np.int64)
     cumulative = np.cumsum(power[order])
     ends = np.cumsum([0, *[len(part) for part in parts]])
-    of_face = np.zeros(len(density), np.int32)
-    of_face[face[order]] = np.repeat(np.arange(len(parts)), np.diff(ends))
+    of_face = np.full(len(density), -1, np.int32)
+    of_face[face[order]] = np.arange(len(order))
     # Several steps per light: picking then seldom has to look further.
     steps = np.linspace(0, 1, 8 * len(order), endpoint=False)
     triangles = np.zeros((len(order), 16), np.float32)
@@ -104,6 +104,7 @@ def light_groups(
     triangles[:, 6:9] = corners[order, 2] - corners[order, 0]
     triangles[:, 9:12] = normals[order]
     triangles[:, 12] = density[face[order]]
+    triangles[:, 13] = np.repeat(np.arange(len(parts)), np.diff(ends))
     return LightGroups(
         face=face[order],
         cumulative=cumulative,

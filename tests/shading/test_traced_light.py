@@ -1,4 +1,4 @@
-"""The estimator's loops do what the warps and NumPy say, whatever the sizes of their batches."""
+"""The estimator's loops do what the warps and NumPy say, whatever is traced at a time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.shading import incoming_light, irradiance
+from usdbrdf.shading import irradiance
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 from usdbrdf.shading.light_groups import picked
@@ -52,21 +52,21 @@ def test_picking_is_a_search(lights: int):
 
 
 @pytest.mark.parametrize("estimator", ["mis", "cosine"])
-def test_batches_and_tasks_do_not_matter(monkeypatch: pytest.MonkeyPatch, estimator: str):
+def test_how_many_points_a_thread_takes_does_not_matter(
+    monkeypatch: pytest.MonkeyPatch, estimator: str
+):
     world = world_of(room((0, 0, 0), (2, 2, 2)) + box((0.8, 0.8, 1.5), (1.2, 1.2, 1.7)))
     lit = np.full((len(world.texels), 3), 0.1, np.float32)
     lit[world.texels.object_index() > 5] = 8
     assert len(world.lights(lit).face)
     sampling = Sampling(estimator=estimator, standard_error=0.05, max_rays=256)
 
-    def found(points: int, batch: int) -> Irradiance:
+    def found(points: int) -> Irradiance:
         monkeypatch.setattr(irradiance, "_POINTS", points)
-        monkeypatch.setattr(incoming_light, "_LIGHT_POINTS", points // 2)
-        monkeypatch.setattr(incoming_light, "_BATCH", batch)
         return _shaded(world, lit, sampling)
 
-    whole = found(1 << 20, 1 << 20)
-    parts = found(16, 100)
+    whole = found(1 << 20)
+    parts = found(16)
     for name, values in vars(whole).items():
         np.testing.assert_array_equal(values, getattr(parts, name), err_msg=name)
     if estimator == "mis":

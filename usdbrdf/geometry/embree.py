@@ -1,0 +1,193 @@
+"""Embree's C interface, called from compiled loops: the library that embreex brings, without
+embreex's own calls, which would copy the scene and every ray.
+
+See the Embree API reference, https://github.com/RenderKit/embree, ``rtcIntersect1`` and
+``rtcOccluded1``; structures and constants are those of Embree 4.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from functools import cache
+
+import embreex.rtcore_scene
+import llvmlite.binding
+import numpy as np
+import numpy.typing as npt
+from numba import types
+
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.kernel import loop
+
+Float = npt.NDArray[np.float32]
+Int = npt.NDArray[np.int32]
+Bool = npt.NDArray[np.bool_]
+
+_TRIANGLES = 0  # RTC_GEOMETRY_TYPE_TRIANGLE
+_INDICES, _VERTICES = 0, 1  # RTC_BUFFER_TYPE_INDEX, _VERTEX
+_UINT3, _FLOAT3 = 0x5003, 0x9003  # RTC_FORMAT_UINT3, _FLOAT3
+# Rays near an edge hit one of its triangles: without it one in 10,000 leaves a closed room that
+# lies 100 m from the origin of its coordinates.
+_ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
+_HIGH = 2  # RTC_BUILD_QUALITY_HIGH
+# Embree may read 16 bytes from any vertex, also the last.
+_FLOATS_BEHIND_VERTICES = 4
+
+# A ray and its hit, RTCRayHit: 22 words of 4 bytes, aligned to 16 bytes.
+_WORDS, _ALIGNED = 24, 16
+_ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
+_U, _V, _FACE, _GEOMETRY, _INSTANCE = 15, 16, 17, 18, 19
+# Finite, so that what is computed with the distance of a ray that met nothing stays a number.
+_FARTHEST = np.float32(1e37)
+
+_pointer, _number, _size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
+_FUNCTIONS: dict[str, tuple[object, list[object]]] = {
+    "rtcNewDevice": (_pointer, [ctypes.c_char_p]),
+    "rtcGetDeviceError": (_number, [_pointer]),
+    "rtcNewScene": (_pointer, [_pointer]),
+    "rtcSetSceneFlags": (None, [_pointer, _number]),
+    "rtcSetSceneBuildQuality": (None, [_pointer, _number]),
+    "rtcCommitScene": (None, [_pointer]),
+    "rtcReleaseScene": (None, [_pointer]),
+    "rtcNewGeometry": (_pointer, [_pointer, _number]),
+    "rtcSetSharedGeometryBuffer": (
+        None,
+        [_pointer, _number, _number, _number, _pointer, _size, _size, _size],
+    ),
+    "rtcCommitGeometry": (None, [_pointer]),
+    "rtcAttachGeometry": (_number, [_pointer, _pointer]),
+    "rtcReleaseGeometry": (None, [_pointer]),
+}
+
+
+@cache
+def _embree() -> ctypes.CDLL:
+    """Embree's functions, found through the module of embreex that was linked to them."""
+    library = ctypes.CDLL(embreex.rtcore_scene.__file__)
+    try:
+        for name, (result, arguments) in _FUNCTIONS.items():
+            function = getattr(library, name)
+            function.restype, function.argtypes = result, arguments
+        for name in ("rtcIntersect1", "rtcOccluded1"):
+            address = ctypes.cast(getattr(library, name), _pointer).value
+            llvmlite.binding.add_symbol(name, address)
+    except AttributeError as error:
+        raise EnvironmentFailure(
+            f"{embreex.rtcore_scene.__file__} does not reach Embree 4 ({error}): install the wheel "
+            "of embreex 4.4 or newer from PyPI"
+        ) from error
+    return library
+
+
+@cache
+def _device() -> int:
+    device: int | None = _embree().rtcNewDevice(None)
+    if device is None:
+        raise EnvironmentFailure(
+            f"Embree does not start (its error {_embree().rtcGetDeviceError(None)}): it needs a "
+            "64-bit processor with SSE2 and free memory"
+        )
+    return device
+
+
+class EmbreeScene:
+    """A committed scene of one mesh, for the loops below.
+
+    points (V, 3) float32; triangles (F, 3) int32 inside [0, V)
+
+    ``points``, ``triangles``  as Embree reads them, for as long as this object lives
+    ``address``                what the loops know it by
+    """
+
+    def __init__(self, points: Float, triangles: Int) -> None:
+        """Raises EnvironmentFailure where memory does not suffice."""
+        padded = np.zeros(3 * len(points) + _FLOATS_BEHIND_VERTICES, np.float32)
+        self.points: Float = padded[: 3 * len(points)].reshape(-1, 3)
+        self.points[:] = points
+        self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
+        embree, device = _embree(), _device()
+        mesh = embree.rtcNewGeometry(device, _TRIANGLES)
+        for kind, form, values in (
+            (_INDICES, _UINT3, self.triangles),
+            (_VERTICES, _FLOAT3, self.points),
+        ):
+            embree.rtcSetSharedGeometryBuffer(
+                mesh, kind, 0, form, values.ctypes.data, 0, values.strides[0], len(values)
+            )
+        embree.rtcCommitGeometry(mesh)
+        self.address: int = embree.rtcNewScene(device)
+        weakref.finalize(self, embree.rtcReleaseScene, self.address)
+        embree.rtcSetSceneFlags(self.address, _ROBUST)
+        embree.rtcSetSceneBuildQuality(self.address, _HIGH)
+        embree.rtcAttachGeometry(self.address, mesh)
+        embree.rtcReleaseGeometry(mesh)
+        embree.rtcCommitScene(self.address)
+        error = embree.rtcGetDeviceError(device)
+        if error:
+            raise EnvironmentFailure(
+                f"Embree cannot take a mesh of {len(triangles):,} triangles (its error {error}): "
+                "free some memory or use a smaller mesh"
+            )
+
+
+_intersect = types.ExternalFunction("rtcIntersect1", types.void(types.intp, types.intp, types.intp))
+_occluded = types.ExternalFunction("rtcOccluded1", types.void(types.intp, types.intp, types.intp))
+
+
+@loop
+def closest_hits(
+    scene: int, origins: Float, directions: Float, face: Int, u: Float, v: Float, distance: Float
+) -> None:
+    """First surface along each of R rays, into the last four (R,): triangle (-1: none),
+    barycentric place, distance in lengths of the direction.
+
+    origins (P, 3), directions (R, 3): ray r starts at origins[r % P].
+    """
+    ray = _empty_ray()
+    words, place, count = ray.view(np.int32), ray.ctypes.data, len(origins)
+    point = 0
+    for r in range(len(directions)):
+        _aim(ray, words, origins, point, directions, r)
+        ray[_FAR] = _FARTHEST
+        words[_GEOMETRY], words[_INSTANCE] = -1, -1
+        _intersect(scene, place, 0)
+        face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
+        u[r], v[r], distance[r] = ray[_U], ray[_V], ray[_FAR]
+        point = point + 1 if point + 1 < count else 0
+
+
+@loop
+def occlusion(
+    scene: int,
+    origins: Float,
+    start: Int,
+    directions: Float,
+    distance: float | np.float32,
+    blocked: Bool,
+) -> None:
+    """True in ``blocked`` (R,) where anything is nearer than ``distance``, in lengths of the
+    direction; origins (P, 3), directions (R, 3): ray r starts at origins[start[r]], for the R of
+    ``start``."""
+    ray = _empty_ray()
+    words, place = ray.view(np.int32), ray.ctypes.data
+    for r in range(len(start)):
+        _aim(ray, words, origins, start[r], directions, r)
+        ray[_FAR] = distance
+        _occluded(scene, place, 0)
+        blocked[r] = ray[_FAR] < 0
+
+
+@loop
+def _empty_ray() -> Float:
+    memory = np.zeros(_WORDS + _ALIGNED // 4, np.float32)
+    first = (-memory.ctypes.data % _ALIGNED) // 4
+    return memory[first : first + _WORDS]
+
+
+@loop
+def _aim(ray: Float, words: Int, origins: Float, o: int, directions: Float, d: int) -> None:
+    for c in range(3):
+        ray[_ORIGIN + c], ray[_DIRECTION + c] = origins[o, c], directions[d, c]
+    ray[_NEAR], ray[_TIME] = 0, 0
+    words[_MASK], words[_ID], words[_FLAGS] = -1, 0, 0
