@@ -31,7 +31,7 @@ from usdbrdf.steps.atlas import MapWriter, TexelMap
 from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
 from usdbrdf.texturing.inpaint import inpaint_alike
-from usdbrdf.texturing.passes import Measured, groups_of_texels, measured_arrays
+from usdbrdf.texturing.passes import Measured, by_parts, groups_of_texels, measured_arrays
 from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
@@ -130,17 +130,16 @@ def _measure(
     groups = groups_of_texels(texels, scene, frames, options.memory)
     if len(groups) > 1:
         say(f"texture: {len(groups)} passes over the frames, for lack of memory")
-    measured = Measured.empty(len(texels))
-    for part in groups:
 
-        def observe(part: slice = part) -> dict[str, npt.NDArray[Any]]:
+    def measured(part: slice) -> dict[str, npt.NDArray[Any]]:
+        def observe() -> dict[str, npt.NDArray[Any]]:
             observed = _observe(run, texels, scene, rays, frames, options.quantile, part)
             return measured_arrays(observed, options.quantile)
 
-        if len(groups) == 1:
-            return Measured(**observe())
-        measured.put(part, run.checkpoint(f"texels-{part.start}-{part.stop}", observe))
-    return measured
+        kept = f"texels-{part.start}-{part.stop}"
+        return observe() if len(groups) == 1 else run.checkpoint(kept, observe)
+
+    return Measured(**by_parts(groups, len(texels), measured))
 
 
 def _observe(

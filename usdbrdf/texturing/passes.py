@@ -3,7 +3,8 @@ frames. What a texel gets does not depend on its group."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from usdbrdf.texturing.radiance_from_frames import Observation
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
 Bool = npt.NDArray[np.bool_]
+Array = npt.NDArray[Any]
 
 # Without --memory this share of the machine's.
 _SHARE = 0.75
@@ -66,25 +68,8 @@ class Measured:
     clipped: Int
     lower_bound: Float
 
-    @classmethod
-    def empty(cls, num_texels: int) -> Measured:
-        colour, number = (num_texels, 3), num_texels
-        return cls(
-            median=np.empty(colour, np.float32),
-            mean=np.empty(colour, np.float32),
-            spread=np.empty(colour, np.float32),
-            count=np.empty(number, np.int32),
-            clipped=np.empty(number, np.int32),
-            lower_bound=np.empty(number, np.float32),
-        )
 
-    def put(self, part: slice, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Set the texels of ``part``."""
-        for field in fields(self):
-            getattr(self, field.name)[part] = arrays[field.name]
-
-
-def measured_arrays(observed: Observation, quantile: float) -> dict[str, npt.NDArray[Any]]:
+def measured_arrays(observed: Observation, quantile: float) -> dict[str, Array]:
     """The arrays of ``Measured``, of the texels that were observed."""
     return {
         "median": psquare.quantile(observed.quantiles, quantile),
@@ -94,6 +79,22 @@ def measured_arrays(observed: Observation, quantile: float) -> dict[str, npt.NDA
         "clipped": observed.clipped,
         "lower_bound": observed.lower_bound,
     }
+
+
+def by_parts(
+    parts: Iterable[slice], count: int, arrays_of: Callable[[slice], Mapping[str, Array]]
+) -> dict[str, Array]:
+    """Arrays of ``count`` rows, from the ``arrays_of`` parts that make up all rows."""
+    whole: dict[str, Array] = {}
+    for part in parts:
+        for name, values in arrays_of(part).items():
+            if len(values) == count:  # the only part
+                whole[name] = values
+                continue
+            if name not in whole:
+                whole[name] = np.empty((count, *values.shape[1:]), values.dtype)
+            whole[name][part] = values
+    return whole
 
 
 def groups_of_texels(

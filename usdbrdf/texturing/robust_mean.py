@@ -12,7 +12,6 @@ the samples weighted by their precision: how blurred it is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.texturing.passes import by_parts
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
@@ -84,19 +84,6 @@ class RobustMean:
     variance: Float
     footprint: Float
 
-    @classmethod
-    def empty(cls, num_texels: int) -> RobustMean:
-        return cls(
-            mean=np.empty((num_texels, 3), np.float32),
-            variance=np.empty(num_texels, np.float32),
-            footprint=np.empty((num_texels, 3), np.float32),
-        )
-
-    def put(self, part: slice, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Set the texels of ``part``."""
-        for name, values in arrays.items():
-            getattr(self, name)[part] = values
-
 
 def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
     """Add one sample to each of the listed texels, in place.
@@ -114,12 +101,13 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
 
 def robust_mean(state: MeanState) -> RobustMean:
     """Of all samples so far; ``state`` stays as it is."""
-    found = RobustMean.empty(len(state.count))
-    for start in range(0, len(state.count), _AT_A_TIME):
-        part = slice(start, start + _AT_A_TIME)
-        some = {name: values[part] for name, values in state.arrays().items()}
-        found.put(part, _means(MeanState(**some)))
-    return found
+    count, arrays = len(state.count), state.arrays()
+    parts = [slice(start, start + _AT_A_TIME) for start in range(0, max(count, 1), _AT_A_TIME)]
+
+    def means(part: slice) -> dict[str, Float]:
+        return _means(MeanState(**{name: values[part] for name, values in arrays.items()}))
+
+    return RobustMean(**by_parts(parts, count, means))
 
 
 def _means(state: MeanState) -> dict[str, Float]:
