@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.geometry.packed_texture import packed_arrays, packed_colour, packed_place
+from usdbrdf.geometry.packed_texture import packed_colour, packed_faces, packed_pixels, packed_place
 from usdbrdf.geometry.surface_radiance import SurfaceTexture
 
 
@@ -28,7 +28,9 @@ def test_look_ups_are_bilinear():
     values = rng.random((500, 3), np.float32)
     shown = rng.integers(-1, 500, int(first[-1])).astype(np.int32)
     corners = (rng.random((5, 3, 2)) * 1.2 * size[:, None] - 0.1).astype(np.float32)
-    pixels, faces, places = texture = packed_arrays(values, shown, corners, first[:-1], size)
+    pixels = packed_pixels(values, shown, int(size[:, 0].max()))
+    faces, places = packed_faces(corners, first[:-1], size)
+    texture = pixels, faces, places
     face = np.tile(np.arange(5, dtype=np.int32), 400)
     u = rng.random(2000, np.float32)
     v = (1 - u) * rng.random(2000, np.float32)
@@ -51,9 +53,8 @@ def test_look_ups_are_bilinear():
 
 
 def test_no_face_lies_on_two_lines_of_the_cache():
-    pixels, faces, places = packed_arrays(
-        np.zeros((1, 3), np.float32),
-        np.zeros(1, np.int32),
+    pixels = packed_pixels(np.zeros((1, 3), np.float32), np.zeros(1, np.int32), 1)
+    faces, places = packed_faces(
         np.zeros((5, 3, 2), np.float32),
         np.zeros(5, np.int64),
         np.ones((5, 2), np.int32),

@@ -8,7 +8,6 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.render_view import ViewedAsset
-from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.header import read_header
 from usdbrdf.stage.read import open_measured, read_fit
@@ -42,12 +41,12 @@ def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> Viewed
             "first. [asset.incomplete]"
         )
     up_axis = read_header(asset.layer("scan")).up_axis
-    texels, face_object = atlas.texels, atlas.scene.face_object
+    lit = lit_scene(atlas, environment_from_file(environment, up_axis))
     diffuse = atlas.map_where_present(map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
-        lit=lit_scene(atlas, environment_from_file(environment, up_axis)),
-        measured=surface_texture(texels, face_object, atlas.map("lit")),
-        diffuse=surface_texture(texels, face_object, diffuse),
+        lit=lit,
+        measured=lit.radiance.showing(atlas.texels, atlas.map("lit")),
+        diffuse=lit.radiance.showing(atlas.texels, diffuse),
         phi=np.array([fit.phi for fit in fits if fit], np.float32),
         psi=np.array([fit.psi for fit in fits if fit], np.float32),
     )

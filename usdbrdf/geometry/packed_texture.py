@@ -31,23 +31,34 @@ Looks: TypeAlias = tuple[Bits, Bits, Float, Float]
 
 # Places to ask for before the first is read: few enough to be in the nearest cache then.
 AHEAD = 128
+# Pixels that are laid out at a time.
+_AT_A_TIME = 1 << 16
 # Bytes of a line of the cache.
 _LINE = 64
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-def packed_arrays(
-    values: Float, shown: Int, corner_pixel: Float, first_pixel: Long, size: Int
-) -> PackedArrays:
-    """The layout of ``values`` (T, 3), of which the atlases' pixels show ``shown`` (P,) (-1: none).
+def packed_pixels(values: Float, shown: Int, widest: int) -> Float:
+    """``values`` (T, 3) in the order of the atlases' pixels, which show ``shown`` (P,) (-1: none);
+    widest: the largest width of an atlas."""
+    # A row and a pixel more than there are, all 0: an atlas of one column or row has no neighbours.
+    pixels = _zeros(len(shown) + widest + 2, 4)
+    for start in range(0, len(shown), _AT_A_TIME):
+        part = shown[start : start + _AT_A_TIME]
+        colours = values[np.maximum(part, 0)]
+        colours[part < 0] = 0
+        # Zeros that nobody writes take no memory.
+        if colours.any():
+            pixels[start : start + len(part), :3] = colours
+    return pixels
+
+
+def packed_faces(corner_pixel: Float, first_pixel: Long, size: Int) -> tuple[Float, Int]:
+    """Where the faces lie in the atlases, as float32 and as int32.
 
     corner_pixel (F, 3, 2) float32: the faces' corners in pixels of their own atlas; first_pixel
     (F,): where that starts; size (F, 2): its width and height
     """
-    # A row and a pixel more than there are, all 0: an atlas of one column or row has no neighbours.
-    pixels = _zeros(len(shown) + int(size[:, 0].max(initial=1)) + 2, 4)
-    pixels[: len(shown), :3] = values[np.maximum(shown, 0)]
-    pixels[: len(shown)][shown < 0] = 0
     faces = _zeros(len(size), 8)
     faces[:, 0:2] = corner_pixel[:, 0] - 0.5
     faces[:, 2:4] = corner_pixel[:, 1] - corner_pixel[:, 0]
@@ -55,7 +66,7 @@ def packed_arrays(
     places = faces.view(np.int32)
     places[:, 6] = first_pixel
     places[:, 7] = size[:, 0] | size[:, 1] << 16
-    return pixels, faces, places
+    return faces, places
 
 
 def _zeros(rows: int, columns: int) -> Float:

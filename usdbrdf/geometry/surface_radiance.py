@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,8 @@ from usdbrdf.geometry.packed_texture import (
     empty_looks,
     fetch_face,
     look_at,
-    packed_arrays,
+    packed_faces,
+    packed_pixels,
 )
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.kernel import parallel_kernel
@@ -40,6 +41,10 @@ class SurfaceTexture:
         """What the kernels take."""
         return self.pixels, self.faces, self.places
 
+    def showing(self, texels: Texels, values: Float) -> SurfaceTexture:
+        """Other values (T, 3) of the same texels."""
+        return replace(self, pixels=_pixels(texels, values))
+
     def at(self, face: Int, u: Float, v: Float) -> Float:
         """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""
         return _lookup(self.arrays, face, u, v)
@@ -47,14 +52,14 @@ class SurfaceTexture:
 
 def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceTexture:
     """Per-texel values (T, 3) as a texture that can be looked up anywhere on the surface."""
-    pixels, faces, places = packed_arrays(
-        values,
-        texels.nearest_texel,
-        texels.corner_pixel,
-        texels.first_pixel[face_object],
-        texels.resolution[face_object],
+    faces, places = packed_faces(
+        texels.corner_pixel, texels.first_pixel[face_object], texels.resolution[face_object]
     )
-    return SurfaceTexture(pixels=pixels, faces=faces, places=places)
+    return SurfaceTexture(pixels=_pixels(texels, values), faces=faces, places=places)
+
+
+def _pixels(texels: Texels, values: Float) -> Float:
+    return packed_pixels(values, texels.nearest_texel, int(texels.resolution[:, 0].max(initial=1)))
 
 
 @parallel_kernel

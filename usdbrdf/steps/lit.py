@@ -22,13 +22,14 @@ def lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
     emission = atlas.map_where_present("emission", 3)
     emissive = (emission > 0).any(axis=1, keepdims=True)
     lit = np.where(emissive, emission, atlas.map("lit"))
+    radiance = surface_texture(texels, scene.face_object, lit)
     return LitScene(
         scene=scene,
         rays=RayScene(scene.points, scene.triangles),
-        radiance=surface_texture(texels, scene.face_object, lit),
+        radiance=radiance,
         lights=lights_from_radiance(scene, texels, lit, _BRIGHTER_THAN),
-        emission=surface_texture(
-            texels, scene.face_object, np.repeat(emissive.astype(np.float32), 3, axis=1)
+        emission=radiance.showing(
+            texels, np.broadcast_to(emissive.astype(np.float32), (len(texels), 3))
         ),
         environment=environment,
         size=float(np.linalg.norm(np.ptp(scene.points, axis=0))),

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stage import StageRun
 from usdbrdf.material.lit_scene import LitScene
@@ -83,7 +82,7 @@ def _change(
     """What the change of the diffuse ``radiance`` (T, 3) and the lobes' light add to S, traced tile
     by tile."""
     texels = atlas.texels
-    texture = surface_texture(texels, lit.scene.face_object, radiance)
+    texture = lit.radiance.showing(texels, radiance)
     lights = lights_from_radiance(lit.scene, texels, np.abs(radiance))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED)
     order, patch = patches_of_texels(texels)
