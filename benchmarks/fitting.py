@@ -13,15 +13,17 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from measure import Spent, figure, lit_asset, parser_of, report, timed
+from measure import Lit, Spent, figure, lit_asset, parser_of, report, timed
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.material import fit_views as views
+from usdbrdf.material.fit_views import MIXTURE
+from usdbrdf.material.lobe_samples import LOBE_ALPHAS, Mixture
+from usdbrdf.scan.scan import Frames
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.read import frames_from_stage, open_measured
 from usdbrdf.steps import fit, fit_objects
@@ -52,35 +54,58 @@ class Fitted:
     record: Any
 
 
-def fitted(asset: Path, most: int | None = None) -> tuple[Spent, dict[str, Fitted]]:
+class Effort(NamedTuple):
+    """How much goes into the fits: rays, and every how many-th of the frames and of the texels that
+    were chosen among those followed. Default: what the fit step does."""
+
+    mixture: Mixture = MIXTURE
+    of_frames: int = 1
+    of_texels: int = 1
+
+
+DEFAULT = Effort()
+
+
+def fitted(
+    lit: Lit, asset: Path, most: int | None = None, effort: Effort = DEFAULT, seed: int = 0
+) -> tuple[Spent, dict[str, Fitted]]:
     """Time of the pass over the frames, and each object by its label."""
-    lit = lit_asset(asset)
-    frames = frames_from_stage(open_measured(Asset.at(asset)))
-    options = fit_objects.FitOptions()
+    frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
+    options = fit_objects.FitOptions(seed=seed)
     survey, surveying = timed(
         lambda: fit_objects.survey_frames(NoCheckpoints(), lit.atlas, lit.scene, frames, options)
     )
-    fit_objects.fit_object(lit.scene, lit.atlas.texels, frames, survey, 0, options)  # compiles
+    chosen = np.unique(survey.observations.texel)[:: effort.of_texels]
+    kept = np.flatnonzero(np.isin(survey.observations.texel, chosen))
+    survey = replace(survey, observations=survey.observations.take(kept))
+
+    def fit_one(i: int) -> dict[str, np.ndarray]:
+        texels, mixture = lit.atlas.texels, effort.mixture
+        return fit_objects.fit_object(lit.scene, texels, frames, survey, i, options, mixture)
+
+    fit_one(0)  # compiles
     objects = {}
     for i, obj in enumerate(lit.atlas.scene.objects[:most]):
-        found, used = timed(
-            lambda i=i: fit_objects.fit_object(
-                lit.scene, lit.atlas.texels, frames, survey, i, options
-            )
-        )
+        found, used = timed(lambda i=i: fit_one(i))
         objects[obj.label] = Fitted(used, found, fit._record(lit.scene, i, found, options, True))
     return surveying, objects
 
 
-def rays_per_sample() -> int:
+def some_frames(frames: Frames, step: int) -> Frames:
+    """Every ``step``-th of them."""
+    names = ("image_paths", "world_from_camera", "intrinsics", "resolution", "exposure_time",
+             "saturation_radiance", "noise_floor_radiance")  # fmt: skip
+    return replace(frames, **{name: getattr(frames, name)[::step] for name in names})
+
+
+def rays_per_sample(mixture: Mixture = MIXTURE) -> int:
     """Of one footprint: points of it, times three independent sets, times the mixture's rays."""
-    mixture, lobes = views._MIXTURE, 5
-    rays = mixture.per_lobe * lobes + mixture.lights + mixture.cosine
+    rays = mixture.per_lobe * len(LOBE_ALPHAS) + mixture.lights + mixture.cosine
     return 3 * len(RINGS) * rays
 
 
 def measure(asset: Path, quick: bool) -> dict[str, Any]:
-    surveying, objects = fitted(asset, 6 if quick else None)
+    surveying, objects = fitted(lit_asset(asset), asset, 6 if quick else None)
     # Objects without observations, as lamps, take no time and would flatter the mean.
     used = {label: one for label, one in objects.items() if np.isfinite(one.found["numbers"][0])}
     cpu = [one.spent.cpu for one in used.values()]

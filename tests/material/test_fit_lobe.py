@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -81,9 +81,21 @@ def _shone_on(samples: ViewSamples, basis: Basis, phi: float, psi: float) -> Vie
 
 def _fit(samples: ViewSamples, *bases: tuple[Basis, float]) -> LobeEstimate:
     """With candidates (basis, blur) that have the same basis twice, without noise."""
-    return fit_lobe(
-        samples, [Candidate(first=b, second=b, third=b, blur=blur) for b, blur in bases]
-    )
+    candidates = []
+    for basis, blur in bases:
+        at = _side_by_side(basis)
+        candidates.append(Candidate(first=at, second=at, third=at, blur=blur))
+    return fit_lobe(samples, candidates)
+
+
+def _side_by_side(basis: Basis) -> Callable[[Sequence[float]], tuple[np.ndarray, np.ndarray]]:
+    """The basis for many roughnesses, (P, 3, K) each."""
+
+    def at(phis: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        bases, slopes = zip(*(basis(phi) for phi in phis), strict=True)
+        return np.stack(bases, axis=2), np.stack(slopes, axis=2)
+
+    return at
 
 
 @pytest.mark.parametrize(("phi", "psi"), [(0.06, 0.4), (0.16, 0.7), (0.35, 0.9)])
@@ -123,7 +135,7 @@ def test_noise_of_the_rays_does_not_draw_psi_anywhere(phi: float, noise: float):
         samples, mirrored = _views(seed)
         basis = _basis(mirrored)
         samples = _shone_on(samples, basis, phi, psi)
-        first, second, third = (_noisy(basis, 3 * seed + k, noise) for k in range(3))
+        first, second, third = (_side_by_side(_noisy(basis, 3 * seed + k, noise)) for k in range(3))
         own = Candidate(first=first, second=second, third=third, blur=0)
         halves.append(fit_lobe(samples, [own]).psi)
         twice.append(fit_lobe(samples, [replace(own, second=first)]).psi)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, quad, room, world_of
-from usdbrdf.material.lobe_samples import Mixture, non_diffuse, trace_lobe_samples
+from usdbrdf.material.lobe_samples import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.shading.environment import Environment, black_environment
 from usdbrdf.shading.lights import Lights
 
 PHIS = (0.0, 0.02, 0.1, 0.3, 0.7, 1.0)
 RGB = np.array([3.0, 2.0, 1.0])
-REPEAT = 2048
+REPEAT = 8192
+MIXTURE = Mixture()
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -46,24 +49,33 @@ def _assert_albedo(
     environment: Environment | None = None,
     visible=None,
     radiance: np.ndarray = RGB,
+    group: int = 4,
 ) -> None:
     """base and base + slope equal L times the directional albedo at psi = 0 and 1."""
     samples = trace_lobe_samples(
         world.rays, _points(position, _towards(degrees)), world.texture(lit), lights,
-        environment or black_environment(), Mixture(), world.size, 0,
+        environment or black_environment(), Mixture(), world.size, 0, group=group,
     )  # fmt: skip
-    found, wanted = [], []
-    for phi in PHIS:
-        base, slope = non_diffuse(samples, np.full(REPEAT, phi, np.float32))
-        found.append([base, base + slope])
-        wanted.append([
+    wanted = [
+        [
             directional_albedo(np.radians(degrees), phi, psi, steps=300, visible=visible) * radiance
             for psi in (0.0, 1.0)
-        ])  # fmt: skip
-    # (phi, psi, copy, channel) -> copy first. slack: the quadrature, halving its step moves it so
-    # little even where a mask cuts it.
+        ]
+        for phi in PHIS
+    ]
+    # Of every group one point: they are all right on the mean, not only together.
+    base, slope = (part[1 % group :: group] for part in _of_groups(samples, PHIS, REPEAT))
+    # (point, channel, phi) of each psi -> (point, phi, psi, channel).
+    found = np.stack([base, base + slope], axis=-1).transpose(0, 2, 3, 1).astype(np.float64)
+    # slack: the quadrature, halving its step moves it so little even where a mask cuts it.
     slack = 1e-3 if visible is None else 4e-3
-    assert_same_mean(np.moveaxis(np.array(found, np.float64), 2, 0), wanted, slack=slack)
+    assert_same_mean(found, wanted, slack=slack)
+
+
+def _of_groups(
+    samples: LobeSamples, phis: Sequence[float], groups: int
+) -> tuple[np.ndarray, np.ndarray]:
+    return non_diffuse(samples, np.tile(np.array(phis, np.float32), (groups, 1)))
 
 
 @pytest.mark.parametrize("degrees", [10, 45, 75])
@@ -135,19 +147,34 @@ def test_a_lamp_half_hidden_by_a_blocker(degrees: float, aimed: bool):
     _assert_albedo(world, lit, lights, np.zeros(3), degrees, visible=visible)
 
 
-def test_the_samples_of_a_point_depend_on_the_seed_alone():
+def _of_copies(
+    seed: int, group: int, stream: np.ndarray | None = None, mixture: Mixture = MIXTURE
+) -> np.ndarray:
+    """base + slope of 64 copies of a point in a room with a bright ceiling, (64 / group, 3)."""
     world = world_of(room((-2, -2, 0), (2, 2, 2.5)))
     lit = world.per_object([(1, 1, 1)] * 5 + [(9, 9, 9)])
-    points = _points(np.zeros(3), _towards(30), repeat=20)
+    samples = trace_lobe_samples(
+        world.rays, _points(np.zeros(3), _towards(30), repeat=64), world.texture(lit),
+        world.lights(lit), black_environment(), mixture, world.size, seed, stream, group=group,
+    )  # fmt: skip
+    base, slope = _of_groups(samples, [0.3], 64 // group)
+    return (base + slope)[..., 0]
 
-    def run(seed: int) -> np.ndarray:
-        samples = trace_lobe_samples(
-            world.rays, points, world.texture(lit), world.lights(lit), black_environment(),
-            Mixture(), world.size, seed,
-        )  # fmt: skip
-        return non_diffuse(samples, np.full(len(samples.cos_out), 0.3, np.float32))[1]
 
-    np.testing.assert_array_equal(run(0), run(0))
-    assert (run(0) != run(1)).mean() > 0.9
-    # Copies of one point do not share their random numbers.
-    assert len(np.unique(run(0)[:, 0])) == 20
+def test_the_samples_of_a_point_depend_on_the_seed_alone():
+    np.testing.assert_array_equal(_of_copies(0, 1), _of_copies(0, 1))
+    assert (_of_copies(0, 1) != _of_copies(1, 1)).mean() > 0.9
+    # Copies of one point do not share their random numbers, but where they are told to.
+    assert len(np.unique(_of_copies(0, 1)[:, 0])) == 64
+    shared = _of_copies(0, 4, np.repeat([3, 5], 8))[:, 0]
+    np.testing.assert_array_equal(shared, np.repeat(shared[[0, 8]], 8))
+    assert shared[0] != shared[8]
+
+
+def test_points_of_a_group_share_the_work():
+    # The mean of 64 points that divide the samples among them, and of 64 that do not.
+    few = Mixture(per_lobe=1, lights=1, cosine=1)
+    alone = np.array([_of_copies(seed, 1, mixture=few).mean(axis=0) for seed in range(48)])
+    together = np.array([_of_copies(seed, 64, mixture=few)[0] for seed in range(48)])
+    assert np.mean(together) == pytest.approx(np.mean(alone), rel=0.02)
+    assert together.std(axis=0).mean() < 0.5 * alone.std(axis=0).mean()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, lobe_from_costs
+from usdbrdf.material.lobe_samples import Basis
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
-Basis = Callable[[float], tuple[Float, Float]]
+Pair = tuple[Float, Float]
 
 # Roughnesses that are tried, and how many more between the best one and each neighbour of it.
 _LEVEL_1 = (
@@ -32,8 +33,8 @@ _UPDATES, _MORE = 4, 2
 class Candidate:
     """What the lobe would look like with one footprint of the samples.
 
-    first, second, third  phi -> (base, slope) of I_nd = base + psi slope, (P, 3) each, with
-                          independent noise
+    first, second, third  roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K)
+                          each, with independent noise
     blur                  standard deviation of the normal over a footprint, in radians
 
     Noise squared would draw psi towards 0; the product of two independent noises does not. But
@@ -63,6 +64,13 @@ class _Search:
         best = int(cost.argmin())
         return float(cost[best]), best, float(psi[best])
 
+    def and_more(self, other: _Search) -> _Search:
+        """Both, with ascending roughnesses."""
+        phis = [*self.phis, *other.phis]
+        order = np.argsort(phis)
+        terms = np.concatenate([self.terms, other.terms])[order]
+        return _Search(phis=[phis[k] for k in order], terms=terms)
+
 
 def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstimate:
     """The lobe that explains the samples best, averaged over the footprints that may be theirs.
@@ -71,78 +79,86 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
     with these. With them fixed all candidates are fitted and compared.
     """
     model = ViewModel(samples)
+    radiance = samples.radiance[..., None]
     tables = [_Table(candidate) for candidate in candidates]
     for _ in range(_UPDATES):
-        _improve(model, samples, tables[0])
-    coarse = [_search(model, samples.radiance, table, _LEVEL_1) for table in tables]
+        _improve(model, radiance, tables[0])
+    coarse = [_search(model, radiance, table) for table in tables]
     best = int(np.argmin([search.least[0] for search in coarse]))
     if best > 0:
         for _ in range(_MORE):
-            _improve(model, samples, tables[best])
-        coarse = [_search(model, samples.radiance, table, _LEVEL_1) for table in tables]
-    whole = model.reduced(samples.radiance)
-    without = model.product(whole, whole)
+            _improve(model, radiance, tables[best])
+        coarse = [_search(model, radiance, table) for table in tables]
+    whole = model.reduced(radiance)
+    without = float(model.product(whole, whole)[0])
     estimates = [
-        _estimate(model, samples.radiance, table, _LEVEL_1[search.least[1]], without, blur)
-        for table, search, blur in zip(tables, coarse, [c.blur for c in candidates], strict=True)
+        _estimate(model, radiance, candidate, search, without)
+        for candidate, search in zip(candidates, coarse, strict=True)
     ]
     return averaged(estimates, model.degrees_of_freedom)
 
 
 def _estimate(
-    model: ViewModel, radiance: Float, table: _Table, near: float, without: float, blur: float
+    model: ViewModel, radiance: Float, candidate: Candidate, coarse: _Search, without: float
 ) -> LobeEstimate:
-    """One candidate's lobe, searched closely about the roughness ``near``, with the variances as
-    they are. without: the cost without specular light."""
-    fine = _search(model, radiance, table, _with_level_2(near))
+    """One candidate's lobe, searched more closely than ``coarse``, with the variances as they are.
+    without: the cost without specular light."""
+    between = _level_2(_LEVEL_1[coarse.least[1]])
+    bases = candidate.first(between), candidate.second(between)
+    more = _Search(phis=between, terms=_terms(model, radiance, *bases))
+    fine = coarse.and_more(more)
+    _, best, psi = fine.least
+    phis = [fine.phis[best]]
     return lobe_from_costs(
         np.array(fine.phis),
         fine.terms,
         without,
-        _cost_with_noise(model, radiance, table, fine),
+        _cost_with_noise(model, radiance, (candidate.first(phis), candidate.second(phis)), psi),
         model.degrees_of_freedom,
-        blur,
+        candidate.blur,
     )
 
 
 class _Table:
-    """A candidate's bases, evaluated once per roughness: two for costs, one for weights."""
+    """A candidate's bases: two of level 1 for costs, one at single roughnesses for weights."""
 
     def __init__(self, candidate: Candidate) -> None:
-        self.at = cache(lambda phi: (candidate.first(phi), candidate.second(phi)))
-        self.of_weights = cache(candidate.third)
+        self.first, self.second = candidate.first(_LEVEL_1), candidate.second(_LEVEL_1)
+        self.of_weights = cache(lambda phi: candidate.third([phi]))
 
 
-def _improve(model: ViewModel, samples: ViewSamples, table: _Table) -> None:
-    _, best, psi = _search(model, samples.radiance, table, _LEVEL_1).least
+def _improve(model: ViewModel, radiance: Float, table: _Table) -> None:
+    _, best, psi = _search(model, radiance, table).least
     base, slope = table.of_weights(_LEVEL_1[best])
-    model.update(base + psi * slope)
+    model.update((base + psi * slope)[..., 0])
 
 
-def _search(model: ViewModel, radiance: Float, table: _Table, phis: Sequence[float]) -> _Search:
-    bases = [basis for phi in phis for basis in table.at(phi)]
-    rest = model.all_reduced([radiance - base for base, _ in bases])
-    slopes = model.all_reduced([slope for _, slope in bases])
-    terms = np.zeros((len(phis), 3))
-    for k in range(len(phis)):
-        pair, slope = rest[2 * k : 2 * k + 2], slopes[2 * k : 2 * k + 2]
-        crossed = model.product(slope[0], pair[1]) + model.product(slope[1], pair[0])
-        terms[k] = model.product(*pair), crossed / 2, model.product(*slope)
-    return _Search(phis=phis, terms=terms)
+def _search(model: ViewModel, radiance: Float, table: _Table) -> _Search:
+    return _Search(phis=_LEVEL_1, terms=_terms(model, radiance, table.first, table.second))
 
 
-def _cost_with_noise(model: ViewModel, radiance: Float, table: _Table, found: _Search) -> float:
-    """The least cost with the bases' own noise in it: the mean of either basis' squares."""
-    _, best, psi = found.least
-    rest = [
-        model.reduced(radiance - base - psi * slope) for base, slope in table.at(found.phis[best])
-    ]
-    return sum(model.product(one, one) for one in rest) / len(rest)
+def _terms(model: ViewModel, radiance: Float, first: Pair, second: Pair) -> Double:
+    """c0, c1, c2 of each roughness, (K, 3), from bases (P, 3, K) with independent noise."""
+    sets = radiance - first[0], radiance - second[0], first[1], second[1]
+    rest, other_rest, slope, other_slope = model.reduced(np.concatenate(sets, axis=2)).parts(4)
+    crossed = model.product(slope, other_rest) + model.product(other_slope, rest)
+    return np.stack(
+        [model.product(rest, other_rest), crossed / 2, model.product(slope, other_slope)], axis=1
+    )
 
 
-def _with_level_2(near: float) -> list[float]:
-    """Level 1, and more roughnesses on both sides of ``near``, one of its own."""
+def _cost_with_noise(
+    model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], psi: float
+) -> float:
+    """The cost of a lobe with the bases' own noise in it: the mean of either basis' squares."""
+    sets = [radiance - base - np.float32(psi) * slope for base, slope in bases]
+    rest = model.reduced(np.concatenate(sets, axis=2))
+    return float(model.product(rest, rest).mean())
+
+
+def _level_2(near: float) -> list[float]:
+    """More roughnesses on both sides of ``near``, one of level 1."""
     best = _LEVEL_1.index(near)
     ends = [_LEVEL_1[k] for k in range(max(best - 1, 0), min(best + 2, len(_LEVEL_1)))]
     between = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
-    return sorted({*_LEVEL_1, *(float(phi) for part in between for phi in part)})
+    return [float(phi) for part in between for phi in part]

@@ -40,7 +40,12 @@ def fit_target_frame(
     chosen, stands_for, points = _points_of_object(lit, view, index, max_pixels, seed)
     if len(chosen) < MIN_PIXELS:
         return None, len(chosen)
-    basis = lobe_basis(lit, points, len(chosen), seed)
+    of_phis = lobe_basis(lit, points, len(chosen), seed)
+
+    def basis(phi: float) -> tuple[Float, Float]:
+        base, slope = of_phis([phi])
+        return base[..., 0], slope[..., 0]
+
     diffuse = lit.radiance.at(points.face, points.u, points.v)
     diffuse = diffuse.reshape(len(chosen), -1, 3).mean(axis=1)
     observed = view.radiance.reshape(-1, 3)[chosen]

@@ -44,7 +44,7 @@ _MIN_VIEWS = 3
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
 # the brighter samples would be valid.
 _ABOVE_NOISE = 4.0
-_MIXTURE = Mixture(per_lobe=4, lights=16, cosine=8)
+MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 
@@ -56,10 +56,12 @@ def fit_views(
     view_of: Callable[[int], View],
     index: int,
     seed: int,
+    mixture: Mixture = MIXTURE,
 ) -> tuple[LobeEstimate | None, int]:
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
     view_of(frame) gives poses and pinholes; the images themselves are not needed any more.
+    mixture: the rays of each of a sample's points, traced three times.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -68,14 +70,12 @@ def fit_views(
     if len(observed.texel) < MIN_OBSERVATIONS:
         return None, len(observed.texel)
     samples = _samples(lit, texels, observed, footprints[0], view_of)
-    # Views of a texel share their random numbers: what they have in common then cancels in their
-    # differences, which are all that is fitted.
-    points_of_texel = len(RINGS) * samples.texel[:, None]
-    stream = (points_of_texel + np.arange(len(RINGS))).ravel()
     candidates = []
     for points in footprints:
+        # Views of a texel share their random numbers: what they have in common then cancels in
+        # their differences, which are all that is fitted.
         bases = [
-            lobe_basis(lit, points, len(samples.texel), 3 * seed + k, _MIXTURE, stream)
+            lobe_basis(lit, points, len(samples.texel), 3 * seed + k, mixture, samples.texel)
             for k in range(3)
         ]
         blur = _deviation_of_normal(points)

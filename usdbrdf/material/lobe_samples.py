@@ -7,8 +7,9 @@ same samples integrate a mirror and a matte lobe, and the grid search is arithme
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -20,14 +21,16 @@ from usdbrdf.material.lobe_kernels import SampleArrays, draw_directions, integra
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.lights import Lights
-from usdbrdf.shading.warps import patch_shifts, shifts_of, sobol_points
+from usdbrdf.shading.warps import sobol_bits
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
 Long = npt.NDArray[np.int64]
+Basis = Callable[[Sequence[float]], tuple[Float, Float]]
 
 LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
+_LANES = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,13 +77,14 @@ def trace_lobe_samples(
     seed: int,
     stream: Long | None = None,
     alphas: Double | None = None,
-    first: int = 0,
+    group: int = 1,
 ) -> LobeSamples:
     """Trace the mixture at R surface points; all of ``points`` must lie on the surface.
 
-    stream (R,)    points of the same number share their random numbers; default: none do
+    group          this many consecutive points divide each technique's Sobol points among them, so
+                   that their mean has a smaller error
+    stream (G,)    groups of the same number share their random numbers; default: none do
     alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
-    first          the number of the first point's random numbers
     """
     if not len(lights.face):
         mixture = Mixture(
@@ -91,14 +95,14 @@ def trace_lobe_samples(
         alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
     total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
     origin = lift_from_surface(points.position, points.normal, scene_size)
-    sequence = sobol_points(int(np.ceil(np.log2(total))), 2)
-    shift = patch_shifts(count, 3, seed, first) if stream is None else shifts_of(stream, 3, seed)
+    counts = mixture.per_lobe, mixture.lights
+    sobol = sobol_bits(int(np.ceil(np.log2(group * max(*counts, mixture.cosine)))))
+    numbers = np.arange(count // group) if stream is None else stream
     directions = np.zeros((count * total, 3), np.float32)
     chosen = np.full((count, total), -1, np.int32)
-    counts = mixture.per_lobe, mixture.lights
     draw_directions(
-        points.normal, points.to_camera, origin, (sequence, shift), counts, alphas,
-        lights.arrays, directions.reshape(count, total, 3), chosen,
+        points.normal, points.to_camera, origin, (sobol, numbers, seed), counts, alphas,
+        lights.groups.arrays, directions.reshape(count, total, 3), chosen,
     )  # fmt: skip
     hits = rays.closest(np.repeat(origin, total, axis=0), directions)
     samples = LobeSamples(
@@ -123,27 +127,32 @@ def lobe_basis(
     seed: int,
     mixture: Mixture = Mixture(),
     stream: Long | None = None,
-) -> Callable[[float], tuple[Float, Float]]:
-    """phi -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3) each: the mean over
-    equally many consecutive ``points`` per group. The rays are traced here, once."""
-    samples = trace_lobe_samples(
-        lit.rays, points, lit.radiance, lit.lights, lit.environment, mixture, lit.size, seed, stream
-    )
+) -> Basis:
+    """Roughnesses (Q,) -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3, Q) each: the
+    mean over equally many consecutive ``points`` per group. Rays are traced once, when they
+    are first needed."""
 
-    def mean(values: Float) -> Float:
-        means: Float = values.reshape(num_groups, -1, 3).mean(axis=1)
-        return means
+    @cache
+    def samples() -> LobeSamples:
+        return trace_lobe_samples(
+            lit.rays, points, lit.radiance, lit.lights, lit.environment, mixture, lit.size, seed,
+            stream, group=len(points.face) // max(num_groups, 1),
+        )  # fmt: skip
 
-    def basis(phi: float) -> tuple[Float, Float]:
-        base, slope = non_diffuse(samples, np.full(len(samples.cos_out), phi, np.float32))
-        return mean(base), mean(slope)
+    def basis(phis: Sequence[float]) -> tuple[Float, Float]:
+        # As many as vector instructions take at once.
+        padded = np.zeros(-(-len(phis) // _LANES) * _LANES, np.float32)
+        padded[: len(phis)] = phis
+        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)))
+        return base[..., : len(phis)], slope[..., : len(phis)]
 
     return basis
 
 
-def non_diffuse(samples: LobeSamples, phi: Float) -> tuple[Float, Float]:
-    """I_nd = base + psi * slope of every point, (R, 3) float32 each, for roughnesses (R,)."""
-    base = np.zeros((len(samples.cos_out), 3), np.float32)
+def non_diffuse(samples: LobeSamples, phis: Float) -> tuple[Float, Float]:
+    """I_nd = base + psi * slope, (G, 3, Q) float32 each, means over each of G groups of consecutive
+    points, for its roughnesses phis (G, Q)."""
+    base = np.zeros((len(phis), 3, phis.shape[1]), np.float32)
     slope = np.zeros_like(base)
-    integrate(samples.arrays, samples.weighted, phi, base, slope)
+    integrate(samples.arrays, samples.weighted, phis, base, slope)
     return base, slope

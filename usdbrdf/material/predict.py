@@ -43,8 +43,8 @@ def non_diffuse_radiance(
         part = np.arange(start, min(start + step, len(phi)))
         samples = trace_lobe_samples(
             lit.rays, points.take(part), lit.radiance, lit.lights, lit.environment, mixture,
-            lit.size, seed, None if stream is None else stream[part], alphas[part], start,
+            lit.size, seed, part if stream is None else stream[part], alphas[part],
         )  # fmt: skip
-        base, slope = non_diffuse(samples, phi[part].astype(np.float32))
-        result[part] = base + psi[part, None] * slope
+        base, slope = non_diffuse(samples, phi[part, None].astype(np.float32))
+        result[part] = base[..., 0] + psi[part, None] * slope[..., 0]
     return result

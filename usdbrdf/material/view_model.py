@@ -19,12 +19,13 @@ outliers lose weight as under Student's t distribution.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, sparse
+from scipy import sparse
+
+from usdbrdf.material.shared_errors import SharedErrors, effects_of_frames
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -58,12 +59,20 @@ class ViewSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced:
-    """(P, 3) values freed of the texels' means, the same weighted, and their part along the shared
-    errors, whitened."""
+    """K sets of values freed of the texels' means, (P, 3, K), the same weighted, and their part
+    along the shared errors, whitened, (N, K)."""
 
     values: Double
     weighted: Double
     shared: Double
+
+    def parts(self, count: int) -> list[Reduced]:
+        """Equally many sets after each other."""
+        every = [np.split(one, count, axis=-1) for one in (self.values, self.weighted, self.shared)]
+        return [
+            Reduced(values=values, weighted=weighted, shared=shared)
+            for values, weighted, shared in zip(*every, strict=True)
+        ]
 
 
 class ViewModel:
@@ -72,6 +81,7 @@ class ViewModel:
     def __init__(self, samples: ViewSamples) -> None:
         self._texel = samples.texel
         self._num_texels = int(samples.texel.max()) + 1
+        self._gather = _gather(samples.texel)
         self._radiance = samples.radiance.astype(np.float64)
         self._noise = samples.noise.astype(np.float64)
         count = np.bincount(samples.texel)
@@ -81,8 +91,8 @@ class ViewModel:
         self._specular = np.zeros_like(mean)
         # Of all samples, what is left for errors after each texel took its mean.
         self._freedom = len(samples.texel) / (len(samples.texel) - len(count))
-        self._effects = _effects(samples)
-        self._deviation = np.full(len(self._effects), _FIRST_GUESS)
+        self._effects = effects_of_frames(_effects(samples), samples.frame)
+        self._deviation = np.full(self._effects.kinds, _FIRST_GUESS)
         self._own_deviation = _FIRST_GUESS
         self._scale = 1.0
         self._trust = np.ones(len(samples.texel))
@@ -93,61 +103,42 @@ class ViewModel:
         return 3 * (len(self._texel) - self._num_texels)
 
     def reduced(self, values: npt.NDArray[np.floating]) -> Reduced:
-        """Prepare (P, 3) values for ``product``."""
-        return self.all_reduced([values])[0]
+        """Prepare K sets of values at once, (P, 3, K), for ``product``."""
+        rest = values - self._texel_means(self._weight @ values)[self._texel]
+        weighted = self._weight @ rest
+        return Reduced(values=rest, weighted=weighted, shared=self._shared.whitened(weighted))
 
-    def all_reduced(self, many: Sequence[npt.NDArray[np.floating]]) -> list[Reduced]:
-        """The same for many at once, which is faster."""
-        means = [self._texel_means(self._weigh(values)) for values in many]
-        rest = [values - mean[self._texel] for values, mean in zip(many, means, strict=True)]
-        weighted = [self._weigh(values) for values in rest]
-        along = self._design.T @ np.stack([values.reshape(-1) for values in weighted], axis=1)
-        shared = linalg.solve_triangular(self._factor, along, trans="T", check_finite=False)
-        return [
-            Reduced(values=values, weighted=its, shared=own)
-            for values, its, own in zip(rest, weighted, shared.T, strict=True)
-        ]
-
-    def product(self, a: Reduced, b: Reduced) -> float:
-        """a' C^-1 b, C being the covariance of the samples with the diffuse parts left free."""
-        return float((a.values * b.weighted).sum()) - float(a.shared @ b.shared)
+    def product(self, a: Reduced, b: Reduced) -> Double:
+        """a' C^-1 b of each of K sets, (K,), C being the covariance of the samples with the diffuse
+        parts left free."""
+        products: Double = np.einsum("pck,pck->k", a.values, b.weighted)
+        products -= np.einsum("nk,nk->k", a.shared, b.shared)
+        return products
 
     def update(self, non_diffuse: npt.NDArray[np.floating]) -> None:
         """One step of expectation maximisation, given I_nd (P, 3) of the best lobe so far."""
         rest = self._radiance - non_diffuse
-        white = self.reduced(rest).shared
-        effect = linalg.solve_triangular(self._factor, white, check_finite=False)
-        square = effect**2 + _diagonal_of_inverse(self._factor)
-        self._deviation = np.array(
-            [
-                max(_LEAST, float(np.sqrt(square[first:last].mean()))) if last > first else _LEAST
-                for first, last in zip(self._first, self._first[1:], strict=False)
-            ]
-        )
-        left = self.reduced(rest - (self._design @ effect).reshape(-1, 3))
+        errors, square = self._shared.expected(self.reduced(rest[..., None]).shared[:, 0])
+        self._deviation = np.maximum(_LEAST, np.sqrt(square))
+        left = self.reduced((rest - errors)[..., None])
+        values, weighted = left.values[..., 0], left.weighted[..., 0]
         own_variance = 1 / self._own_precision
-        own = (self._towards_level * left.values).sum(axis=1) * own_variance
+        own = (self._towards_level * values).sum(axis=1) * own_variance
         self._own_deviation = float(np.sqrt((self._trust * (own**2 + own_variance)).mean()))
-        alone = left.values - own[:, None] * self._level
+        alone = values - own[:, None] * self._level
         explained = (self._level**2 * own_variance[:, None] / self._variance).mean()
         self._scale *= float((alone**2 / self._variance).mean() * self._freedom + explained)
-        distance = (left.values * left.weighted).sum(axis=1) * self._freedom / self._trust
+        distance = (values * weighted).sum(axis=1) * self._freedom / self._trust
         self._trust = (_TAIL + 3) / (_TAIL + distance)
         self._specular = np.maximum(non_diffuse, 0).astype(np.float64)
-        diffuse = self._texel_means(self._weigh(rest))[self._texel]
+        diffuse = self._texel_means(self._weight @ rest[..., None])[self._texel, :, 0]
         self._level = np.maximum(diffuse, _LEAST_LEVEL * self._mean)
         self._factorise()
 
-    def _weigh(self, values: npt.NDArray[np.floating]) -> Double:
-        """Each sample's inverse 3 x 3 covariance, of its own errors, times its values."""
-        along = (self._towards_level * values).sum(axis=1) / self._own_precision
-        weighted: Double = values / self._variance - self._towards_level * along[:, None]
-        return weighted
-
     def _texel_means(self, weighted: Double) -> Double:
-        """(num_texels, 3) generalised means from weighted values."""
-        sums = [np.bincount(self._texel, c, self._num_texels) for c in weighted.T]
-        means: Double = np.einsum("tij,jt->ti", self._texel_covariance, np.stack(sums))
+        """(num_texels, 3, K) generalised means from weighted values."""
+        sums = self._gather @ weighted.reshape(len(weighted), -1)
+        means: Double = self._texel_covariance @ sums.reshape(self._num_texels, *weighted.shape[1:])
         return means
 
     def _factorise(self) -> None:
@@ -159,28 +150,21 @@ class ViewModel:
         self._own_precision = self._trust / self._own_deviation**2 + (
             self._towards_level * self._level
         ).sum(axis=1)
+        # Each sample's inverse 3 x 3 covariance, of its own errors.
         weight = -np.einsum("pi,pj->pij", self._towards_level, self._towards_level)
         weight /= self._own_precision[:, None, None]
         weight[:, range(3), range(3)] += 1 / self._variance
-        sums = [np.bincount(self._texel, w, self._num_texels) for w in weight.reshape(-1, 9).T]
-        self._texel_covariance = np.linalg.inv(np.stack(sums, axis=-1).reshape(-1, 3, 3))
-        self._design, self._first = _design(self._effects, self._level)
-        self._factor = linalg.cholesky(self._normal_matrix(weight), check_finite=False)
-
-    def _normal_matrix(self, weight: Double) -> Double:
-        """The shared errors' normal equations, texel means eliminated, with their priors."""
-        count, texels = len(self._texel), self._num_texels
-        weighted = _block_diagonal(weight) @ self._design
-        rows = (3 * self._texel[:, None] + np.arange(3)).reshape(-1)
-        gather = sparse.csr_matrix(
-            (np.ones(3 * count), (rows, np.arange(3 * count))), shape=(3 * texels, 3 * count)
+        self._weight = weight
+        of_texels = (self._gather @ weight.reshape(-1, 9)).reshape(-1, 3, 3)
+        self._texel_covariance = np.linalg.inv(of_texels)
+        self._shared = SharedErrors(
+            self._effects, self._deviation, self._level, weight, self._texel, of_texels
         )
-        of_texels = gather @ weighted
-        means = of_texels.T @ (_block_diagonal(self._texel_covariance) @ of_texels)
-        normal: Double = (self._design.T @ weighted - means).toarray()
-        precision = np.repeat(1 / self._deviation**2, np.diff(self._first))
-        normal[np.diag_indices_from(normal)] += precision
-        return normal
+
+
+def _gather(texel: Long) -> sparse.csr_matrix:
+    """(texels, P): sums of each texel's samples."""
+    return sparse.csr_matrix((np.ones(len(texel)), (texel, np.arange(len(texel)))))
 
 
 def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
@@ -192,7 +176,7 @@ def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
         small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
         every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
         every += [(which, channel) for which in (frame, large) for channel in range(3)]
-        # The normal matrix is dense: its size bounds memory and time.
+        # Their number bounds memory and time.
         if sum(int(which.max(initial=-1)) + 1 for which, _ in every) <= _MOST_EFFECTS:
             return every
         patch *= 1.5
@@ -212,35 +196,3 @@ def _shared(group: Long) -> Long:
     shared = np.full(len(group), -1, np.int64)
     shared[~alone] = np.unique(number[~alone], return_inverse=True)[1]
     return shared
-
-
-def _design(
-    effects: list[tuple[Long, int | None]], level: Double
-) -> tuple[sparse.csr_matrix, Long]:
-    """How the shared errors enter the 3 P channel values, and the first column of each kind."""
-    first = np.cumsum([0] + [int(which.max(initial=-1)) + 1 for which, _ in effects])
-    rows, columns, values = [], [], []
-    for (which, channel), start in zip(effects, first, strict=False):
-        sample = np.flatnonzero(which >= 0)
-        for c in range(3) if channel is None else (channel,):
-            rows.append(3 * sample + c)
-            columns.append(start + which[sample])
-            values.append(level[sample, c])
-    places = np.concatenate(rows), np.concatenate(columns)
-    shape = 3 * len(level), int(first[-1])
-    return sparse.csr_matrix((np.concatenate(values), places), shape=shape), first
-
-
-def _diagonal_of_inverse(factor: Double) -> Double:
-    """From an upper Cholesky factor; LAPACK itself refuses a matrix without rows."""
-    if not len(factor):
-        return np.zeros(0)
-    diagonal: Double = np.diag(linalg.lapack.dpotri(factor)[0])
-    return diagonal
-
-
-def _block_diagonal(blocks: Double) -> sparse.bsr_matrix:
-    count = len(blocks)
-    return sparse.bsr_matrix(
-        (blocks, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count)
-    )

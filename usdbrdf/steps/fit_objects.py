@@ -17,8 +17,9 @@ from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stage import StageRun
 from usdbrdf.material.fit_target import Residual, fit_target_frame
-from usdbrdf.material.fit_views import fit_views
+from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.lit_scene import LitScene, View
+from usdbrdf.material.lobe_samples import Mixture
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
 from usdbrdf.scan.frame_reading import read_frame
@@ -154,16 +155,18 @@ def fit_object(
     survey: Survey,
     index: int,
     options: FitOptions,
+    mixture: Mixture = MIXTURE,
 ) -> dict[str, npt.NDArray[Any]]:
     """phi, psi, their errors, share unresolved, cost and evidence (NaN where the object could not
-    be fitted), the number of samples, and the target frame (-1: none)."""
+    be fitted), the number of samples, and the target frame (-1: none). mixture: see fit_views."""
     numbers, used, target = np.full(7, np.nan), 0, int(survey.target[index])
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
         lobe, used = fit_views(
-            lit, texels, own, lambda frame: _view(frames, frame, *nothing), index, options.seed
-        )
+            lit, texels, own, lambda frame: _view(frames, frame, *nothing), index, options.seed,
+            mixture,
+        )  # fmt: skip
         if lobe is not None:
             numbers[:] = (
                 lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
