@@ -25,7 +25,7 @@ def test_a_library_that_lacks_a_function_is_named(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(embree._FUNCTIONS, "rtcDoesNotExist", (None, []))
     embree._embree.cache_clear()
     try:
-        with pytest.raises(EnvironmentFailure, match="rtcDoesNotExist.*install the wheel"):
+        with pytest.raises(EnvironmentFailure, match=r"rtcDoesNotExist.*install the wheel"):
             EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
     finally:
         embree._embree.cache_clear()
@@ -51,7 +51,7 @@ def test_scenes_come_and_go():
 
 
 def test_what_embree_refuses_is_said():
+    # A buffer that starts off the four bytes that Embree asks for.
+    off = np.zeros(13, np.int8)[1:].view(np.int32).reshape(1, 3)
     with pytest.raises(EnvironmentFailure, match="1 triangles"):
-        # A buffer that starts off the four bytes that Embree asks for.
-        off = np.zeros(13, np.int8)[1:].view(np.int32).reshape(1, 3)
         EmbreeScene(_TRIANGLE, off)

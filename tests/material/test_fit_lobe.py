@@ -175,9 +175,11 @@ def test_footprints_that_fit_alike_are_averaged():
         phi=0.2, psi=0.5, phi_error=0.03, psi_error=0.1, unresolved=0.01, cost=1.0, evidence=0.7
     )
     other = replace(one, phi=0.3, psi=0.7, unresolved=0.05)
-    both = averaged([one, other], 1000)
+    both = averaged([one, other], 1000, [1, 1])
     assert (both.phi, both.psi, both.unresolved) == pytest.approx((0.25, 0.6, 0.03))
     assert both.phi_error == pytest.approx(math.hypot(0.03, 0.05))
     assert both.psi_error == pytest.approx(math.hypot(0.1, 0.1))
-    assert averaged([one, replace(other, cost=1.5)], 1000).phi == pytest.approx(0.2, abs=1e-6)
-    assert averaged([one], 1000) == one
+    worse = replace(other, cost=1.5)
+    assert averaged([one, worse], 1000, [1, 1]).phi == pytest.approx(0.2, abs=1e-6)
+    assert averaged([one, other], 1000, [1, 3]).phi == pytest.approx((one.phi + 3 * other.phi) / 4)
+    assert averaged([one], 1000, [1]) == one

@@ -36,6 +36,7 @@ class Candidate:
     first, second, third  roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K)
                           each, with independent noise
     blur                  standard deviation of the normal over a footprint, in radians
+    likely                how likely the footprint is, before the samples are asked
 
     Noise squared would draw psi towards 0; the product of two independent noises does not. But
     weights that follow from these two would choose samples in which they cancel, and draw psi up:
@@ -46,6 +47,7 @@ class Candidate:
     second: Basis
     third: Basis
     blur: float
+    likely: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +97,8 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
         _estimate(model, radiance, candidate, search, without)
         for candidate, search in zip(candidates, coarse, strict=True)
     ]
-    return averaged(estimates, model.degrees_of_freedom)
+    likely = [candidate.likely for candidate in candidates]
+    return averaged(estimates, model.degrees_of_freedom, likely)
 
 
 def _estimate(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 
 import numpy as np
@@ -37,6 +38,9 @@ _FOOTPRINT = 0.7
 # tried as well, as long as so many of the samples keep the whole footprint on the object.
 _WIDER = (0.5, 1.0, 1.4, 2.0)
 _KEPT = 0.4
+# How likely each is follows a normal distribution of the logarithm about the width that the
+# pictures' noise tells: what smooths noise may leave bright highlights sharper.
+_SPREAD_OF_WIDTHS = math.log(1.5)
 # From this deviation of the normal over a footprint on, in radians, an object counts as curved.
 _CURVED = 0.01
 MIN_OBSERVATIONS = 48
@@ -44,7 +48,9 @@ _MIN_VIEWS = 3
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
 # the brighter samples would be valid.
 _ABOVE_NOISE = 4.0
+# Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
+_TIMES_FOR_CURVED = 2
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 
@@ -61,7 +67,7 @@ def fit_views(
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
     view_of(frame) gives poses and pinholes; the images themselves are not needed any more.
-    mixture: the rays of each of a sample's points, traced three times.
+    mixture: the rays of each of a sample's points, traced three times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -70,8 +76,11 @@ def fit_views(
     if len(observed.texel) < MIN_OBSERVATIONS:
         return None, len(observed.texel)
     samples = _samples(lit, texels, observed, footprints[0], view_of)
+    if len(footprints) > 1:
+        times = _TIMES_FOR_CURVED
+        mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
     candidates = []
-    for points in footprints:
+    for points, width in zip(footprints, (_FOOTPRINT, *_WIDER), strict=False):
         # Views of a texel share their random numbers: what they have in common then cancels in
         # their differences, which are all that is fitted.
         bases = [
@@ -79,7 +88,11 @@ def fit_views(
             for k in range(3)
         ]
         blur = _deviation_of_normal(points)
-        candidates.append(Candidate(first=bases[0], second=bases[1], third=bases[2], blur=blur))
+        likely = _likely(width, float(observed.smoothing[0]))
+        first, second, third = bases
+        candidates.append(
+            Candidate(first=first, second=second, third=third, blur=blur, likely=likely)
+        )
     return fit_lobe(samples, candidates), len(samples.texel)
 
 
@@ -111,6 +124,15 @@ def _footprints(
             observed = observed.take(inner)
             return observed, [whole(observed, width)[1] for width in widths]
     return observed, [points]
+
+
+def _likely(width: float, smoothing: float) -> float:
+    """Of a footprint of so many pixels, in pictures smoothed by ``smoothing`` pixels (NaN: nobody
+    knows, and all are alike)."""
+    if math.isnan(smoothing):
+        return 1.0
+    expected = math.hypot(_FOOTPRINT, smoothing)
+    return math.exp(-0.5 * (math.log(width / expected) / _SPREAD_OF_WIDTHS) ** 2)
 
 
 def _width(texels: Texels, observed: Observations, view_of: Callable[[int], View]) -> float:

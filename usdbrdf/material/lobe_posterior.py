@@ -79,12 +79,15 @@ def lobe_from_costs(
     )
 
 
-def averaged(estimates: Sequence[LobeEstimate], freedom: int) -> LobeEstimate:
-    """Estimates of one lobe from different models, weighted by how likely these are; cost and
-    evidence are the best one's."""
+def averaged(
+    estimates: Sequence[LobeEstimate], freedom: int, likely: Sequence[float]
+) -> LobeEstimate:
+    """Estimates of one lobe from different models, weighted by how likely these are: before the
+    samples were asked, ``likely``, and with them. Cost and evidence are the best one's."""
     costs = np.array([estimate.cost * max(freedom, 1) for estimate in estimates])
     least = float(costs.min())
     weight = np.exp(-0.5 * (costs - least) / max(1.0, _MODEL_DISCREPANCY * least))
+    weight *= np.array(likely)
     weight /= weight.sum()
 
     def mean(name: str) -> tuple[float, Double]:

@@ -18,6 +18,7 @@ from usdbrdf.geometry.rays import lift_from_surface
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.material.lit_scene import LitScene, View
 from usdbrdf.material.patches import sides_of_samples
+from usdbrdf.material.smoothing import noise_correlation, smoothing_of
 from usdbrdf.shading.warps import patch_shifts
 from usdbrdf.texturing.samples_from_frame import SAMPLE, first_surfaces, samples_from_frame
 
@@ -38,6 +39,8 @@ _FEWEST = 40
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
 _PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
+# How far pictures were smoothed is measured on about so many frames.
+_FRAMES_OF_NOISE = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,9 @@ class Observations:
     """M samples of texels by frames, sorted by object and texel.
 
     texel (M,) int32; frame (M,) int32; radiance (M, 3) float32; noise (M,) float32, the frame's
-    noise floor; side (M,) float32, of the square that the sample is the mean of, in texels
+    noise floor; side (M,) float32, of the square that the sample is the mean of, in texels;
+    smoothing (M,) float32, see ``smoothing_of``: standard deviation in pixels of what smoothed the
+    pictures
     """
 
     texel: Int
@@ -53,6 +58,7 @@ class Observations:
     radiance: Float
     noise: Float
     side: Float
+    smoothing: Float
 
     def of_texels(self, own: slice) -> Observations:
         """Those of one object's texels."""
@@ -86,6 +92,8 @@ class Follower:
         self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
         self._added = 0
+        self._frames_per_noise = max(1, frames // _FRAMES_OF_NOISE)
+        self._noise_in_tiles: list[Double] = []
         cells = (rows, len(self._index))
         self._seen = np.zeros(cells, np.bool_)
         self._radiance = np.zeros((*cells, 3), np.float32)
@@ -95,6 +103,8 @@ class Follower:
     def add(self, view: View, clipped: Bool, noise_floor: float) -> None:
         """Sample the followed texels in the next frame."""
         row = self._row.get(self._added)
+        if len(self._index) and self._added % self._frames_per_noise == 0:
+            self._noise_in_tiles.append(noise_correlation(self._lit, view))
         self._added += 1
         if row is None or not len(self._index):
             return
@@ -130,6 +140,7 @@ class Follower:
             radiance=self._radiance[row, column],
             noise=self._noise[row],
             side=self._side[column],
+            smoothing=np.full(len(row), smoothing_of(self._noise_in_tiles), np.float32),
         )
 
     def target_frames(self, texels: Texels) -> Int:
