@@ -11,7 +11,7 @@ from usdbrdf.shading import incoming_light
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.shading.light_by_picks import pick_triangles
-from usdbrdf.shading.light_groups import LightGroups, light_groups, weighed_groups
+from usdbrdf.shading.light_groups import LightGroups, weighed_groups
 from usdbrdf.shading.lights import Lights
 
 
@@ -43,7 +43,7 @@ def _weighed(groups: LightGroups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("count", [1, 5, 3000])
 def test_every_triangle_has_one_group_whose_bounds_hold_it(count: int):
     lights = _soup(count)
-    groups = light_groups(*lights.arrays)
+    groups = lights.groups
     np.testing.assert_array_equal(np.sort(groups.face), lights.face)
     np.testing.assert_array_equal(groups.of_face[groups.face], np.arange(count))
     of = groups.triangles[:, 13].astype(int)
@@ -57,7 +57,7 @@ def test_every_triangle_has_one_group_whose_bounds_hold_it(count: int):
 
 def test_densities_of_a_patch_integrate_to_one():
     lights = _soup(3000)
-    groups = light_groups(*lights.arrays)
+    groups = lights.groups
     cumulative, _, ratio = _weighed(groups)
     np.testing.assert_allclose(cumulative[:, -1], 1, atol=1e-6)
     corners = lights.corners.astype(np.float64)
@@ -72,7 +72,7 @@ def test_densities_of_a_patch_integrate_to_one():
 
 def test_picks_follow_the_density_and_leave_a_uniform_number():
     lights = _soup(300)
-    groups = light_groups(*lights.arrays)
+    groups = lights.groups
     cumulative, guide, ratio = _weighed(groups)
     count = 1 << 16
     patch = np.zeros(count, np.int32)

@@ -24,7 +24,6 @@ from usdbrdf.material.lobe import (
 )
 from usdbrdf.shading.environment import EnvironmentArrays, environment_at
 from usdbrdf.shading.light_groups import GroupArrays, picked
-from usdbrdf.shading.lights import LightArrays
 from usdbrdf.shading.warps import cosine_direction, hashed_uniform, tangent_frame, triangle_point
 
 Float = npt.NDArray[np.float32]
@@ -143,7 +142,7 @@ def weigh(
     hits: tuple[Int, Float],
     counts: tuple[int, int],
     alphas: Double,
-    lights: LightArrays,
+    lights: GroupArrays,
     environment: EnvironmentArrays,
     incident: Float,
     samples: SampleArrays,
@@ -151,7 +150,7 @@ def weigh(
     """Turn incident radiance (R, K, 3), in place, into L cos / (sum of all densities)."""
     face, distance = hits
     per_lobe, num_lights = counts
-    _, _, light_density, _, face_normals = lights
+    _, _, _, _, light_of_face, triangles, is_light = lights
     image, z_up = environment
     cos_in, sin2_half, graze, _ = samples
     num_cosine = directions.shape[1] - per_lobe * alphas.shape[1] - num_lights
@@ -162,11 +161,11 @@ def weigh(
             f = face[r, k]
             cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
             light = 0.0
-            if f >= 0 and num_lights > 0 and light_density[f] > 0:
-                m = face_normals[f]
-                facing = -(w[0] * m[0] + w[1] * m[1] + w[2] * m[2])
+            if f >= 0 and num_lights > 0 and is_light[f >> 3] >> (f & 7) & 1:
+                t = triangles[light_of_face[f]]
+                facing = -(w[0] * t[9] + w[1] * t[10] + w[2] * t[11])
                 if facing > 0:
-                    light = light_density[f] * distance[r, k] * distance[r, k] / facing
+                    light = t[12] * distance[r, k] * distance[r, k] / facing
             # A ray sent to a point on a light counts only if that is what it meets.
             missed = chosen[r, k] >= 0 and (light <= 0 or chosen[r, k] != f)
             if cosine <= 0 or missed:

@@ -115,7 +115,7 @@ def trace_lobe_samples(
     weigh(
         points.normal, points.to_camera, directions.reshape(count, total, 3), chosen,
         (hits.face.reshape(count, total), hits.distance.reshape(count, total)), counts,
-        alphas, lights.arrays, environment.arrays, samples.weighted, samples.arrays,
+        alphas, lights.groups.arrays, environment.arrays, samples.weighted, samples.arrays,
     )  # fmt: skip
     return samples
 

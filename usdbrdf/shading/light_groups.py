@@ -80,12 +80,11 @@ class LightGroups:
 
 
 def light_groups(
-    face: Int, cumulative: Double, density: Float, all_corners: Float, all_normals: Float
+    face: Int, cumulative: Double, density: Float, of_corners: Float, of_normals: Float
 ) -> LightGroups:
-    """Groups of ``Lights.arrays``, split where power times extent is largest."""
+    """Groups of ``Lights``, split where power times extent is largest."""
     power = np.diff(cumulative, prepend=0)
-    corners = all_corners[face].astype(np.float64)
-    normals = all_normals[face].astype(np.float64)
+    corners, normals = of_corners.astype(np.float64), of_normals.astype(np.float64)
     centres = corners.mean(axis=1)
     # Lights that face apart are as good as far apart.
     size = np.linalg.norm(np.ptp(centres, axis=0)) if len(centres) else 0.0

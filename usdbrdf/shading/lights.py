@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +15,6 @@ from usdbrdf.shading.light_groups import LightGroups, light_groups
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int32]
-
-# What the kernels take of Lights, in this order: face, cumulative, density, corners, normals.
-LightArrays: TypeAlias = tuple[Int, Double, Float, Float, Float]
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
@@ -33,7 +29,7 @@ class Lights:
     cumulative   (K,) float64, ascending to 1: probability of picking one of the first k
     density      (F,) float32, probability per m^2 of a point on any triangle of the scene (0 on
                  those that are no light)
-    corners      (F, 3, 3) float32, metres; normals (F, 3) float32, unit
+    corners      (K, 3, 3) float32, metres, and normals (K, 3) float32, unit, of the lights
     """
 
     face: Int
@@ -42,13 +38,9 @@ class Lights:
     corners: Float
     normals: Float
 
-    @property
-    def arrays(self) -> LightArrays:
-        return self.face, self.cumulative, self.density, self.corners, self.normals
-
     @cached_property
     def groups(self) -> LightGroups:
-        return light_groups(*self.arrays)
+        return light_groups(self.face, self.cumulative, self.density, self.corners, self.normals)
 
 
 def lights_from_radiance(
@@ -82,8 +74,8 @@ def lights_from_radiance(
         face=face,
         cumulative=np.cumsum(share[face]) / total if len(face) else np.zeros(0),
         density=density,
-        corners=corners.astype(np.float32),
-        normals=(normal / np.maximum(doubled, 1e-30)[:, None]).astype(np.float32),
+        corners=corners[face].astype(np.float32),
+        normals=(normal[face] / doubled[face, None]).astype(np.float32),
     )
 
 

@@ -153,7 +153,7 @@ def _without_lobes(
 
 def _bytes_of(lit: LitScene) -> int:
     """What the light takes beside scene and texels."""
-    return lit.radiance.pixels.nbytes + lit.emission.pixels.nbytes + lit.lights.corners.nbytes
+    return lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
 
 
 def _observe(
