@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from usdbrdf.geometry.normals import corner_normals, face_normals
+from usdbrdf.geometry import normals as normals_module
+from usdbrdf.geometry.normals import corner_normals, doubled_areas, face_normals
 from usdbrdf.geometry.weld import welded_ids
 
 
@@ -108,3 +109,17 @@ def test_weld_joins_equal_positions_and_minus_zero():
     points = np.array([[0, 0, 1], [0, 0, 0], [-0.0, 0, 0], [0, 0, 1], [0, 1e-7, 0]], np.float32)
     assert welded_ids(points).tolist() == [1, 0, 0, 1, 2]
     assert welded_ids(points[:0]).tolist() == []
+
+
+def test_areas_are_those_of_any_number_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(9)
+    points, triangles = rng.random((40, 3), np.float32), rng.integers(0, 40, (50, 3))
+    # Heron's formula.
+    a, b, c = (
+        np.linalg.norm(points[triangles[:, k]].astype(float) - points[triangles[:, k - 1]], axis=1)
+        for k in range(3)
+    )
+    half = (a + b + c) / 2
+    square = half * (half - a) * (half - b) * (half - c)
+    monkeypatch.setattr(normals_module, "_AT_A_TIME", 7)
+    np.testing.assert_allclose((doubled_areas(points, triangles) / 2) ** 2, square, atol=1e-9)

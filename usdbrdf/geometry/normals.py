@@ -18,6 +18,7 @@ Int = npt.NDArray[np.int32]
 # The pairs of corners around one vertex grow with the square of their number. Beyond this a vertex
 # is the hub of a fan that no smoothing can help; its corners keep their faces' normals.
 _MAX_CORNERS = 4096
+_AT_A_TIME = 1 << 18
 
 
 def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Float:
@@ -49,6 +50,23 @@ def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Fl
 def face_normals(points: Float, triangles: Int) -> Double:
     """(F, 3) float64 unit normals, counter-clockwise; zero where a triangle has no area."""
     return _face_normals_and_angles(points, triangles)[0]
+
+
+def doubled_areas(points: Float, triangles: Int) -> Double:
+    """(F,) float64, twice the triangles' areas, in the points' unit squared; some triangles at a
+    time, which takes little memory."""
+    doubled = np.empty(len(triangles))
+    for start in range(0, len(triangles), _AT_A_TIME):
+        part = slice(start, start + _AT_A_TIME)
+        doubled[part] = np.linalg.norm(across_triangles(points, triangles[part]), axis=1)
+    return doubled
+
+
+def across_triangles(points: Float, triangles: Int) -> Double:
+    """(F, 3) float64 along the triangles' normals, as long as twice their areas."""
+    first, second, third = (points[triangles[:, k]].astype(np.float64) for k in range(3))
+    across: Double = np.cross(second - first, third - first)
+    return across
 
 
 def _face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:

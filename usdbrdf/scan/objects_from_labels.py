@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.geometry.mesh_from_file import FileMesh
+from usdbrdf.geometry.normals import doubled_areas
 from usdbrdf.geometry.weld import welded_ids
 from usdbrdf.scan.scan import ObjectLabel
 from usdbrdf.stage.naming import unique_identifiers
@@ -127,7 +128,9 @@ def _connected_parts(mesh: FileMesh, min_area: float) -> Segmentation:
     )
     _, part_of_point = connected_components(links, directed=False)
     parts, part_of_face = np.unique(part_of_point[corners[:, 0]], return_inverse=True)
-    area = np.bincount(part_of_face, weights=_areas(mesh), minlength=len(parts))
+    area = np.bincount(
+        part_of_face, weights=doubled_areas(mesh.points, mesh.triangles) / 2, minlength=len(parts)
+    )
     order = np.argsort(-area, kind="stable")
     large = order[area[order] >= min_area][:_MAX_OBJECTS]
     if len(large) < 2:
@@ -140,12 +143,6 @@ def _connected_parts(mesh: FileMesh, min_area: float) -> Segmentation:
     if len(large) < len(parts):
         labels.append(("rest", ""))
     return Segmentation(face_object=object_of_part[part_of_face], labels=tuple(labels))
-
-
-def _areas(mesh: FileMesh) -> Double:
-    p = mesh.points.astype(np.float64)[mesh.triangles]
-    crossed: Double = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    return np.asarray(np.linalg.norm(crossed, axis=1) / 2, np.float64)
 
 
 def objects_with_faces(

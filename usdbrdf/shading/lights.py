@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf.geometry.normals import across_triangles, doubled_areas
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.shading.light_groups import LightGroups, light_groups
@@ -59,9 +60,7 @@ def lights_from_radiance(
     covered = np.bincount(texels.face, weight, num_faces).astype(np.float64)
     mean = _mean_per_face(scene, texels, brightness, power, covered)
 
-    corners = scene.points[scene.triangles].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(normal, axis=-1)
+    doubled = doubled_areas(scene.points, scene.triangles)
     area = doubled / 2
     scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
     bright = (mean > brighter_than * scene_mean) & (area > 0)
@@ -70,12 +69,14 @@ def lights_from_radiance(
     face = np.flatnonzero(bright).astype(np.int32)
     density = np.zeros(len(area), np.float32)
     density[face] = share[face] / total / area[face]
+    triangles = scene.triangles[face]
+    normals = across_triangles(scene.points, triangles) / doubled[face, None]
     return Lights(
         face=face,
         cumulative=np.cumsum(share[face]) / total if len(face) else np.zeros(0),
         density=density,
-        corners=corners[face].astype(np.float32),
-        normals=(normal[face] / doubled[face, None]).astype(np.float32),
+        corners=scene.points[triangles].astype(np.float32),
+        normals=normals.astype(np.float32),
     )
 
 
