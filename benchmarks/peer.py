@@ -205,7 +205,9 @@ def compared(efforts: list[dict[str, Any]], course: list[dict[str, Any]]) -> dic
 
     def as_good(one: dict[str, Any], other: dict[str, Any]) -> bool:
         errors, others = one["errors"]["measured"], other["errors"]["measured"]
-        return errors is not None and all(a <= b for a, b in zip(errors, others, strict=True))
+        if errors is None or others is None:
+            return False
+        return all(a <= b for a, b in zip(errors, others, strict=True))
 
     def at(check: dict[str, Any]) -> dict[str, Any] | None:
         able = [one for one in efforts if as_good(one, check)]
@@ -261,10 +263,9 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
         rows.append(figure(f"peer ({which}) over our default, CPU", ratio, "x"))
     rows.append(figure("our default, CPU", ours[0]["cpu"], "s"))
     for which in ("measured", "all"):
-        for k, name in enumerate(("phi", "psi")):
-            what = f"mean error of {name}, {which} objects"
-            rows.append(figure(f"{what}: our default", ours[0]["errors"][which][k], ""))
-            rows.append(figure(f"{what}: peer's last", peer["errors"][which][k], ""))
+        for who, errors in (("our default", ours[0]["errors"]), ("peer's last", peer["errors"])):
+            for name, value in zip(("phi", "psi"), errors[which] or (), strict=False):
+                rows.append(figure(f"mean error of {name}, {which} objects: {who}", value, ""))
     return rows
 
 

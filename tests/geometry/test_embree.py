@@ -31,23 +31,35 @@ def test_a_library_that_lacks_a_function_is_named(monkeypatch: pytest.MonkeyPatc
         embree._embree.cache_clear()
 
 
-def test_a_scene_keeps_what_embree_reads():
-    # Embree reads the vertices where they are: the caller's may be gone.
-    scene = EmbreeScene(_TRIANGLE.copy(), np.array([[0, 1, 2]], np.int32))
-    gc.collect()
-    waste = [np.full((3, 3), 1e9, np.float32) for _ in range(1000)]
+def test_what_embree_reads_is_the_scenes_own_and_padded():
+    given = _TRIANGLE.copy()
+    scene = EmbreeScene(given, np.array([[0, 1, 2]], np.int32))
+    assert not np.shares_memory(scene.points, given)
+    padded = scene.points
+    while padded.base is not None:
+        padded = padded.base
+    assert padded.nbytes >= scene.points.nbytes + 16
+    given[:] = 1e9
+    np.testing.assert_array_equal(scene.points, _TRIANGLE)
     assert _face(scene) == 0
-    assert len(waste) == 1000
 
 
-def test_scenes_come_and_go():
-    points = np.random.default_rng(1).random((3000, 3), np.float32)
-    triangles = np.arange(3000, dtype=np.int32).reshape(-1, 3)
-    first = EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
-    for _ in range(50):
-        EmbreeScene(points, triangles)
-        gc.collect()
-    assert _face(first) == 0
+def test_a_scene_is_released_once_nobody_holds_it(monkeypatch: pytest.MonkeyPatch):
+    released: list[int] = []
+    library = embree._embree()
+    release = library.rtcReleaseScene
+
+    def counted(address: int) -> None:
+        released.append(address)
+        release(address)
+
+    monkeypatch.setattr(library, "rtcReleaseScene", counted)
+    triangles = np.array([[0, 1, 2]], np.int32)
+    kept = EmbreeScene(_TRIANGLE, triangles)
+    gone = [EmbreeScene(_TRIANGLE, triangles).address for _ in range(5)]
+    gc.collect()
+    assert sorted(released) == sorted(gone)
+    assert _face(kept) == 0
 
 
 def test_what_embree_refuses_is_said():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from usdbrdf.material.fit_views import _likely
 from usdbrdf.material.smoothing import correlations, smoothing_of
 
 
@@ -39,3 +40,11 @@ def test_structure_of_the_surface_is_no_smoothing():
     row, column = np.indices((24, 24))
     slopes = np.random.default_rng(4).normal(size=(2, 200, 1, 1))
     assert math.isnan(smoothing_of([correlations(1 + slopes[0] * row + slopes[1] * column)]))
+
+
+def test_footprints_are_likely_about_what_the_noise_tells():
+    widths = (0.7, 0.5, 1.0, 1.4, 2.0)
+    sharp, smooth = ([_likely(width, s) for width in widths] for s in (0.0, 2.0))
+    assert widths[int(np.argmax(sharp))] == 0.7
+    assert widths[int(np.argmax(smooth))] == 2.0
+    assert [_likely(width, math.nan) for width in widths] == [1.0] * 5

@@ -195,3 +195,10 @@ def test_a_group_of_a_single_sample_has_no_error_of_its_own():
     samples.frame[3] = samples.frame[0]
     together = ViewModel(samples)
     assert _shared_errors(together) == 4
+
+
+def test_more_frames_than_shared_errors_are_wanted_come_to_an_end():
+    # Nine for each frame, however large the patches: more than the most that there may be.
+    few = _samples(np.random.default_rng(6), 3, 300)
+    model = ViewModel(few)
+    assert model.degrees_of_freedom > 0

@@ -13,7 +13,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import passes
-from usdbrdf.texturing.passes import OF_TEXTURING, BytesPerTexel, groups_of_texels
+from usdbrdf.texturing.passes import OF_TEXTURING, BytesPerTexel, by_parts, groups_of_texels
 
 
 @pytest.fixture(autouse=True)
@@ -84,3 +84,17 @@ def test_the_machines_memory_is_the_default(square: World, monkeypatch):
     monkeypatch.setattr(passes, "machine_bytes", lambda: 0.5 * GIB)
     with pytest.raises(EnvironmentFailure, match=r"limit is 0\.4"):
         _groups(square, None)
+
+
+def test_parts_make_the_whole():
+    whole = {
+        "count": np.arange(10, dtype=np.int32),
+        "mean": np.random.default_rng(1).random((10, 3), np.float32),
+    }
+    parts = [slice(0, 4), slice(4, 5), slice(5, 10)]
+    found = by_parts(parts, 10, lambda part: {name: a[part] for name, a in whole.items()})
+    for name, values in whole.items():
+        np.testing.assert_array_equal(found[name], values)
+        assert found[name].dtype == values.dtype
+    # A single part is taken as it is.
+    assert by_parts([slice(0, 10)], 10, lambda _: whole)["mean"] is whole["mean"]

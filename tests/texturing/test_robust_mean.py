@@ -113,3 +113,10 @@ def test_one_good_sample_beside_bad_ones_keeps_its_error():
     noise = np.random.default_rng(8).standard_normal((5, 500, 3))
     found = _found(1 + deviation[:, None, None] * noise, deviation)
     np.testing.assert_allclose(found.variance, 0.03**2, rtol=0.1)
+
+
+def test_what_is_kept_of_a_texel_is_in_single_precision():
+    found = vars(_found(np.ones((3, 5, 3)), np.full(3, 0.1)))
+    assert {name: values.dtype for name, values in found.items()} == dict.fromkeys(
+        ("mean", "variance", "footprint"), np.dtype(np.float32)
+    )

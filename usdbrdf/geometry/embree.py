@@ -34,7 +34,7 @@ _HIGH = 2  # RTC_BUILD_QUALITY_HIGH
 # Embree may read 16 bytes from any vertex, also the last.
 _FLOATS_BEHIND_VERTICES = 4
 
-# A ray and its hit, RTCRayHit: 22 words of 4 bytes, aligned to 16 bytes.
+# A ray and its hit, RTCRayHit: 21 words of 4 bytes, filled up to 24, aligned to 16 bytes.
 _WORDS, _ALIGNED = 24, 16
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 _U, _V, _FACE, _GEOMETRY, _INSTANCE = 15, 16, 17, 18, 19
@@ -96,7 +96,8 @@ class EmbreeScene:
 
     points (V, 3) float32; triangles (F, 3) int32 inside [0, V)
 
-    ``points``, ``triangles``  as Embree reads them, for as long as this object lives
+    ``points``, ``triangles``  as Embree reads them, for as long as this object lives; triangles
+                               are the caller's own, points a copy
     ``address``                what the loops know it by
     """
 

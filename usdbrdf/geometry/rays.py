@@ -74,11 +74,10 @@ class RayScene:
         return self._scene.address
 
     def closest(self, origins: Float, directions: Float) -> Hits:
-        """First hit of R rays: directions (R, 3), origins (R, 3) or (P, 3), ray r from r % P, all
-        float32 in the world frame."""
+        """First hit of R rays: directions (R, 3), origins (P, 3), 1 <= P <= R, ray r from r % P,
+        all float32 in the world frame."""
         count = len(directions)
         face, (u, v, distance) = np.empty(count, np.int32), np.empty((3, count), np.float32)
-
         in_turn = len(origins) < count
 
         def trace(part: slice) -> None:

@@ -92,7 +92,7 @@ class Follower:
         self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
         self._added = 0
-        self._frames_per_noise = max(1, frames // _FRAMES_OF_NOISE)
+        self._frames_per_noise = max(1, -(-frames // _FRAMES_OF_NOISE))
         self._noise_in_tiles: list[Double] = []
         cells = (rows, len(self._index))
         self._seen = np.zeros(cells, np.bool_)

@@ -35,7 +35,7 @@ Long = npt.NDArray[np.int64]
 _INDEPENDENT, _OF_SPECULAR = 0.012, 0.05
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
-# With more shared errors than this, patches are made larger.
+# With more shared errors than this, patches are made larger, up to the object.
 _MOST_EFFECTS = 2500
 # Degrees of freedom of Student's t.
 _TAIL = 15.0
@@ -171,13 +171,15 @@ def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
     """The shared errors: which of them each sample has (-1: none), and the one channel that it is
     for (None: all three alike)."""
     frame, patch = _shared(samples.frame), samples.patch
+    extent = float(np.ptp(samples.position, axis=0).max())
     while True:
         cells = [_cells(samples.position, size) for size in (patch, 2.5 * patch)]
         small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
         every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
         every += [(which, channel) for which in (frame, large) for channel in range(3)]
-        # Their number bounds memory and time.
-        if sum(int(which.max(initial=-1)) + 1 for which, _ in every) <= _MOST_EFFECTS:
+        # Their number bounds memory and time. Each of many frames has some, whatever the patches.
+        number = sum(int(which.max(initial=-1)) + 1 for which, _ in every)
+        if number <= _MOST_EFFECTS or patch > extent:
             return every
         patch *= 1.5
 

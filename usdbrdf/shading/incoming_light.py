@@ -16,8 +16,7 @@ from usdbrdf.kernel import loop
 from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.light_by_direction import add_light_by_direction
 from usdbrdf.shading.light_by_picks import add_light_by_picks
-from usdbrdf.shading.light_groups import weighed_groups
-from usdbrdf.shading.lights import Lights
+from usdbrdf.shading.light_groups import LightGroups, weighed_groups
 from usdbrdf.shading.patch_draws import PatchDraws, scrambles_of_points
 
 Float = npt.NDArray[np.float32]
@@ -64,7 +63,7 @@ class IncomingLight:
 
     rays: RayScene
     radiance: SurfaceTexture
-    lights: Lights
+    groups: LightGroups
     environment: Environment
     draws: PatchDraws
     techniques: int
@@ -73,7 +72,7 @@ class IncomingLight:
         """How the points' patches pick lights."""
         if self.techniques == 1:
             return np.zeros((0, 0)), np.zeros((0, 0), np.int16), np.zeros((0, 0), np.float32)
-        groups = self.lights.groups
+        groups = self.groups
         return weighed_groups(
             groups.start, groups.bounds, points.origin, points.normal,
             np.searchsorted(points.row, np.arange(points.row[-1] + 2)),
@@ -87,13 +86,13 @@ class IncomingLight:
         sums: Double,
         escaped: Double,
     ) -> None:
-        """Trace samples first to last of each point and add them to sums (2, 4, P, 3), one for each
+        """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
         technique, and escaped (P,)."""
         scrambles = scrambles_of_points(
             points.patch, points.stratum, points.identity, self.draws.seed, self.draws.shared
         )
         draws = self.draws.sobol, scrambles, self.draws.seed, points.identity
-        groups = self.lights.groups.arrays, points.row, *picks
+        groups = self.groups.arrays, points.row, *picks
         radiance, scene = self.radiance.arrays, self.rays.address
         start, block = samples[0], _block_of(np.arange(*samples), *samples)
         add_light_by_direction(
@@ -117,7 +116,7 @@ def _block_of(sample: Long, first: int, last: int) -> Long:
 @loop
 def mean_and_error(sums: Double, samples: int) -> tuple[Double, Double]:
     """Mean of ``samples`` in all, and its standard error from the four blocks, (P, 3) each; sums
-    (2, 4, P, 3), one for each technique."""
+    (2, 4, P, 4), one for each technique, whose last column is not looked at."""
     count = sums.shape[2]
     mean, error = np.empty((count, 3)), np.empty((count, 3))
     block = np.empty(4)

@@ -135,7 +135,7 @@ def irradiance_at(
     light = IncomingLight(
         rays=rays,
         radiance=radiance,
-        lights=lights,
+        groups=lights.groups,  # made here, once, not by each thread
         environment=environment,
         draws=independent_draws(sampling.seed)
         if sampling.estimator == "cosine"
@@ -185,7 +185,9 @@ def _irradiance_of(
             break
         if len(noisy) < len(escaped):
             active = np.arange(count)[active][noisy]
-            points, sums, escaped = points.of(noisy), sums[:, :, noisy], escaped[noisy]
+            points, escaped = points.of(noisy), escaped[noisy]
+            # In one piece, as the compiled loops know them.
+            sums = np.take(sums, noisy, axis=2)
     return Irradiance(mean=mean, standard_error=error, rays=done, escaped=share)
 
 

@@ -5,7 +5,8 @@ of Python's lock; each thread takes points of its own. They take AHEAD points at
 that a ray needs from its making to what it brought stays in the nearest cache. One sample's rays of
 all points follow each other: within a patch they are nearly parallel.
 
-Sums are kept in four blocks of samples, (4, P, 3), so that the estimator can tell its own error.
+Sums are kept in four blocks of samples, (4, P, 4), whose last column fills up a row, so that the
+estimator can tell its own error.
 """
 
 from __future__ import annotations
@@ -28,11 +29,7 @@ from usdbrdf.geometry.packed_texture import (
 from usdbrdf.geometry.prefetch import prefetch
 from usdbrdf.kernel import loop
 from usdbrdf.shading.environment import EnvironmentArrays, environment_at
-from usdbrdf.shading.light_by_picks import (
-    PickArrays,
-    PointDraws,
-    turns,
-)
+from usdbrdf.shading.light_by_picks import PickArrays, PointDraws, turns
 from usdbrdf.shading.warp_loops import fractions, on_hemisphere
 from usdbrdf.shading.warps import hashed_uniform, tangent_frame
 
@@ -101,7 +98,7 @@ def add_light_by_direction(
     directions, face = np.empty((AHEAD, 3), np.float32), np.empty(AHEAD, np.int32)
     u, v, distance = np.empty((3, AHEAD), np.float32)
     weight, looks = np.empty(AHEAD, np.float32), empty_looks()
-    lamps, light = np.empty((2, AHEAD + 1), np.int32)
+    lamps, light = np.empty((2, AHEAD), np.int32)
     image, z_up = environment
     is_light, use_lights = picks[0][6], len(picks[4]) > 0
     for first, s in turns(len(origin), len(block)):

@@ -96,10 +96,10 @@ def turns(points: int, samples: int) -> Turns:
 
 @loop
 def empty_segments() -> Segments:
-    """Room for AHEAD rays. What faces away is overwritten by the next: a place more."""
-    u, v, weight = np.empty((3, AHEAD + 1), np.float32)
-    point, face = np.empty((2, AHEAD + 1), np.int32)
-    return point, face, u, v, weight, np.empty((AHEAD + 1, 3), np.float32)
+    """Room for AHEAD rays."""
+    u, v, weight = np.empty((3, AHEAD), np.float32)
+    point, face = np.empty((2, AHEAD), np.int32)
+    return point, face, u, v, weight, np.empty((AHEAD, 3), np.float32)
 
 
 @loop

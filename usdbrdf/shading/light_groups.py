@@ -58,8 +58,8 @@ class LightGroups:
     bounds      (8, G) float32: centre, mean normal, radius, spread of the normals
     triangles   (K, 16) float32: first corner, edges to the others, normal, density per m^2 when
                 picked by power, group; what is read together lies together
-    is_light    (F / 8,) uint8, a bit for each triangle of the scene, the lowest first: few enough
-                to stay in the cache
+    is_light    (ceil(F / 8),) uint8, a bit for each triangle of the scene, the lowest first: few
+                enough to stay in the cache
     """
 
     face: Int

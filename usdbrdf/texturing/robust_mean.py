@@ -119,7 +119,7 @@ def _means(state: MeanState) -> dict[str, Float]:
     variance = pull / np.maximum(np.maximum(inlying, state.precision / count), 1e-30) ** 2
     return {
         "mean": np.where(state.count[:, None] > 0, mean, np.nan),
-        "variance": variance,
+        "variance": variance.astype(np.float32),
         "footprint": state.footprint / np.maximum(state.precision, 1e-30)[:, None],
     }
 
