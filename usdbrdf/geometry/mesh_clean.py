@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.normals import doubled_areas
 from usdbrdf.geometry.weld import welded_ids
 from usdbrdf.job.child import run_child
 
@@ -123,9 +124,8 @@ def _has_area(points: Float, triangles: Int, corners: Int) -> Bool:
     distinct: Bool = (a != b) & (b != c) & (c != a)
     p = points.astype(np.float64)[triangles]
     longest = np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2).max(axis=1)
-    twice_area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
     # Relative to the longest edge, so that small scans keep their small triangles.
-    flat: Bool = twice_area <= 1e-9 * longest**2
+    flat: Bool = doubled_areas(points, triangles) <= 1e-9 * longest**2
     return distinct & ~flat
 
 

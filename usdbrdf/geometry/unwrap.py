@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.normals import doubled_areas
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.job.child import run_child
 
@@ -58,9 +59,7 @@ def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
 
 def _refuse_huge(scene: Scene, texel_size: float) -> None:
     """Packing what cannot fit takes xatlas minutes; the area alone tells it at once."""
-    corners = scene.points[scene.triangles].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.bincount(scene.face_object, np.linalg.norm(cross, axis=1) / 2)
+    area = np.bincount(scene.face_object, doubled_areas(scene.points, scene.triangles) / 2)
     for obj, square_metres in zip(scene.objects, area, strict=True):
         side = int(np.ceil(np.sqrt(square_metres) / texel_size))
         if side > MAX_SIDE:

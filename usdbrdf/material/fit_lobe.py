@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, lobe_from_costs
+from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, least_costs, lobe_from_costs
 from usdbrdf.material.lobe_samples import Basis
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
@@ -60,9 +60,7 @@ class _Search:
     @property
     def least(self) -> tuple[float, int, float]:
         """The least cost, with the index of its roughness and its psi in [0, 1]."""
-        square = np.maximum(self.terms[:, 2], 1e-12 * max(float(self.terms[:, 0].max()), 1.0))
-        psi = np.clip(self.terms[:, 1] / square, 0, 1)
-        cost = self.terms[:, 0] - 2 * psi * self.terms[:, 1] + psi**2 * square
+        psi, cost, _ = least_costs(self.terms, float(self.terms[:, 0].max()))
         best = int(cost.argmin())
         return float(cost[best]), best, float(psi[best])
 

@@ -52,9 +52,7 @@ def lobe_from_costs(
     blur     standard deviation, in radians, of the surface normal over the footprint of a sample: a
              lobe narrower than that is not seen as such
     """
-    square = np.maximum(terms[:, 2], 1e-12 * max(abs(without), 1.0))
-    psi = np.clip(terms[:, 1] / square, 0, 1)
-    profile = terms[:, 0] - 2 * psi * terms[:, 1] + psi**2 * square
+    psi, profile, square = least_costs(terms, abs(without))
     phi = _vertex(phis, profile)
     least = float(profile.min())
     surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
@@ -77,6 +75,14 @@ def lobe_from_costs(
         cost=least / max(freedom, 1),
         evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
     )
+
+
+def least_costs(terms: Double, scale: float) -> tuple[Double, Double, Double]:
+    """Of each roughness, (K,): the psi in [0, 1] of the least cost, that cost, and c2, which is at
+    least next to nothing on the ``scale`` of the costs. terms: see ``lobe_from_costs``."""
+    square = np.maximum(terms[:, 2], 1e-12 * max(scale, 1.0))
+    psi = np.clip(terms[:, 1] / square, 0, 1)
+    return psi, terms[:, 0] - 2 * psi * terms[:, 1] + psi**2 * square, square
 
 
 def averaged(

@@ -8,8 +8,6 @@ place of the median, and what the pixels blurred is restored where it stands abo
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -24,11 +22,12 @@ from usdbrdf.scan.scan import Frames
 from usdbrdf.shading.warps import shifts_of
 from usdbrdf.steps.albedo_map import albedo_map
 from usdbrdf.steps.atlas import Atlas, TexelMap
+from usdbrdf.steps.in_passes import in_passes
 from usdbrdf.steps.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.steps.texture import CLIPPED, FILLED
 from usdbrdf.texturing.footprints import footprints, widest
 from usdbrdf.texturing.inpaint import inpaint
-from usdbrdf.texturing.passes import BytesPerTexel, by_parts, groups_of_texels, smallest_groups
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, smallest_groups
 from usdbrdf.texturing.radiance_from_frames import samples_from_frames, spread_order
 from usdbrdf.texturing.restore import restored
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
@@ -136,19 +135,13 @@ def _without_lobes(
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
         say(f"warning: {short}")
         groups = smallest_groups(atlas.texels)
-    if len(groups) > 1:
-        say(f"fit: {len(groups)} passes over the frames, for lack of memory")
     samples = atlas.map("samples")[:, 0]
 
-    def means(part: slice) -> dict[str, npt.NDArray[Any]]:
-        def observe() -> dict[str, Float]:
-            observed = _observe(run, atlas, lit, frames, lobes, level, samples, seed, part)
-            return dict(vars(robust_mean(observed)))
+    def means(part: slice) -> dict[str, Float]:
+        observed = _observe(run, atlas, lit, frames, lobes, level, samples, seed, part)
+        return dict(vars(robust_mean(observed)))
 
-        kept = f"means-{part.start}-{part.stop}"
-        return observe() if len(groups) == 1 else run.checkpoint(kept, observe)
-
-    return RobustMean(**by_parts(groups, len(atlas.texels), means))
+    return RobustMean(**in_passes(run, "means", groups, len(atlas.texels), means))
 
 
 def _bytes_of(lit: LitScene) -> int:

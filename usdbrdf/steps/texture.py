@@ -28,10 +28,11 @@ from usdbrdf.stage.read import (
 from usdbrdf.stage.records import Aov, TexturedObject
 from usdbrdf.stage.texturing_layer import write_texturing_layer
 from usdbrdf.steps.atlas import MapWriter, TexelMap
+from usdbrdf.steps.in_passes import in_passes
 from usdbrdf.steps.preview import overview
 from usdbrdf.steps.step import Step, hash_of_files, weaker_layers
 from usdbrdf.texturing.inpaint import inpaint_alike
-from usdbrdf.texturing.passes import Measured, by_parts, groups_of_texels, measured_arrays
+from usdbrdf.texturing.passes import Measured, groups_of_texels, measured_arrays
 from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
@@ -128,18 +129,12 @@ def _measure(
 ) -> Measured:
     """All frames, in as many passes as memory asks for."""
     groups = groups_of_texels(texels, scene, frames, options.memory)
-    if len(groups) > 1:
-        say(f"texture: {len(groups)} passes over the frames, for lack of memory")
 
     def measured(part: slice) -> dict[str, npt.NDArray[Any]]:
-        def observe() -> dict[str, npt.NDArray[Any]]:
-            observed = _observe(run, texels, scene, rays, frames, options.quantile, part)
-            return measured_arrays(observed, options.quantile)
+        observed = _observe(run, texels, scene, rays, frames, options.quantile, part)
+        return measured_arrays(observed, options.quantile)
 
-        kept = f"texels-{part.start}-{part.stop}"
-        return observe() if len(groups) == 1 else run.checkpoint(kept, observe)
-
-    return Measured(**by_parts(groups, len(texels), measured))
+    return Measured(**in_passes(run, "texels", groups, len(texels), measured))
 
 
 def _observe(

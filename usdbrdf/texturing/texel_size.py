@@ -8,6 +8,7 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.geometry.normals import doubled_areas
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.geometry.scene import Scene
 from usdbrdf.scan.scan import Frames
@@ -46,9 +47,7 @@ def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_tex
             "no camera ray meets the mesh, so no texel size can be chosen. Check that poses and "
             "mesh share one frame of reference and unit. [texturing.texel-size]"
         )
-    corners = scene.points[scene.triangles].astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1).sum() / 2
+    area = doubled_areas(scene.points, scene.triangles).sum() / 2
     size = float(f"{np.median(footprint):.{_DIGITS}g}")
     least = float(np.sqrt(area / (_PACKING * max_texels)))
     return size if size >= least else _rounded_up(least)
