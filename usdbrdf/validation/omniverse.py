@@ -37,7 +37,8 @@ class Plugin:
 def _checker(rule: Rule) -> type[Any]:
     """A rule as a class; its name begins with UsdBrdf, as all names share one namespace."""
 
-    def check_stage(self: Any, stage: Usd.Stage) -> None:
+    # What is no coroutine it would run in another thread, while it switches the stage's variants.
+    async def check_stage(self: Any, stage: Usd.Stage) -> None:
         for fault in rule.check(AssetStage(stage)):
             _report(self, rule, fault)
 
