@@ -13,7 +13,8 @@ import pytest
 
 from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.shading.denoise import CHOICES, chosen_filter, denoise_lightmap
+from usdbrdf.job.memory import give_back_freed, resident_bytes
+from usdbrdf.shading.denoise import CHOICES, chosen_filter, denoise_lightmaps
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.steps.trace import denoised_irradiance
@@ -100,9 +101,10 @@ def test_the_contact_shadow_of_a_thin_leg_keeps_its_depth(floor: Floor):
 def _digest() -> str:
     noise = np.random.default_rng(5)
     found = hashlib.sha256()
-    for height, width in ((1, 1), (3, 2), (40, 33), (210, 300)):
-        picture = noise.gamma(2, size=(height, width, 3)).astype(np.float32)
-        found.update(denoise_lightmap(picture).tobytes())
+    sizes = (1, 1), (3, 2), (40, 33), (210, 300)
+    pictures = (noise.gamma(2, size=(*size, 3)).astype(np.float32) for size in sizes)
+    for filtered in denoise_lightmaps(pictures):
+        found.update(filtered.tobytes())
     return found.hexdigest()
 
 
@@ -120,6 +122,21 @@ def test_the_filter_gives_the_same_bits_in_every_run_and_on_any_number_of_thread
             check=True,
         )
         assert child.stdout.strip() == here, threads
+
+
+def test_the_filter_gives_its_memory_back():
+    pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    picture = np.ones((1200, 1200, 3), np.float32)
+    held = []
+    for _ in range(3):
+        (filtered,) = denoise_lightmaps([picture])
+        del filtered
+        give_back_freed()
+        held.append(resident_bytes())
+    assert held[-1] < held[0] + picture.nbytes
+    with_filter = denoise_lightmaps([picture])
+    next(with_filter)
+    assert resident_bytes() > held[-1] + 10 * picture.nbytes
 
 
 def test_auto_is_the_filter_where_it_is_installed():

@@ -13,7 +13,13 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB
 from usdbrdf.scan.scan import Frames
 from usdbrdf.texturing import passes
-from usdbrdf.texturing.passes import OF_TEXTURING, BytesPerTexel, by_parts, groups_of_texels
+from usdbrdf.texturing.passes import (
+    OF_TEXTURING,
+    BytesPerTexel,
+    by_parts,
+    groups_of_texels,
+    smallest_groups,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -76,6 +82,15 @@ def test_what_the_process_holds_already_counts(square: World, monkeypatch):
 def test_too_little_memory_is_refused_with_what_is_needed(square: World):
     with pytest.raises(EnvironmentFailure, match=r"need 0.\d GiB, the limit is 0.5.*--memory"):
         _groups(square, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("count", "passes"), [(1, 1), (700_000, 3), (3_000_000, 12), (80_000_000, 12)]
+)
+def test_the_smallest_groups_are_worth_their_passes(count: int, passes: int):
+    groups = smallest_groups(range(count))
+    assert len(groups) == passes
+    assert groups[-1].stop == count
 
 
 def test_the_machines_memory_is_the_default(square: World, monkeypatch):

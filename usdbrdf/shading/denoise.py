@@ -3,6 +3,7 @@ object's atlas."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Final, Literal
 
 import numpy as np
@@ -15,6 +16,9 @@ AUTO: Final = "auto"
 NONE: Final = "none"
 OIDN: Final = "oidn"
 CHOICES: Final = (AUTO, NONE, OIDN)
+
+# Larger lightmaps than this suffices for are filtered in tiles.
+_MOST_MEGABYTES = 512
 
 
 def chosen_filter(wanted: str) -> Literal["none", "oidn"]:
@@ -34,19 +38,31 @@ def chosen_filter(wanted: str) -> Literal["none", "oidn"]:
     return OIDN
 
 
-def denoise_lightmap(picture: Float) -> Float:
-    """Filtered copy of an HDR lightmap (H, W, 3) float32 whose gutters are dilated.
+def denoise_lightmaps(pictures: Iterable[Float]) -> Iterator[Float]:
+    """Filtered copies of HDR lightmaps (H, W, 3) float32 whose gutters are dilated.
 
     The same bits in every run on one machine, with any number of threads. Raises
     EnvironmentFailure where Open Image Denoise gives up, as without memory.
     """
     import pyoidn
 
-    try:
-        filtered = pyoidn.denoise(np.ascontiguousarray(picture), filter_type="RTLightmap")
-    except RuntimeError as error:
-        raise EnvironmentFailure(
-            f"Open Image Denoise failed on a lightmap of {picture.shape[1]} x {picture.shape[0]} "
-            f"texels: {error}. Run again with --denoise none. [shading.denoise]"
-        ) from error
-    return np.maximum(np.asarray(filtered, np.float32), 0)
+    # Not pyoidn.denoise, which keeps its working memory, up to 2.4 GiB, until the process ends.
+    with pyoidn.Device() as device:
+        device.commit()
+        with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT_LIGHTMAP) as lightmap_filter:
+            for picture in pictures:
+                colour = np.ascontiguousarray(picture, np.float32)
+                filtered = np.empty_like(colour)
+                lightmap_filter.set_image("color", colour, pyoidn.OIDN_FORMAT_FLOAT3)
+                lightmap_filter.set_image("output", filtered, pyoidn.OIDN_FORMAT_FLOAT3)
+                lightmap_filter.set_int("maxMemoryMB", _MOST_MEGABYTES)
+                lightmap_filter.commit()
+                lightmap_filter.execute()
+                error = device.get_error()
+                if error:
+                    raise EnvironmentFailure(
+                        f"Open Image Denoise failed on a lightmap of {picture.shape[1]} x "
+                        f"{picture.shape[0]} texels: {error}. Run again with --denoise none. "
+                        "[shading.denoise]"
+                    )
+                yield np.maximum(filtered, 0)

@@ -13,7 +13,7 @@ from usdbrdf.geometry.surface_radiance import surface_texture
 from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.stage import StageRun
-from usdbrdf.shading.denoise import denoise_lightmap
+from usdbrdf.shading.denoise import denoise_lightmaps
 from usdbrdf.shading.environment import Environment
 from usdbrdf.shading.incoming_light import whole_patches
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
@@ -71,9 +71,6 @@ def tiles_of_patches(patch: npt.NDArray[np.int32]) -> list[slice]:
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
     """Each object's S (T, 3) through the lightmap filter."""
-    return np.concatenate(
-        [
-            texels.from_image(i, denoise_lightmap(texels.image(i, irradiance)))
-            for i in range(len(texels.resolution))
-        ]
-    )
+    pictures = (texels.image(i, irradiance) for i in range(len(texels.resolution)))
+    filtered = denoise_lightmaps(pictures)
+    return np.concatenate([texels.from_image(i, picture) for i, picture in enumerate(filtered)])

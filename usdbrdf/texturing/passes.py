@@ -30,8 +30,8 @@ _SHARE = 0.75
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
 _PROCESS = GIB // 2
-# A pass costs reading all frames: groups smaller than this are not worth it.
-_SMALLEST_GROUP = 250_000
+# A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
+_SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
 
 
 class BytesPerTexel(NamedTuple):
@@ -117,7 +117,7 @@ def groups_of_texels(
     held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
     after = held + need.after * len(texels)
     held += need.result * len(texels)
-    smallest = min(len(texels), _SMALLEST_GROUP)
+    smallest = _smallest(len(texels))
     needed = max(held + need.grouped * smallest, after)
     if needed > limit:
         raise EnvironmentFailure(
@@ -130,7 +130,12 @@ def groups_of_texels(
 
 def smallest_groups(texels: Texels) -> list[slice]:
     """For whom too little memory is no reason to stop."""
-    return _groups(len(texels), _SMALLEST_GROUP)
+    return _groups(len(texels), _smallest(len(texels)))
+
+
+def _smallest(count: int) -> int:
+    """The fewest texels that are worth a pass, of so many."""
+    return min(count, max(_SMALLEST_GROUP, -(-count // _MOST_PASSES)))
 
 
 def _groups(count: int, most: int) -> list[slice]:
