@@ -144,6 +144,21 @@ def test_noise_of_the_rays_does_not_draw_psi_anywhere(phi: float, noise: float):
     assert np.mean(twice) < 0.93 * psi
 
 
+def test_what_the_rays_do_is_foretold():
+    samples, mirrored = _views(0)
+    basis = _basis(mirrored)
+    samples = _shone_on(samples, basis, 0.1, 0.6)
+    found = []
+    for seed in range(16):
+        first, second, third = (_side_by_side(_noisy(basis, 3 * seed + k, 0.05)) for k in range(3))
+        own = Candidate(first=first, second=second, third=third, blur=0)
+        found.append(fit_lobe(samples, [own]))
+    scatter = np.std([(one.phi, one.psi) for one in found], axis=0, ddof=1)
+    foretold = np.sqrt(np.mean([np.square(one.of_rays) for one in found], axis=0))
+    assert foretold == pytest.approx(scatter, rel=0.5)
+    assert _fit(samples, (basis, 0.0)).of_rays == (0, 0)
+
+
 def _left_open(phi: float, blur: float) -> float:
     return math.hypot(phi, 1.5 * blur) - phi
 

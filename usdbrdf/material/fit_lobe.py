@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, least_costs, lobe_from_costs
 from usdbrdf.material.lobe_samples import Basis
+from usdbrdf.material.ray_noise import error_of_rays
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 Float = npt.NDArray[np.float32]
@@ -110,7 +111,7 @@ def _estimate(
     fine = coarse.and_more(more)
     _, best, psi = fine.least
     phis = [fine.phis[best]]
-    return lobe_from_costs(
+    found = lobe_from_costs(
         np.array(fine.phis),
         fine.terms,
         without,
@@ -118,6 +119,9 @@ def _estimate(
         model.degrees_of_freedom,
         candidate.blur,
     )
+    near = [fine.phis[k] for k in (max(best - 1, 0), best, min(best + 1, len(fine.phis) - 1))]
+    of_rays = error_of_rays(model, candidate.first(near), candidate.second(near), near, psi)
+    return replace(found, of_rays=of_rays)
 
 
 class _Table:

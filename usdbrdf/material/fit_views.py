@@ -21,6 +21,7 @@ from usdbrdf.material.lit_scene import LitScene, View, sub_pixel_points
 from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
+from usdbrdf.material.ray_noise import mean_of_repeats
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.texturing.footprints import RINGS
@@ -51,6 +52,9 @@ _ABOVE_NOISE = 4.0
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
+# Where the rays' errors are more than this share of the stated ones, the fit is the mean of several
+# with rays of their own.
+_NOISY, _REPEATS = 0.3, 4
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 
@@ -79,21 +83,48 @@ def fit_views(
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
         mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
+    smoothing = float(observed.smoothing[0])
+
+    def fitted(repeat: int) -> LobeEstimate:
+        own_seed = _REPEATS * seed + repeat
+        return fit_lobe(
+            samples, _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
+        )
+
+    found = [fitted(0)]
+    if _noisy(found[0]):
+        found += [fitted(repeat) for repeat in range(1, _REPEATS)]
+    return mean_of_repeats(found), len(samples.texel)
+
+
+def _candidates(
+    lit: LitScene,
+    samples: ViewSamples,
+    footprints: list[SurfacePoints],
+    smoothing: float,
+    seed: int,
+    mixture: Mixture,
+) -> list[Candidate]:
+    """What the lobe would look like with each of the footprints; see ``_likely``."""
     candidates = []
     for points, width in zip(footprints, (_FOOTPRINT, *_WIDER), strict=False):
         # Views of a texel share their random numbers: what they have in common then cancels in
         # their differences, which are all that is fitted.
-        bases = [
+        first, second, third = [
             lobe_basis(lit, points, len(samples.texel), 3 * seed + k, mixture, samples.texel)
             for k in range(3)
         ]
-        blur = _deviation_of_normal(points)
-        likely = _likely(width, float(observed.smoothing[0]))
-        first, second, third = bases
+        blur, likely = _deviation_of_normal(points), _likely(width, smoothing)
         candidates.append(
             Candidate(first=first, second=second, third=third, blur=blur, likely=likely)
         )
-    return fit_lobe(samples, candidates), len(samples.texel)
+    return candidates
+
+
+def _noisy(found: LobeEstimate) -> bool:
+    """Whether the rays matter beside the samples' own errors."""
+    phi, psi = found.of_rays
+    return phi > _NOISY * found.phi_error or psi > _NOISY * found.psi_error
 
 
 def _footprints(

@@ -28,7 +28,7 @@ class LobeEstimate:
     """phi, psi in [0, 1], where the cost is least; their standard deviations as far as the samples
     tell, which near NOTHING_KNOWN say just that; unresolved, how much of phi may be due to the
     samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any specular
-    light."""
+    light; of_rays, the share in the errors of phi and psi of the rays, where it is known."""
 
     phi: float
     psi: float
@@ -37,6 +37,7 @@ class LobeEstimate:
     unresolved: float
     cost: float
     evidence: float
+    of_rays: tuple[float, float] = (0.0, 0.0)
 
 
 def lobe_from_costs(
@@ -106,11 +107,13 @@ def averaged(
         within = mean(f"{name}_error")[1]
         error = math.sqrt(float(weight @ (within**2 + (values - middle) ** 2)))
         errors[f"{name}_error"] = min(error, float(NOTHING_KNOWN))
+    of_rays = (weight @ np.array([estimate.of_rays for estimate in estimates])).tolist()
     return replace(
         estimates[int(costs.argmin())],
         phi=mean("phi")[0],
         psi=mean("psi")[0],
         unresolved=mean("unresolved")[0],
+        of_rays=(of_rays[0], of_rays[1]),
         **errors,
     )
 

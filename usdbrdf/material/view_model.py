@@ -115,6 +115,17 @@ class ViewModel:
         products -= np.einsum("nk,nk->k", a.shared, b.shared)
         return products
 
+    def of_texels(self, values: Double) -> Double:
+        """Sums over each texel's samples, (num_texels, K), of values (P, K)."""
+        sums: Double = self._gather @ values
+        return sums
+
+    def solved(self, values: npt.NDArray[np.floating]) -> Double:
+        """C^-1 of K sets of values, (P, 3, K), with the diffuse parts left free."""
+        shared = self.reduced(values).shared
+        errors = [self._shared.expected(one)[0] for one in shared.T]
+        return self.reduced(values - np.stack(errors, axis=-1)).weighted
+
     def update(self, non_diffuse: npt.NDArray[np.floating]) -> None:
         """One step of expectation maximisation, given I_nd (P, 3) of the best lobe so far."""
         rest = self._radiance - non_diffuse
