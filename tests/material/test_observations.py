@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
@@ -101,6 +102,27 @@ def test_beyond_the_bound_frames_are_taken_evenly(floor: World, monkeypatch):
     assert set(found.frame) == {0, 5, 10, 15, 20}
     np.testing.assert_array_equal(found.radiance[:, 0], 1 + found.frame)
     np.testing.assert_array_equal(found.noise, 0.25 * found.frame)
+
+
+@pytest.mark.parametrize("blur", [0.0, 1.5])
+def test_the_frames_noise_tells_how_far_they_were_smoothed(floor: World, blur: float):
+    # Both squares and the gap between them: tiles across it show no single object.
+    width, height = 480, 192
+    lens = np.array([160.0, 160.0, 240.0, 96.0])
+    pose = look_at(np.array([2.0, -0.01, 2.0]), np.array([2.0, 0.0, 0.0]))
+    follower = Follower(_lit(floor), floor.texels, np.ones(len(floor.texels), bool), 2, 0)
+    for seed in range(2):
+        noise = np.random.default_rng(seed).normal(size=(height, width))
+        if blur:
+            noise = gaussian_filter(noise, blur)
+        shown = 0.5 * (1 + 0.02 * noise / noise.std())
+        shown[:, width // 2 :] *= 3  # a bias of a whole object is no noise
+        view = View(
+            radiance=np.repeat(shown[..., None], 3, axis=2).astype(np.float32),
+            valid=np.ones((height, width), bool), world_from_camera=pose, intrinsics=lens,
+        )  # fmt: skip
+        follower.add(view, np.zeros((height, width), bool), 0.0)
+    assert follower.smoothing == pytest.approx(blur, rel=0.15)
 
 
 @pytest.mark.parametrize("frames", [0, 4])

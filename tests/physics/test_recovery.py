@@ -210,8 +210,9 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         )
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         views.append(view)
-    observed = follower.chosen(studio.world.texels, 0).of_texels(own)
-    found, used = fit_views(lit, studio.world.texels, observed, views.__getitem__, SPHERE, 0)
+    texels = studio.world.texels
+    observed, smoothing = follower.chosen(texels, 0).of_texels(own), follower.smoothing
+    found, used = fit_views(lit, texels, observed, smoothing, views.__getitem__, SPHERE, 0)
     assert found is not None
     assert used > 500
     assert found.phi == pytest.approx(phi, abs=0.04)

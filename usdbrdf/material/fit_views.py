@@ -63,6 +63,7 @@ def fit_views(
     lit: LitScene,
     texels: Texels,
     observed: Observations,
+    smoothing: float,
     view_of: Callable[[int], View],
     index: int,
     seed: int,
@@ -70,7 +71,8 @@ def fit_views(
 ) -> tuple[LobeEstimate | None, int]:
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
-    view_of(frame) gives poses and pinholes; the images themselves are not needed any more.
+    smoothing: of the pictures, in pixels, see ``smoothing_of``. view_of(frame) gives poses and
+    pinholes; the images themselves are not needed any more.
     mixture: the rays of each of a sample's points, traced three times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
@@ -83,7 +85,6 @@ def fit_views(
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
         mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
-    smoothing = float(observed.smoothing[0])
 
     def fitted(repeat: int) -> LobeEstimate:
         own_seed = _REPEATS * seed + repeat

@@ -48,9 +48,7 @@ class Observations:
     """M samples of texels by frames, sorted by object and texel.
 
     texel (M,) int32; frame (M,) int32; radiance (M, 3) float32; noise (M,) float32, the frame's
-    noise floor; side (M,) float32, of the square that the sample is the mean of, in texels;
-    smoothing (M,) float32, see ``smoothing_of``: standard deviation in pixels of what smoothed the
-    pictures
+    noise floor; side (M,) float32, of the square that the sample is the mean of, in texels
     """
 
     texel: Int
@@ -58,7 +56,6 @@ class Observations:
     radiance: Float
     noise: Float
     side: Float
-    smoothing: Float
 
     def of_texels(self, own: slice) -> Observations:
         """Those of one object's texels."""
@@ -140,8 +137,12 @@ class Follower:
             radiance=self._radiance[row, column],
             noise=self._noise[row],
             side=self._side[column],
-            smoothing=np.full(len(row), smoothing_of(self._noise_in_tiles), np.float32),
         )
+
+    @property
+    def smoothing(self) -> float:
+        """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
+        return smoothing_of(self._noise_in_tiles)
 
     def target_frames(self, texels: Texels) -> Int:
         """Per object, the frame in which its followed texels mirror most light beyond what each of

@@ -67,10 +67,12 @@ class FitOptions:
 @dataclass(frozen=True, kw_only=True)
 class Survey:
     """What one pass over the frames gathers: per object the target frame, which shows its highlight
-    best (-1: none), and, as the method needs, the observations of followed texels."""
+    best (-1: none), and, as the method needs, the observations of followed texels, and by how many
+    pixels the pictures were smoothed (NaN: they do not tell)."""
 
     target: Int
     observations: Observations
+    smoothing: float
 
 
 def survey_frames(
@@ -96,10 +98,12 @@ def survey_frames(
             follower.target_frames(atlas.texels) if by_views else choose_target_frames(counts)[0]
         )
         chosen = follower.chosen(atlas.texels, options.seed)
-        return {"target": target, **chosen.arrays()}
+        smoothing = np.array(follower.smoothing)
+        return {"target": target, "smoothing": smoothing, **chosen.arrays()}
 
     found = run.checkpoint("survey", gather)
-    return Survey(target=found.pop("target"), observations=Observations(**found))
+    target, smoothing = found.pop("target"), float(found.pop("smoothing"))
+    return Survey(target=target, smoothing=smoothing, observations=Observations(**found))
 
 
 def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
@@ -164,8 +168,8 @@ def fit_object(
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
         lobe, used = fit_views(
-            lit, texels, own, lambda frame: _view(frames, frame, *nothing), index, options.seed,
-            mixture,
+            lit, texels, own, survey.smoothing, lambda frame: _view(frames, frame, *nothing), index,
+            options.seed, mixture,
         )  # fmt: skip
         if lobe is not None:
             numbers[:] = (
