@@ -99,32 +99,23 @@ def measure(
 ) -> dict[str, Any]:
     settings = QUICK if quick else SETTINGS
     lit = lit_asset(asset)
-    known = known_objects(truth, lit.atlas)
+    known = {
+        name: (one["phi"], one["psi"]) for name, one in known_objects(truth, lit.atlas).items()
+    }
     ours, measured, labels = our_efforts(lit, asset, 1 if quick else SEEDS)
     if earlier is not None:
         course = stored_course(earlier, diffuse)
     else:
-        try:
-            mi = mitsuba_variant()
-        except EnvironmentFailure as error:
-            return {"skipped": str(error), "figures": []}
-        if mi.variant() != "llvm_ad_rgb":
-            reason = "no LLVM library of version 17 or newer; set DRJIT_LIBLLVM_PATH"
-            return {"skipped": reason, "figures": []}
+        mi = peers_mitsuba()
+        if isinstance(mi, str):
+            return {"skipped": mi, "figures": []}
         course = optimised(mi, asset, lit, diffuse, labels, settings)
 
-    def errors(many: list[dict[str, Any]], names: list[str]) -> list[float] | None:
-        if any(name not in values for values in many for name in names):
-            return None
-        off = [
-            np.abs(np.subtract(values[name], (known[name]["phi"], known[name]["psi"])))
-            for values in many
-            for name in names
-        ]
-        return [float(mean) for mean in np.mean(off, axis=0)]
-
     def both(many: list[dict[str, Any]]) -> dict[str, list[float] | None]:
-        return {"measured": errors(many, measured), "all": errors(many, labels)}
+        return {
+            "measured": mean_errors(many, known, measured),
+            "all": mean_errors(many, known, labels),
+        }
 
     efforts = [{**one, "errors": both(one["values"])} for one in ours]
     checks = [
@@ -143,18 +134,40 @@ def measure(
             "compiling": course.compiling._asdict(),
             "course": checks,
         },
-    }
-    results["compared"] = compared(efforts, checks)
-    results["parameters"] = {
-        name: {
-            "truth": [known[name]["phi"], known[name]["psi"]],
-            "ours": [[round(v, 3) for v in one[name]] for one in efforts[0]["values"]],
-            "peer": [round(float(v), 3) for v in checks[-1]["values"][name]],
-        }
-        for name in labels
+        "compared": compared(efforts, checks),
+        "parameters": {
+            name: {
+                "truth": known[name],
+                "ours": [[round(v, 3) for v in one[name]] for one in efforts[0]["values"]],
+                "peer": [round(float(v), 3) for v in checks[-1]["values"][name]],
+            }
+            for name in labels
+        },
     }
     results["figures"] = figures(results)
     return results
+
+
+def peers_mitsuba() -> Any:
+    """Mitsuba with derivatives, or a sentence that says why there is none."""
+    try:
+        mi = mitsuba_variant()
+    except EnvironmentFailure as error:
+        return str(error)
+    if mi.variant() != "llvm_ad_rgb":
+        return "no LLVM library of version 17 or newer; set DRJIT_LIBLLVM_PATH"
+    return mi
+
+
+def mean_errors(
+    many: list[dict[str, Any]], known: dict[str, tuple[float, float]], names: list[str]
+) -> list[float] | None:
+    """Mean |phi - truth| and |psi - truth| of the objects ``names`` over ``many`` sets of values;
+    None where one of these lacks one of them."""
+    if any(name not in values for values in many for name in names):
+        return None
+    off = [np.abs(np.subtract(values[name], known[name])) for values in many for name in names]
+    return [float(mean) for mean in np.mean(off, axis=0)]
 
 
 def our_efforts(
