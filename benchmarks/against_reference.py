@@ -12,12 +12,12 @@ compared:
     albedo, base_color               with albedo
 
 Printed as JSON, for all points, those within 4.5 cm of another object (`contacts`), the `rest`, and
-each object: median error and median absolute error, relative, of the channels' mean and of each
-channel, the error of the sums over all points, and NRMSE = ||x - truth|| / ||truth||. All are
-weighted by the area the points stand for. `reference_error` is the mean relative standard error of
-E there: as noise it raises the absolute errors and the NRMSE, and as it is skewed the medians of
-the signed ones, but not the sums'. What the capture's own frames lack tells
-`frames_against_reference.py`.
+each object: median error and median absolute error, relative, of all channels' values (as
+`accuracy.py` takes them), of the channels' mean and of each channel, the error of the sums over all
+points, and NRMSE = ||x - truth|| / ||truth||. All are weighted by the area the points stand for.
+`reference_error` is the mean relative standard error of E there: as noise it raises the absolute
+errors and the NRMSE, and as it is skewed the medians of the signed ones, but not the sums'. What
+the capture's own frames lack tells `frames_against_reference.py`.
 """
 
 from __future__ import annotations
@@ -175,9 +175,12 @@ def errors(found: Array, truth: Array, area: Array) -> dict[str, Any]:
     mean = found.mean(axis=1) / np.maximum(truth.mean(axis=1), 1e-9) - 1
     sums = (area[:, None] * found).sum(axis=0) / (area[:, None] * truth).sum(axis=0) - 1
     squares = (area[:, None] * (found - truth) ** 2).sum() / (area[:, None] * truth**2).sum()
+    every, each = channels.ravel(), np.repeat(area, 3)
     return {
-        "signed": round(weighted_median(mean, area), 5),
-        "absolute": round(weighted_median(np.abs(mean), area), 5),
+        "signed": round(weighted_median(every, each), 5),
+        "absolute": round(weighted_median(np.abs(every), each), 5),
+        "signed_mean": round(weighted_median(mean, area), 5),
+        "absolute_mean": round(weighted_median(np.abs(mean), area), 5),
         "signed_rgb": [round(weighted_median(c, area), 5) for c in channels.T],
         "absolute_rgb": [round(weighted_median(np.abs(c), area), 5) for c in channels.T],
         "sums_rgb": [round(float(c), 5) for c in sums],
