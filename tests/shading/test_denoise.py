@@ -124,6 +124,27 @@ def test_the_filter_gives_the_same_bits_in_every_run_and_on_any_number_of_thread
         assert child.stdout.strip() == here, threads
 
 
+def test_a_failure_of_the_filter_ends_it_with_what_to_do(monkeypatch):
+    pyoidn = pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    said = iter([None, "out of memory"])
+    monkeypatch.setattr(pyoidn.Device, "get_error", lambda _: next(said))
+    filtered = denoise_lightmaps([np.ones((4, 5, 3), np.float32)] * 3)
+    next(filtered)
+    with pytest.raises(EnvironmentFailure, match=r"5 x 4 texels: out of memory.*--denoise none"):
+        next(filtered)
+
+
+def test_an_interrupt_on_the_way_is_not_swallowed():
+    pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+
+    def pictures():
+        yield np.ones((4, 4, 3), np.float32)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(denoise_lightmaps(pictures()))
+
+
 def test_the_filter_gives_its_memory_back():
     pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
     picture = np.ones((1200, 1200, 3), np.float32)

@@ -49,20 +49,23 @@ def denoise_lightmaps(pictures: Iterable[Float]) -> Iterator[Float]:
     # Not pyoidn.denoise, which keeps its working memory, up to 2.4 GiB, until the process ends.
     with pyoidn.Device() as device:
         device.commit()
-        with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT_LIGHTMAP) as lightmap_filter:
+        lightmap_filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT_LIGHTMAP)
+        try:  # not "with": its filters swallow errors
+            lightmap_filter.set_int("maxMemoryMB", _MOST_MEGABYTES)
             for picture in pictures:
                 colour = np.ascontiguousarray(picture, np.float32)
                 filtered = np.empty_like(colour)
                 lightmap_filter.set_image("color", colour, pyoidn.OIDN_FORMAT_FLOAT3)
                 lightmap_filter.set_image("output", filtered, pyoidn.OIDN_FORMAT_FLOAT3)
-                lightmap_filter.set_int("maxMemoryMB", _MOST_MEGABYTES)
                 lightmap_filter.commit()
                 lightmap_filter.execute()
                 error = device.get_error()
-                if error:
+                if error is not None:
                     raise EnvironmentFailure(
                         f"Open Image Denoise failed on a lightmap of {picture.shape[1]} x "
                         f"{picture.shape[0]} texels: {error}. Run again with --denoise none. "
                         "[shading.denoise]"
                     )
-                yield np.maximum(filtered, 0)
+                yield np.maximum(filtered, 0, out=filtered)
+        finally:
+            lightmap_filter.release()
