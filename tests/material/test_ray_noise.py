@@ -4,16 +4,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate
-from usdbrdf.material.ray_noise import mean_of_repeats
+from usdbrdf.material.ray_noise import mean_of_repeats, repeated_where_noisy
 
 ONE = LobeEstimate(
     phi=0.1, psi=0.5, phi_error=0.02, psi_error=0.06, unresolved=0.01, cost=1.0, evidence=0.8,
     of_rays=(0.01, 0.04),
 )  # fmt: skip
+
+
+def test_a_fit_is_repeated_with_rays_of_its_own_only_where_they_matter():
+    seeds = []
+
+    def fit(seed: int, one: LobeEstimate) -> LobeEstimate:
+        seeds.append(seed)
+        return one
+
+    for one, expected in (
+        (replace(ONE, of_rays=(0.005, 0.017)), 1),
+        (replace(ONE, of_rays=(0.007, 0.0)), 4),
+        (replace(ONE, of_rays=(0.0, 0.019)), 4),
+        (replace(ONE, of_rays=(0.02, 0.05), evidence=0.1), 1),  # its class tells more
+    ):
+        seeds.clear()
+        for seed in range(3):
+            repeated_where_noisy(partial(fit, one=one), seed)
+        assert len(seeds) == len(set(seeds)) == 3 * expected
 
 
 def test_a_single_fit_keeps_its_values_and_states_what_its_rays_do():

@@ -137,6 +137,8 @@ def test_costs_are_those_of_generalised_least_squares(updates: int):
     for x, y in ((a, a), (a, b), (samples.radiance.astype(float), b)):
         wanted = _product(samples, covariance, x, y)
         assert _found(model, x, y) == pytest.approx(wanted, rel=1e-8, abs=1e-8)
+        solved = model.solved(y[..., None])[..., 0]
+        assert float((x * solved).sum()) == pytest.approx(wanted, rel=1e-8, abs=1e-8)
 
 
 def test_what_a_texel_shows_in_all_frames_costs_nothing():

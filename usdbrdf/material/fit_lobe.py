@@ -110,17 +110,17 @@ def _estimate(
     more = _Search(phis=between, terms=_terms(model, radiance, *bases))
     fine = coarse.and_more(more)
     _, best, psi = fine.least
-    phis = [fine.phis[best]]
+    near = [fine.phis[k] for k in (max(best - 1, 0), best, min(best + 1, len(fine.phis) - 1))]
+    bases = candidate.first(near), candidate.second(near)
     found = lobe_from_costs(
         np.array(fine.phis),
         fine.terms,
         without,
-        _cost_with_noise(model, radiance, (candidate.first(phis), candidate.second(phis)), psi),
+        _cost_with_noise(model, radiance, bases, psi),
         model.degrees_of_freedom,
         candidate.blur,
     )
-    near = [fine.phis[k] for k in (max(best - 1, 0), best, min(best + 1, len(fine.phis) - 1))]
-    of_rays = error_of_rays(model, candidate.first(near), candidate.second(near), near, psi)
+    of_rays = error_of_rays(model, radiance[..., 0], bases, near, psi)
     return replace(found, of_rays=of_rays)
 
 
@@ -155,8 +155,9 @@ def _terms(model: ViewModel, radiance: Float, first: Pair, second: Pair) -> Doub
 def _cost_with_noise(
     model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], psi: float
 ) -> float:
-    """The cost of a lobe with the bases' own noise in it: the mean of either basis' squares."""
-    sets = [radiance - base - np.float32(psi) * slope for base, slope in bases]
+    """The cost of the lobe in the middle of three, with the bases' own noise in it: the mean of
+    either basis' squares."""
+    sets = [radiance - (base + np.float32(psi) * slope)[..., 1:2] for base, slope in bases]
     rest = model.reduced(np.concatenate(sets, axis=2))
     return float(model.product(rest, rest).mean())
 

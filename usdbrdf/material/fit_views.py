@@ -21,7 +21,7 @@ from usdbrdf.material.lit_scene import LitScene, View, sub_pixel_points
 from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
-from usdbrdf.material.ray_noise import mean_of_repeats
+from usdbrdf.material.ray_noise import repeated_where_noisy
 from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.texturing.footprints import RINGS
@@ -54,9 +54,6 @@ _ABOVE_NOISE = 4.0
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
-# Where the rays' errors are more than this share of the stated ones, the fit is the mean of several
-# with rays of their own.
-_NOISY, _REPEATS = 0.3, 4
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 
@@ -75,7 +72,8 @@ def fit_views(
 
     smoothing: of the pictures, in pixels, see ``smoothing_of``. view_of(frame) gives poses and
     pinholes; the images themselves are not needed any more.
-    mixture: the rays of each of a sample's points, traced three times; curved objects have more.
+    mixture: the rays of each of a sample's points, traced three times, or where their noise matters
+    twelve times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -88,16 +86,12 @@ def fit_views(
         times = _TIMES_FOR_CURVED
         mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
 
-    def fitted(repeat: int) -> LobeEstimate:
-        own_seed = _REPEATS * seed + repeat
+    def fitted(own_seed: int) -> LobeEstimate:
         return fit_lobe(
             samples, _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
         )
 
-    found = [fitted(0)]
-    if _noisy(found[0]):
-        found += [fitted(repeat) for repeat in range(1, _REPEATS)]
-    return mean_of_repeats(found), len(samples.texel)
+    return repeated_where_noisy(fitted, seed), len(samples.texel)
 
 
 def _candidates(
@@ -122,12 +116,6 @@ def _candidates(
             Candidate(first=first, second=second, third=third, blur=blur, likely=likely)
         )
     return candidates
-
-
-def _noisy(found: LobeEstimate) -> bool:
-    """Whether the rays matter beside the samples' own errors."""
-    phi, psi = found.of_rays
-    return phi > _NOISY * found.phi_error or psi > _NOISY * found.psi_error
 
 
 def _footprints(

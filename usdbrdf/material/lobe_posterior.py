@@ -28,7 +28,8 @@ class LobeEstimate:
     """phi, psi in [0, 1], where the cost is least; their standard deviations as far as the samples
     tell, which near NOTHING_KNOWN say just that; unresolved, how much of phi may be due to the
     samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any specular
-    light; of_rays, the share in the errors of phi and psi of the rays, where it is known."""
+    light; of_rays, what the rays' noise alone does to phi and psi, beside the stated errors until
+    ``mean_of_repeats`` adds it to them."""
 
     phi: float
     psi: float
@@ -57,9 +58,9 @@ def lobe_from_costs(
     phi = _vertex(phis, profile)
     least = float(profile.min())
     surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
-    # The rays' noise is an error of the lobe as much as the frames' is.
-    of_rays = max(1.0, noisy / max(least, 1e-12))
-    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0)) * of_rays
+    # Where rays are noisy, what they show is badly known as well, as the place of a mirrored lamp.
+    noise_ratio = max(1.0, noisy / max(least, 1e-12))
+    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
     density = np.exp(-0.5 * (surface - surface.min()) / temper)
     density *= np.gradient(phis)[:, None]
     density /= density.sum()

@@ -5,44 +5,74 @@ A mirror shows a lamp in few of its samples, and few rays meet it there: then ps
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate
+from usdbrdf.material.verdict import SOME_EVIDENCE
 from usdbrdf.material.view_model import ViewModel
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
 Pair = tuple[Float, Float]
 
+# Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
+# many with rays of their own.
+_NOISY, _REPEATS = 0.3, 4
+
 
 def error_of_rays(
-    model: ViewModel, first: Pair, second: Pair, phis: Sequence[float], psi: float
+    model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], phis: Sequence[float], psi: float
 ) -> tuple[float, float]:
     """Standard deviations of phi and psi that the rays' noise alone brings about.
 
-    first, second  (base, slope), (P, 3, 3) each, with independent noise, at three ``phis``: the one
-                   that was found and its neighbours
+    radiance  (P, 3) of the samples
+    bases     twice (base, slope), (P, 3, 3) each, with independent noise, at three ``phis``: the
+              one that was found and its neighbours
 
-    Gauss-Newton: noise n in the predicted lobe moves (phi, psi) by H^-1 J' C^-1 n, H = J' C^-1 J.
-    The difference of the two predictions has twice the variance of one, four times that of their
-    mean. Rays of different texels are independent, those of one texel's views are the same. This is
-    of first order: strong noise also moves the samples' weights, and does some times as much.
+    (phi, psi) solve J1' C^-1 (I - M2) + J2' C^-1 (I - M1) = 0, M being the predicted lobe and J its
+    derivatives. Noise in them moves the solution by H^-1 / 2 times the sum over both of J' C^-1 n
+    and, the other way, d' C^-1 e; H = J1' C^-1 J2, e what is left of the samples. A sum of two
+    independent noises has the variance of their difference, which is known. Rays of different
+    texels are independent, those of one texel's views hang together.
     """
-    lobes = [base + np.float32(psi) * slope for base, slope in (first, second)]
-    by_phi, by_psi = (lobes[0] + lobes[1]) / 2, (first[1] + second[1]) / 2
+    lobes = [base + np.float32(psi) * slope for base, slope in bases]
     step = phis[2] - phis[0]
-    along = np.stack([(by_phi[..., 2] - by_phi[..., 0]) / step, by_psi[..., 1]], axis=-1)
-    solved = model.solved(along)
-    normal = np.einsum("pci,pcj->ij", solved, along) + np.eye(2) / NOTHING_KNOWN**2
-    noise = (lobes[0] - lobes[1])[..., 1]
-    pull = model.of_texels(np.einsum("pci,pc->pi", solved, noise)) / 2
-    inverse = np.linalg.inv(normal)
-    phi, of_psi = np.sqrt(np.diag(inverse @ (pull.T @ pull) @ inverse))
-    return float(phi), float(of_psi)
+    first, second = (
+        np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
+        for lobe, (_, slope) in zip(lobes, bases, strict=True)
+    )
+    left = radiance - (lobes[0] + lobes[1])[..., 1] / 2
+    solved = model.solved(np.concatenate([first, second, left[..., None]], axis=-1))
+    along = (solved[..., :2] + solved[..., 2:4]) / 2
+    each = np.einsum("pci,pc->pi", along, (lobes[0] - lobes[1])[..., 1])
+    each -= np.einsum("pci,pc->pi", first - second, solved[..., 4])
+    pull = model.sums_of_texels(each) / 2
+    crossed = np.einsum("pci,pcj->ij", solved[..., :2], second)
+    moved = pull @ _inverse((crossed + crossed.T) / 2)
+    by_phi, by_psi = np.sqrt((moved**2).sum(axis=0))
+    return float(by_phi), float(by_psi)
+
+
+def _inverse(normal: Double) -> Double:
+    """Of a symmetric matrix with the prior's precision: noise may leave less than that of it."""
+    values, vectors = np.linalg.eigh(normal)
+    found: Double = (vectors / (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
+    return found
+
+
+def repeated_where_noisy(fit: Callable[[int], LobeEstimate], seed: int) -> LobeEstimate:
+    """A fit that gets its rays from a seed, or, where their noise matters to what it tells, the
+    mean of several; these have seeds that no other ``seed`` brings about."""
+    found = [fit(_REPEATS * seed)]
+    stated = np.array([found[0].phi_error, found[0].psi_error])
+    noisy = np.any(np.array(found[0].of_rays) > _NOISY * stated)
+    if noisy and found[0].evidence >= SOME_EVIDENCE:
+        found += [fit(_REPEATS * seed + repeat) for repeat in range(1, _REPEATS)]
+    return mean_of_repeats(found)
 
 
 def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:

@@ -12,7 +12,7 @@ B = Z' W X.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,29 +119,38 @@ class SharedErrors:
         parts.append(linalg.solve_triangular(self._root, of_texels, lower=True, check_finite=False))
         return np.concatenate(parts)
 
-    def expected(self, whitened: Double) -> tuple[Double, Double]:
-        """Given one ``whitened`` column (N,) of the samples' radiance: what the shared errors are
-        expected to have added to the samples, (P, 3), and the mean square expected of each kind,
-        (kinds,)."""
-        covariance, _ = linalg.lapack.dpotri(self._root, lower=True)
-        of_texels = linalg.solve_triangular(
-            self._root, whitened[-len(self._root) :], lower=True, trans="T", check_finite=False
-        )
+    def added(self, whitened: Double) -> Double:
+        """What the shared errors are expected to have added to the samples, (P, 3), given one
+        ``whitened`` column (N,) of the samples' values."""
         added = np.zeros((self._count, 3))
-        square, number, first = np.zeros(self._kinds), np.zeros(self._kinds), 0
-        for frame in self._frames:
-            white = whitened[first : first + len(frame.kind)]
-            first += len(white)
-            white = white + frame.of_texels @ of_texels[frame.places]
-            effect = frame.inverse_root.T @ white
+        for frame, white in self._of_frames(whitened):
             added[frame.samples] = (frame.along.T @ white).reshape(-1, 3)
+        return added
+
+    def mean_squares(self, whitened: Double) -> Double:
+        """The mean square expected of each kind of shared error, (kinds,), given the same."""
+        covariance, _ = linalg.lapack.dpotri(self._root, lower=True)
+        square, number = np.zeros(self._kinds), np.zeros(self._kinds)
+        for frame, white in self._of_frames(whitened):
+            effect = frame.inverse_root.T @ white
             coupling = frame.inverse_root.T @ frame.of_texels
             own = _symmetric_block(covariance, frame.places)
             variance = (frame.inverse_root**2).sum(axis=0)
             variance += ((coupling @ own) * coupling).sum(axis=1)
             square += np.bincount(frame.kind, effect**2 + variance, self._kinds)
             number += np.bincount(frame.kind, minlength=self._kinds)
-        return added, square / np.maximum(number, 1)
+        return square / np.maximum(number, 1)
+
+    def _of_frames(self, whitened: Double) -> Iterator[tuple[_Frame, Double]]:
+        """Each frame with its shared errors' part, the texels' part solved for, (n,)."""
+        of_texels = linalg.solve_triangular(
+            self._root, whitened[-len(self._root) :], lower=True, trans="T", check_finite=False
+        )
+        first = 0
+        for frame in self._frames:
+            white = whitened[first : first + len(frame.kind)]
+            first += len(white)
+            yield frame, white + frame.of_texels @ of_texels[frame.places]
 
 
 @loop

@@ -115,23 +115,22 @@ class ViewModel:
         products -= np.einsum("nk,nk->k", a.shared, b.shared)
         return products
 
-    def of_texels(self, values: Double) -> Double:
+    def sums_of_texels(self, values: Double) -> Double:
         """Sums over each texel's samples, (num_texels, K), of values (P, K)."""
         sums: Double = self._gather @ values
         return sums
 
     def solved(self, values: npt.NDArray[np.floating]) -> Double:
         """C^-1 of K sets of values, (P, 3, K), with the diffuse parts left free."""
-        shared = self.reduced(values).shared
-        errors = [self._shared.expected(one)[0] for one in shared.T]
+        errors = [self._shared.added(one) for one in self.reduced(values).shared.T]
         return self.reduced(values - np.stack(errors, axis=-1)).weighted
 
     def update(self, non_diffuse: npt.NDArray[np.floating]) -> None:
         """One step of expectation maximisation, given I_nd (P, 3) of the best lobe so far."""
         rest = self._radiance - non_diffuse
-        errors, square = self._shared.expected(self.reduced(rest[..., None]).shared[:, 0])
-        self._deviation = np.maximum(_LEAST, np.sqrt(square))
-        left = self.reduced((rest - errors)[..., None])
+        whitened = self.reduced(rest[..., None]).shared[:, 0]
+        self._deviation = np.maximum(_LEAST, np.sqrt(self._shared.mean_squares(whitened)))
+        left = self.reduced((rest - self._shared.added(whitened))[..., None])
         values, weighted = left.values[..., 0], left.weighted[..., 0]
         own_variance = 1 / self._own_precision
         own = (self._towards_level * values).sum(axis=1) * own_variance
