@@ -73,8 +73,11 @@ class _Search:
         return _Search(phis=[phis[k] for k in order], terms=terms)
 
 
-def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstimate:
+def fit_lobe(
+    samples: ViewSamples, candidates: Sequence[Candidate], repeats: int = 1
+) -> LobeEstimate:
     """The lobe that explains the samples best, averaged over the footprints that may be theirs.
+    Its errors are those of the mean of so many ``repeats`` with rays of their own.
 
     The errors' variances are found with the first candidate, and improved with the one that is best
     with these. With them fixed all candidates are fitted and compared.
@@ -93,7 +96,7 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
     whole = model.reduced(radiance)
     without = float(model.product(whole, whole)[0])
     estimates = [
-        _estimate(model, radiance, candidate, search, without)
+        _estimate(model, radiance, candidate, search, without, repeats)
         for candidate, search in zip(candidates, coarse, strict=True)
     ]
     likely = [candidate.likely for candidate in candidates]
@@ -101,7 +104,12 @@ def fit_lobe(samples: ViewSamples, candidates: Sequence[Candidate]) -> LobeEstim
 
 
 def _estimate(
-    model: ViewModel, radiance: Float, candidate: Candidate, coarse: _Search, without: float
+    model: ViewModel,
+    radiance: Float,
+    candidate: Candidate,
+    coarse: _Search,
+    without: float,
+    repeats: int,
 ) -> LobeEstimate:
     """One candidate's lobe, searched more closely than ``coarse``, with the variances as they are.
     without: the cost without specular light."""
@@ -109,16 +117,12 @@ def _estimate(
     bases = candidate.first(between), candidate.second(between)
     more = _Search(phis=between, terms=_terms(model, radiance, *bases))
     fine = coarse.and_more(more)
-    _, best, psi = fine.least
+    least, best, psi = fine.least
     near = [fine.phis[k] for k in (max(best - 1, 0), best, min(best + 1, len(fine.phis) - 1))]
     bases = candidate.first(near), candidate.second(near)
+    noisy = least + (_cost_with_noise(model, radiance, bases, psi) - least) / repeats
     found = lobe_from_costs(
-        np.array(fine.phis),
-        fine.terms,
-        without,
-        _cost_with_noise(model, radiance, bases, psi),
-        model.degrees_of_freedom,
-        candidate.blur,
+        np.array(fine.phis), fine.terms, without, noisy, model.degrees_of_freedom, candidate.blur
     )
     of_rays = error_of_rays(model, radiance[..., 0], bases, near, psi)
     return replace(found, of_rays=of_rays)

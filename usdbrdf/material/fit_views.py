@@ -73,7 +73,7 @@ def fit_views(
     smoothing: of the pictures, in pixels, see ``smoothing_of``. view_of(frame) gives poses and
     pinholes; the images themselves are not needed any more.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
-    twelve times; curved objects have more.
+    fifteen times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -86,10 +86,9 @@ def fit_views(
         times = _TIMES_FOR_CURVED
         mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
 
-    def fitted(own_seed: int) -> LobeEstimate:
-        return fit_lobe(
-            samples, _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
-        )
+    def fitted(own_seed: int, repeats: int) -> LobeEstimate:
+        candidates = _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
+        return fit_lobe(samples, candidates, repeats)
 
     return repeated_where_noisy(fitted, seed), len(samples.texel)
 

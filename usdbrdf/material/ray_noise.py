@@ -21,7 +21,7 @@ Pair = tuple[Float, Float]
 
 # Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
 # many with rays of their own.
-_NOISY, _REPEATS = 0.3, 4
+_NOISY, _REPEATS = 0.5, 4
 
 
 def error_of_rays(
@@ -64,15 +64,15 @@ def _inverse(normal: Double) -> Double:
     return found
 
 
-def repeated_where_noisy(fit: Callable[[int], LobeEstimate], seed: int) -> LobeEstimate:
-    """A fit that gets its rays from a seed, or, where their noise matters to what it tells, the
-    mean of several; these have seeds that no other ``seed`` brings about."""
-    found = [fit(_REPEATS * seed)]
-    stated = np.array([found[0].phi_error, found[0].psi_error])
-    noisy = np.any(np.array(found[0].of_rays) > _NOISY * stated)
-    if noisy and found[0].evidence >= SOME_EVIDENCE:
-        found += [fit(_REPEATS * seed + repeat) for repeat in range(1, _REPEATS)]
-    return mean_of_repeats(found)
+def repeated_where_noisy(fit: Callable[[int, int], LobeEstimate], seed: int) -> LobeEstimate:
+    """``fit(seed, repeats)`` gets its rays from its seed. One fit, or, where their noise matters to
+    what it tells, the mean of several; these have seeds that no other ``seed`` brings about."""
+    first = (_REPEATS + 1) * seed
+    one = fit(first, 1)
+    noisy = np.any(np.array(one.of_rays) > _NOISY * np.array([one.phi_error, one.psi_error]))
+    if not noisy or one.evidence < SOME_EVIDENCE:
+        return mean_of_repeats([one])
+    return mean_of_repeats([fit(first + k, _REPEATS) for k in range(1, _REPEATS + 1)])
 
 
 def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
