@@ -173,7 +173,8 @@ def errors(found: Array, truth: Array, area: Array) -> dict[str, Any]:
     """Relative errors of values (R, 3), weighted by ``area`` (R,)."""
     channels = found / np.maximum(truth, 1e-9) - 1
     mean = found.mean(axis=1) / np.maximum(truth.mean(axis=1), 1e-9) - 1
-    sums = (area[:, None] * found).sum(axis=0) / (area[:, None] * truth).sum(axis=0) - 1
+    whole = np.maximum((area[:, None] * truth).sum(axis=0), 1e-9)
+    sums = (area[:, None] * found).sum(axis=0) / whole - 1
     squares = (area[:, None] * (found - truth) ** 2).sum() / (area[:, None] * truth**2).sum()
     every, each = channels.ravel(), np.repeat(area, 3)
     return {

@@ -24,6 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.job.progress import progress
+from usdbrdf.relighting.render import pinhole
+from usdbrdf.relighting.views import View
 from usdbrdf.scan.adapters import read_scan
 from usdbrdf.scan.frame_reading import read_frame
 from usdbrdf.scan.ingest_options import IngestOptions
@@ -56,17 +58,16 @@ def main() -> int:
     frames = read_scan(options.capture, IngestOptions()).frames
     scene = make_study.mitsuba_scene(true_objects(options.capture))
     integrator = mi.load_dict(
-        {
-            "type": "path",
-            "max_depth": options.max_depth,
-            "rr_depth": make_study.ROULETTE_DEPTH,
-        }
+        {"type": "path", "max_depth": options.max_depth, "rr_depth": make_study.ROULETTE_DEPTH}
     )
     chosen = range(0, len(frames), options.every)
     sums = {
         i: compared(frames, i, scene, integrator, options.samples)
         for i in progress(chosen, total=len(chosen), label="render", unit="frames")
     }
+    sums = {i: one for i, one in sums.items() if one.reference.all()}
+    if not sums:
+        raise SystemExit(f"{options.capture}: no frame has a square of known pixels")
     frame, reference = (np.stack(some) for some in zip(*sums.values(), strict=True))
     excess = (frame - reference * frame.sum(axis=0) / reference.sum(axis=0)) / reference.sum(axis=0)
     report = {
@@ -82,41 +83,30 @@ def main() -> int:
 def compared(
     frames: Frames, i: int, scene: mi.Scene, integrator: mi.Integrator, samples: int
 ) -> Sums:
-    pixels = read_frame(frames, i)
-    image = mi.render(scene, sensor=sensor(frames, i), spp=samples, seed=i, integrator=integrator)
+    """The sums of frame ``i``, and of what the true scene shows from there."""
+    pixels, sensor = read_frame(frames, i), pinhole_of(frames, i)
+    image = mi.render(scene, sensor=sensor, spp=samples, seed=i, integrator=integrator)
     known = squares(pixels.valid.astype(np.float64)[..., None])[..., 0] == 1
-    sums = (squares(np.asarray(values, np.float64))[known].sum(axis=0)
-            for values in (np.nan_to_num(pixels.radiance), image))  # fmt: skip
-    return Sums(*sums)
-
-
-def sensor(frames: Frames, i: int) -> mi.Sensor:
-    """The frame's pinhole; Mitsuba's cameras look along +z with x to the left."""
-    width, height = (int(size) for size in frames.resolution[i])
-    fx, _, cx, cy = frames.intrinsics[i]
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov_axis": "x",
-            "fov": float(np.degrees(2 * np.arctan(width / 2 / fx))),
-            "principal_point_offset_x": float(0.5 - cx / width),
-            "principal_point_offset_y": float(0.5 - cy / height),
-            "near_clip": 0.01,
-            "far_clip": 100.0,
-            "to_world": mi.ScalarTransform4f(
-                frames.world_from_camera[i] @ np.diag([-1.0, 1.0, -1.0, 1.0])
-            ),
-            "sampler": {"type": "independent"},
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-        }
+    frame, reference = (
+        squares(np.asarray(values, np.float64))[known].sum(axis=0)
+        for values in (np.nan_to_num(pixels.radiance), image)
     )
+    return Sums(frame, reference)
+
+
+def pinhole_of(frames: Frames, i: int) -> mi.Sensor:
+    width, height = (int(size) for size in frames.resolution[i])
+    lens = tuple(float(number) for number in frames.intrinsics[i])
+    if abs(lens[0] - lens[1]) > 1e-6 * lens[0]:
+        raise SystemExit(f"frame {i}: its pixels are not square, which is not provided for here")
+    view = View(
+        name=str(i),
+        world_from_camera=frames.world_from_camera[i],
+        intrinsics=lens,
+        width=width,
+        height=height,
+    )
+    return pinhole(mi, view, height, lens[3])
 
 
 def squares(image: Array) -> Array:

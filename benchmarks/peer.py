@@ -106,9 +106,10 @@ def measure(
     if earlier is not None:
         course = stored_course(earlier, diffuse)
     else:
-        mi = peers_mitsuba()
-        if isinstance(mi, str):
-            return {"skipped": mi, "figures": []}
+        try:
+            mi = peers_mitsuba()
+        except EnvironmentFailure as error:
+            return {"skipped": str(error), "figures": []}
         course = optimised(mi, asset, lit, diffuse, labels, settings)
 
     def both(many: list[dict[str, Any]]) -> dict[str, list[float] | None]:
@@ -149,13 +150,10 @@ def measure(
 
 
 def peers_mitsuba() -> Any:
-    """Mitsuba with derivatives, or a sentence that says why there is none."""
-    try:
-        mi = mitsuba_variant()
-    except EnvironmentFailure as error:
-        return str(error)
+    """Mitsuba with derivatives. Raises EnvironmentFailure where there is none."""
+    mi = mitsuba_variant()
     if mi.variant() != "llvm_ad_rgb":
-        return "no LLVM library of version 17 or newer; set DRJIT_LIBLLVM_PATH"
+        raise EnvironmentFailure("no LLVM library of version 17 or newer; set DRJIT_LIBLLVM_PATH")
     return mi
 
 

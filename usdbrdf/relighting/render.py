@@ -39,7 +39,7 @@ def render_view(
     # Mitsuba's pixels are square: others are rendered so, and their rows gathered afterwards.
     height = max(1, round(view.height * fx / fy))
     stretch = height / view.height
-    sensor = _sensor(mi, view, height, cy * stretch)
+    sensor = pinhole(mi, view, height, cy * stretch)
     integrator = mi.load_dict(
         {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": scene.integrator()}
     )
@@ -68,7 +68,8 @@ def render_view(
     )
 
 
-def _sensor(mi: Any, view: View, height: int, cy: float) -> Any:
+def pinhole(mi: Any, view: View, height: int, cy: float) -> Any:
+    """A sensor of square pixels, ``height`` rows of them with the principal point in row cy."""
     fx, _, cx, _ = view.intrinsics
     # Mitsuba's cameras look down +z with x to the left.
     pose = view.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
