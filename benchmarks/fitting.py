@@ -99,7 +99,7 @@ def some_frames(frames: Frames, step: int) -> Frames:
 
 
 def rays_per_sample(mixture: Mixture = MIXTURE) -> int:
-    """Of one footprint of a flat object: points of it, times three independent sets, times the
+    """Of one fit of a flat object: points of a footprint, times three independent sets, times the
     mixture's rays."""
     rays = mixture.per_lobe * len(LOBE_ALPHAS) + mixture.lights + mixture.cosine
     return 3 * len(RINGS) * rays
