@@ -52,6 +52,11 @@ def test_repeats_are_averaged_and_their_rays_errors_fall():
     assert found.psi_error == pytest.approx(math.hypot(0.06, 0.02))
 
 
+def test_one_that_is_far_off_does_not_tell_for_all():
+    found = mean_of_repeats([ONE, ONE, ONE, replace(ONE, of_rays=(5.0, 5.0))])
+    assert found.of_rays == pytest.approx((0.005, 0.02))
+
+
 def test_a_scatter_beyond_what_the_fits_foretell_counts():
     found = mean_of_repeats([replace(ONE, psi=psi) for psi in (0.3, 0.7, 0.3, 0.7)])
     assert found.of_rays[1] == pytest.approx(math.sqrt(0.16 / 3) / 2)

@@ -80,7 +80,8 @@ def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
     from their scatter, or as each of them says, whichever is more."""
     values = np.array([[one.phi, one.psi] for one in found])
     stated = np.array([[one.phi_error, one.psi_error] for one in found])
-    of_rays = np.sqrt((np.array([one.of_rays for one in found]) ** 2).mean(axis=0))
+    # Not their mean: with much noise H, and so what one of them says, may be far off.
+    of_rays = np.median([one.of_rays for one in found], axis=0)
     if len(found) > 1:
         of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
     of_rays /= np.sqrt(len(found))
