@@ -6,7 +6,6 @@ A mirror shows a lamp in few of its samples, and few rays meet it there: then ps
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -85,16 +84,14 @@ def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
     if len(found) > 1:
         of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
     of_rays /= np.sqrt(len(found))
-    phi, psi = values.mean(axis=0)
     errors = np.minimum(np.hypot(stated.mean(axis=0), of_rays), NOTHING_KNOWN)
-    return replace(
-        found[0],
-        phi=float(phi),
-        psi=float(psi),
+    means = {
+        name: float(np.mean([getattr(one, name) for one in found]))
+        for name in ("phi", "psi", "unresolved", "cost", "evidence")
+    }
+    return LobeEstimate(
+        **means,
         phi_error=float(errors[0]),
         psi_error=float(errors[1]),
-        unresolved=float(np.mean([one.unresolved for one in found])),
-        cost=float(np.mean([one.cost for one in found])),
-        evidence=float(np.mean([one.evidence for one in found])),
         of_rays=(float(of_rays[0]), float(of_rays[1])),
     )

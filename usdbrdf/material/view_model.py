@@ -147,7 +147,7 @@ class ViewModel:
 
     def _texel_means(self, weighted: Double) -> Double:
         """(num_texels, 3, K) generalised means from weighted values."""
-        sums = self._gather @ weighted.reshape(len(weighted), -1)
+        sums = self.sums_of_texels(weighted.reshape(len(weighted), -1))
         means: Double = self._texel_covariance @ sums.reshape(self._num_texels, *weighted.shape[1:])
         return means
 
@@ -165,7 +165,7 @@ class ViewModel:
         weight /= self._own_precision[:, None, None]
         weight[:, range(3), range(3)] += 1 / self._variance
         self._weight = weight
-        of_texels = (self._gather @ weight.reshape(-1, 9)).reshape(-1, 3, 3)
+        of_texels = self.sums_of_texels(weight.reshape(-1, 9)).reshape(-1, 3, 3)
         self._texel_covariance = np.linalg.inv(of_texels)
         self._shared = SharedErrors(
             self._effects, self._deviation, self._level, weight, self._texel, of_texels
