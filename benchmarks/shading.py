@@ -6,8 +6,10 @@ ASSET was shaded. Measured are
 
     throughput  rays per second of the whole estimator (make rays, trace them, add up) over those of
                 embreex when it is called with the very same rays in the same order and nothing else
-    order       rays traced in our order, one sample's rays after the other's over patches of
-                8 x 8 texels, against the same rays in random order
+    order       first hits in our order, one sample's rays after the other's over patches of 8 x 8
+                texels and as the estimator traces them, a group's parallel rays together; against
+                the same rays in random order, one by one (together they take longer); and our
+                order one by one
     noise       relative RMSE of S against a converged one for 10,000 independent cosine-distributed
                 rays (the paper's) and for ours with and without the lightmap filter; rays and time
                 for equal noise
@@ -21,8 +23,9 @@ from __future__ import annotations
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -42,6 +45,7 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.geometry.embree import closest_hits, closest_hits_of_groups
 from usdbrdf.geometry.packed_texture import AHEAD
 from usdbrdf.geometry.rays import RayScene
 from usdbrdf.shading import incoming_light
@@ -49,13 +53,21 @@ from usdbrdf.shading.incoming_light import whole_patches
 from usdbrdf.shading.irradiance import Sampling, patches_of_texels
 from usdbrdf.shading.light_by_direction import cosine_directions, frames_of
 from usdbrdf.shading.light_by_picks import empty_room, empty_segments, light_segments, turns
-
-# Origins, directions (R, 3); distances (R,) of rays to lights, None for first hits.
-Call: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None]
+from usdbrdf.shading.patch_draws import groups_of
 
 THREADS = os.cpu_count() or 1
 # Places of the scene that throughput is measured at.
 RUNS = 16
+
+
+class Call(NamedTuple):
+    """Rays of one call: origins, directions (R, 3); of rays to lights distances (R,), of first hits
+    in our order groups (R,)."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    distances: np.ndarray | None = None
+    group: np.ndarray | None = None
 
 
 FULL = Sizes(1 << 15, 7, 3000, 1 << 13, 64)
@@ -91,12 +103,13 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     ours, embree = side_by_side(
         [lambda: shaded(lit, order, patch, sampling), lambda: embreex(scene, calls)], sizes.turns
     )
-    first_hits = [call for call in calls if call[2] is None]
+    first_hits = [call for call in calls if call.distances is None]
+    single = [call._replace(group=None) for call in first_hits]
     mixed = in_random_order(first_hits)
-    patches, random = side_by_side(
-        [lambda: traced(lit, first_hits), lambda: traced(lit, mixed)], sizes.turns
+    patches, one_by_one, random = side_by_side(
+        [partial(traced, lit, rays) for rays in (first_hits, single, mixed)], sizes.turns
     )
-    rays = sum(len(call[0]) for call in calls)
+    rays = sum(len(call.origins) for call in calls)
     per_ray = {name: median(times) / rays for name, times in (("ours", ours), ("embreex", embree))}
     return {
         "rays": rays,
@@ -104,6 +117,7 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         "rays_per_wall_second": {name: 1 / one.wall for name, one in per_ray.items()},
         "of_embreex": ratio(embree, ours)._asdict(),
         "patches_over_random_order": ratio(random, patches)._asdict(),
+        "one_by_one_over_random_order": ratio(random, one_by_one)._asdict(),
     }
 
 
@@ -122,13 +136,14 @@ def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) 
     def by_direction(*arguments: Any) -> None:
         origin, normal, draws, start, block = arguments[4:9]
         frames, room, found = frames_of(normal), np.empty((3, AHEAD), np.float32), []
+        groups = groups_of(draws[3])
         for first, sample in turns(len(origin), len(block)):
             origins = origin[first : first + AHEAD]
             directions = np.empty_like(origins)
             cosine_directions(frames, draws, start + sample, first, directions, room)
-            found.append((origins, directions))
-        origins, directions = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        calls.append((origins, directions, None))
+            found.append((origins, directions, groups[first : first + AHEAD]))
+        origins, directions, group = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        calls.append(Call(origins, directions, group=group))
 
     def by_picks(*arguments: Any) -> None:
         picks, origin, normal, draws, start, block = arguments[2:8]
@@ -140,12 +155,12 @@ def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) 
             )
             found.append((origin[segments[0][:count]], segments[-1][:count].copy()))
         origins, ways = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        calls.append((origins, ways, np.full(len(ways), 0.9999, np.float32)))
+        calls.append(Call(origins, ways, np.full(len(ways), 0.9999, np.float32)))
 
     instead = {"add_light_by_direction": by_direction, "add_light_by_picks": by_picks}
     with mock.patch.multiple(incoming_light, **instead):
         shaded(lit, order, patch, sampling)
-    return [call for call in calls if len(call[0])]
+    return [call for call in calls if len(call.origins)]
 
 
 def embreex_scene(rays: RayScene) -> EmbreeScene:
@@ -160,27 +175,37 @@ def embreex(scene: EmbreeScene, calls: list[Call]) -> None:
     """Nothing but embreex's answers, by as many threads as the estimator has."""
 
     def one(call: Call) -> None:
-        origins, directions, distances = call
-        if distances is None:
-            scene.run(origins, directions, output=True)
+        if call.distances is None:
+            scene.run(call.origins, call.directions, output=True)
         else:
-            scene.run(origins, directions, dists=distances, query="OCCLUDED")
+            scene.run(call.origins, call.directions, dists=call.distances, query="OCCLUDED")
 
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         list(pool.map(one, calls))
 
 
 def traced(lit: Lit, calls: list[Call]) -> None:
-    """First hits alone, as the estimator traces them."""
+    """First hits alone, as the estimator traces them: in groups where there are any."""
+    scene = lit.scene.rays.address
+
+    def one(call: Call) -> None:
+        count = len(call.origins)
+        found = np.empty(count, np.int32), *np.empty((3, count), np.float32)
+        if call.group is None:
+            closest_hits(scene, call.origins, call.directions, *found)
+        else:
+            closest_hits_of_groups(scene, call.origins, call.directions, call.group, *found)
+
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
-        list(pool.map(lambda call: lit.scene.rays.closest(*call[:2]), calls))
+        list(pool.map(one, calls))
 
 
 def in_random_order(calls: list[Call]) -> list[Call]:
     """The same rays, in as many calls."""
-    origins, directions = (np.concatenate(parts) for parts in list(zip(*calls, strict=True))[:2])
+    origins = np.concatenate([call.origins for call in calls])
+    directions = np.concatenate([call.directions for call in calls])
     order = np.random.default_rng(0).permutation(len(origins))
-    return [(origins[part], directions[part], None) for part in np.array_split(order, len(calls))]
+    return [Call(origins[part], directions[part]) for part in np.array_split(order, len(calls))]
 
 
 def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -189,7 +214,8 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     rows = [
         figure("rays per CPU second, of embreex's own", 100 * of_embreex["cpu"], "%", least=85),
         figure("the same by the clock", 100 * of_embreex["wall"], "%"),
-        figure("rays in patches over random order, CPU", order["cpu"], "x", least=1.8),
+        figure("first hits in patches over random order, CPU", order["cpu"], "x", least=1.8),
+        figure("the same one by one", traced["one_by_one_over_random_order"]["cpu"], "x"),
         figure("RMSE of S by 10,000 cosine rays", 100 * study["paper"]["rmse"], "%"),
         figure("rays for that, unfiltered", study["rays_for_equal_noise"], "", most=100),
         figure("tracing time, unfiltered, CPU", study["unfiltered_tracing"]["cpu"], "x"),

@@ -8,7 +8,7 @@ import pytest
 from tests.physics.surfaces import World, box, quad, room, sphere, world_of
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.geometry import rays as rays_module
-from usdbrdf.geometry.embree import occlusion
+from usdbrdf.geometry.embree import closest_hits_of_groups, occlusion
 from usdbrdf.geometry.rays import RayScene, lift_from_surface
 
 
@@ -96,6 +96,48 @@ def test_no_ray_leaves_a_closed_room_far_from_the_origin():
     rng = np.random.default_rng(5)
     directions = rng.standard_normal((200_000, 3)).astype(np.float32)
     assert (world.rays.closest(at[None].astype(np.float32), directions).face >= 0).all()
+
+
+def _in_groups(rays: RayScene, origins: np.ndarray, directions: np.ndarray, group: np.ndarray):
+    face, (u, v, distance) = np.empty(len(group), np.int32), np.empty((3, len(group)), np.float32)
+    closest_hits_of_groups(rays.address, origins, directions, group, face, u, v, distance)
+    return face, u, v, distance
+
+
+def _sizes_in_turn(rays: int) -> np.ndarray:
+    """Groups of 1 to 11 rays."""
+    return np.repeat(np.arange(rays), np.arange(rays) % 11 + 1)[:rays].astype(np.int64)
+
+
+def test_groups_find_what_single_rays_find():
+    ball = sphere((2, 1.5, 1.2), 0.6, 24, 48, (48, 24))
+    world = world_of([*room((0, 0, 0), (4, 3, 2.5)), ball])
+    rng = np.random.default_rng(9)
+    group = _sizes_in_turn(20_000)
+    # Nearly parallel ones, and others; some start outside and meet nothing.
+    towards = rng.standard_normal((20_000, 3))
+    for spread in (0.01, 1):
+        directions = (towards[group] + spread * rng.standard_normal((20_000, 3))).astype(np.float32)
+        origins = rng.uniform(-0.2, 2.7, (20_000, 3)).astype(np.float32)
+        single = world.rays.closest(origins, directions)
+        face, u, v, distance = _in_groups(world.rays, origins, directions, group)
+        assert 0.5 < (single.face >= 0).mean() < 1
+        same = face == single.face
+        assert same.mean() > 0.9999  # on an edge either triangle will do
+        hit = same & (face >= 0)
+        np.testing.assert_allclose(distance[hit], single.distance[hit], rtol=1e-4)
+        for found, one in ((u, single.u), (v, single.v)):
+            np.testing.assert_allclose(found[hit], one[hit], atol=1e-3)
+
+
+def test_no_ray_of_a_group_leaves_a_closed_room_far_from_the_origin():
+    at = np.array([1e3, -1e3, 1e3], np.float32)
+    world = world_of([sphere(at, 2, 48, 96, (96, 48))])
+    rng = np.random.default_rng(5)
+    group = _sizes_in_turn(200_000)
+    directions = rng.standard_normal((200_000, 3))[group] + rng.normal(0, 0.02, (200_000, 3))
+    origins = np.tile(at, (200_000, 1))
+    assert (_in_groups(world.rays, origins, directions.astype(np.float32), group)[0] >= 0).all()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 """Random numbers of patches: every texel's uniform, neighbours' in different strata, and one in
-each cell of a round."""
+each cell of a round; groups that share directions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ import pytest
 from scipy import stats
 
 from usdbrdf.shading.patch_draws import (
-    STRATA,
+    PATCHES,
+    TEXELS,
     PatchDraws,
+    groups_of,
     patch_draws,
+    places_in_patch,
     scrambles_of_points,
+    strata_by_place,
     strata_of_texels,
 )
 
 X, Y = (axis.ravel() for axis in np.meshgrid(np.arange(8), np.arange(8)))
+# Patches whose groups share random bits, and what these divide the cell of a direction into.
+RUN, STEPS = PATCHES, 16
 
 
 def _quadrants(stratum: np.ndarray, bits: int) -> np.ndarray:
@@ -25,10 +31,8 @@ def _quadrants(stratum: np.ndarray, bits: int) -> np.ndarray:
 
 def _points(draws: PatchDraws, patches: int, samples: int) -> np.ndarray:
     """All numbers of whole patches in [0, 1), (samples, 4, patches * 64)."""
-    patch = np.repeat(np.arange(patches, dtype=np.int32), STRATA)
-    stratum = np.tile(np.arange(STRATA, dtype=np.int32), patches)
-    identity = np.arange(len(patch))
-    scrambles = scrambles_of_points(patch, stratum, identity, draws.seed, draws.shared)
+    identity, stratum = np.arange(patches * TEXELS), np.tile(strata_by_place(), patches)
+    scrambles = scrambles_of_points(identity, stratum, draws.seed, draws.shared)
     return (draws.sobol[:samples, :, None] ^ scrambles) * 2.0**-32
 
 
@@ -38,6 +42,17 @@ def test_aligned_squares_of_texels_have_a_stratum_in_each_part_of_the_cell(bits:
     square = (X >> bits) * 8 + (Y >> bits)
     for one in np.unique(square):
         assert sorted(parts[square == one]) == list(range(4**bits))
+
+
+def test_a_patch_has_groups_of_eight_one_of_each_square_of_four():
+    place = places_in_patch(X, Y)
+    assert sorted(place) == list(range(TEXELS))
+    np.testing.assert_array_equal(strata_by_place()[place], strata_of_texels(X, Y))
+    group = groups_of(place.astype(np.int64))
+    for one in range(8):
+        x, y = X[group == one], Y[group == one]
+        assert len(set(zip(x // 2, y // 2, strict=True))) == len(x) == 8
+        assert np.ptp(y // 2) == 1
 
 
 @pytest.mark.parametrize("samples", [8, 32])
@@ -54,43 +69,69 @@ def test_a_round_has_one_sample_in_each_cell_for_every_point(samples: int):
         )
 
 
-def test_the_points_of_a_patch_follow_each_other_through_the_strata_of_one_cell():
+def test_a_group_shares_its_directions_and_no_two_groups_do():
     draws = patch_draws(5, 32, 32)
-    points = _points(draws, 4, 32)[:, :2].reshape(32, 2, 4, STRATA)
+    points = _points(draws, 2 * RUN, 32)[7].reshape(4, -1, 8)
+    assert (points[:2] == points[:2, :, :1]).all()
+    assert len({tuple(point) for point in points[:2, :, 0].T}) == 2 * RUN * 8
+    assert len({tuple(point) for point in points[2:].reshape(2, -1).T}) == 2 * RUN * TEXELS
+
+
+def test_the_groups_of_a_run_of_patches_are_stratified_in_one_cell():
+    draws = patch_draws(5, 32, 32)
     size = np.array([1 / 8, 1 / 4])[:, None]
-    for patch in range(4):
-        own = points[7, :, patch]
-        within = own / size % 1
+    directions = _points(draws, 2 * RUN, 32)[7, :2].reshape(2, 2, 8 * RUN, 8)[..., 0]
+    for run in range(2):
+        own = directions[:, run]
         assert len({tuple(cell) for cell in np.floor(own / size).astype(int).T}) == 1
-        strata = (within * 8).astype(int)
-        assert len({tuple(cell) for cell in strata.T}) == STRATA
-        # Four in turn share a quarter of a quarter of the cell.
-        quarters = (within * 4).astype(int).reshape(2, 16, 4)
-        assert (quarters == quarters[:, :, :1]).all()
+        strata = (own / size % 1 * STEPS).astype(int)
+        assert len({tuple(cell) for cell in strata.T}) == 8 * RUN
+        for x, y in ((16, 8), (8, 16), (4, 32 // 2)):
+            cell = strata[0] * x // STEPS * y + strata[1] * y // STEPS
+            assert (np.bincount(cell, minlength=x * y) == 8 * RUN // (x * y)).all()
+        # Of each patch one in each of 8, of each square of 2 x 2 texels one in each quarter.
+        for count, x, y in ((8, 4, 2), (4, 2, 2)):
+            parts = strata[0] * x // STEPS * y + strata[1] * y // STEPS
+            assert (np.sort(parts.reshape(-1, count)) == np.arange(count)).all()
+
+
+def test_the_points_on_lights_of_a_patch_are_stratified_in_one_cell():
+    draws = patch_draws(5, 32, 32)
+    size = np.array([1 / 8, 1 / 4])[:, None]
+    lights = _points(draws, 4, 32)[7, 2:].reshape(2, 4, TEXELS)
+    for patch in range(4):
+        own = lights[:, patch]
+        assert len({tuple(cell) for cell in np.floor(own / size).astype(int).T}) == 1
+        assert len({tuple(cell) for cell in (own / size % 1 * 8).astype(int).T}) == TEXELS
 
 
 def test_every_texel_is_uniform_over_the_strata_and_within_them():
-    # Chi-square over 64 strata, and over 64 parts of each of these, of one texel in 4,096 patches.
+    # Chi-square over 64 strata, and over 64 parts of each of these, of one texel in 4,096 runs of
+    # patches.
     draws = patch_draws(7, 32, 32)
-    points = _points(draws, 4096, 1)[0].reshape(4, 4096, STRATA)
+    identity = np.arange(4096) * RUN * TEXELS
     for texel in (0, 21, 63):
-        within = points[:, :, texel] * np.array([8, 4, 8, 4])[:, None] % 1
-        for x, y in ((0, 1), (2, 3)):
-            for place in (within[[x, y]], within[[x, y]] * 8 % 1):
+        stratum = np.full(4096, strata_by_place()[texel], np.int32)
+        scrambles = scrambles_of_points(identity + texel, stratum, draws.seed, draws.shared)
+        within = (draws.sobol[0, :, None] ^ scrambles) * 2.0**-32
+        within = within * np.array([8, 4, 8, 4])[:, None] % 1
+        for dimensions in ([0, 1], [2, 3]):
+            for place in (within[dimensions], within[dimensions] * 8 % 1):
                 cell = (place * 8).astype(int)
                 found = np.bincount(cell[0] * 8 + cell[1], minlength=64)
                 assert stats.chisquare(found).pvalue > 1e-4
 
 
-def test_a_patch_integrates_as_stratified_samples_do_and_without_bias():
+@pytest.mark.parametrize(("technique", "most"), [(0, 0.6 * 8), (2, 0.4)])
+def test_a_patch_integrates_as_stratified_samples_do_and_without_bias(technique: int, most: float):
     # What lies within a circle about a corner: pi / 4 of 0.8. A round of 32 samples leaves each
     # texel the error of its cells at the edge, of which the mean over a patch has far less variance
-    # than independent errors would leave.
+    # than independent errors of its 8 groups or its 64 texels would leave.
     draws = patch_draws(11, 32, 32)
-    points = _points(draws, 512, 32)
+    points = _points(draws, 512 * RUN, 32).reshape(32, 4, 512, RUN, TEXELS)[:, technique:, :, 0]
     inside = points[:, 0] ** 2 + points[:, 1] ** 2 < 0.8
-    error = inside.mean(axis=0).reshape(512, STRATA) - np.pi / 4 * 0.8
+    error = inside.mean(axis=0) - np.pi / 4 * 0.8
     of_texels, of_patches = error.var(), error.mean(axis=1).var()
-    assert of_patches < 0.4 * of_texels / STRATA
+    assert of_patches < most * of_texels / TEXELS
     assert abs(error.mean()) < 4 * np.sqrt(of_patches / 512)
     assert abs(error[:, 9].mean()) < 4 * np.sqrt(of_texels / 512)

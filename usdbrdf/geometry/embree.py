@@ -1,8 +1,8 @@
 """Embree's C interface, called from compiled loops: the library that embreex brings, without
 embreex's own calls, which would copy the scene and every ray.
 
-See the Embree API reference, https://github.com/RenderKit/embree, ``rtcIntersect1`` and
-``rtcOccluded1``; structures and constants are those of Embree 4.
+See the Embree API reference, https://github.com/RenderKit/embree, ``rtcIntersect1``,
+``rtcIntersect8`` and ``rtcOccluded1``; structures and constants are those of Embree 4.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from usdbrdf.kernel import loop
 
 Float = npt.NDArray[np.float32]
 Int = npt.NDArray[np.int32]
+Long = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 _TRIANGLES = 0  # RTC_GEOMETRY_TYPE_TRIANGLE
@@ -38,6 +39,9 @@ _FLOATS_BEHIND_VERTICES = 4
 _WORDS, _ALIGNED = 24, 16
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 _U, _V, _FACE, _GEOMETRY, _INSTANCE = 15, 16, 17, 18, 19
+# Rays of one packet, RTCRayHit8: each word of a ray for all of them, aligned to 32 bytes.
+_LANES, _ALIGNED_PACKET = 8, 32
+_COHERENT = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
 # Finite, so that what is computed with the distance of a ray that met nothing stays a number.
 _FARTHEST = np.float32(1e37)
 
@@ -69,7 +73,7 @@ def _embree() -> ctypes.CDLL:
         for name, (result, arguments) in _FUNCTIONS.items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
-        for name in ("rtcIntersect1", "rtcOccluded1"):
+        for name in ("rtcIntersect1", "rtcIntersect8", "rtcOccluded1"):
             address = ctypes.cast(getattr(library, name), _pointer).value
             llvmlite.binding.add_symbol(name, address)
     except AttributeError as error:
@@ -133,6 +137,9 @@ class EmbreeScene:
 
 
 _intersect = types.ExternalFunction("rtcIntersect1", types.void(types.intp, types.intp, types.intp))
+_intersect_packet = types.ExternalFunction(
+    "rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp)
+)
 _occluded = types.ExternalFunction("rtcOccluded1", types.void(types.intp, types.intp, types.intp))
 
 
@@ -145,7 +152,7 @@ def closest_hits(
 
     origins (P, 3), directions (R, 3): ray r starts at origins[r % P].
     """
-    ray = _empty_ray()
+    ray = _aligned(_WORDS, _ALIGNED)
     words, place, count = ray.view(np.int32), ray.ctypes.data, len(origins)
     point = 0
     for r in range(len(directions)):
@@ -156,6 +163,46 @@ def closest_hits(
         face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
         u[r], v[r], distance[r] = ray[_U], ray[_V], ray[_FAR]
         point = point + 1 if point + 1 < count else 0
+
+
+@loop
+def closest_hits_of_groups(
+    scene: int,
+    origins: Float,
+    directions: Float,
+    group: Long,
+    face: Int,
+    u: Float,
+    v: Float,
+    distance: Float,
+) -> None:
+    """``closest_hits`` of rays of which those with the same number in ``group`` (R,) follow each
+    other, start close together and are nearly parallel: they go through the scene together."""
+    # In one piece: the packet, which of its rays count, RTCIntersectArguments.
+    memory = _aligned((_WORDS + 2) * _LANES, _ALIGNED_PACKET)
+    words, place = memory.view(np.int32), memory.ctypes.data
+    rays, hits = memory.reshape(-1, _LANES), words.reshape(-1, _LANES)
+    counts, arguments = hits[_WORDS], hits[_WORDS + 1]
+    hits[_MASK], arguments[0], arguments[1] = -1, _COHERENT, -1
+    start, end = 0, len(directions)
+    while start < end:
+        lanes = 1
+        while lanes < _LANES and start + lanes < end and group[start + lanes] == group[start]:
+            lanes += 1
+        for j in range(lanes):
+            r = start + j
+            for c in range(3):
+                rays[_ORIGIN + c, j], rays[_DIRECTION + c, j] = origins[r, c], directions[r, c]
+        for j in range(_LANES):
+            counts[j] = -1 if j < lanes else 0
+            rays[_FAR, j] = _FARTHEST
+            hits[_GEOMETRY, j], hits[_INSTANCE, j] = -1, -1
+        _intersect_packet(counts.ctypes.data, scene, place, arguments.ctypes.data)
+        for j in range(lanes):
+            r = start + j
+            face[r] = hits[_FACE, j] if hits[_GEOMETRY, j] >= 0 else -1
+            u[r], v[r], distance[r] = rays[_U, j], rays[_V, j], rays[_FAR, j]
+        start += lanes
 
 
 @loop
@@ -170,7 +217,7 @@ def occlusion(
     """True in ``blocked`` (R,) where anything is nearer than ``distance``, in lengths of the
     direction; origins (P, 3), directions (R, 3): ray r starts at origins[start[r]], for the R of
     ``start``."""
-    ray = _empty_ray()
+    ray = _aligned(_WORDS, _ALIGNED)
     words, place = ray.view(np.int32), ray.ctypes.data
     for r in range(len(start)):
         _aim(ray, words, origins, start[r], directions, r)
@@ -180,10 +227,11 @@ def occlusion(
 
 
 @loop
-def _empty_ray() -> Float:
-    memory = np.zeros(_WORDS + _ALIGNED // 4, np.float32)
-    first = (-memory.ctypes.data % _ALIGNED) // 4
-    return memory[first : first + _WORDS]
+def _aligned(words: int, size: int) -> Float:
+    """Zeros, (words,), aligned to ``size`` bytes."""
+    memory = np.zeros(words + size // 4, np.float32)
+    first = (-memory.ctypes.data % size) // 4
+    return memory[first : first + words]
 
 
 @loop

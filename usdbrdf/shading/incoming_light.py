@@ -89,7 +89,7 @@ class IncomingLight:
         """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
         technique, and escaped (P,)."""
         scrambles = scrambles_of_points(
-            points.patch, points.stratum, points.identity, self.draws.seed, self.draws.shared
+            points.identity, points.stratum, self.draws.seed, self.draws.shared
         )
         draws = self.draws.sobol, scrambles, self.draws.seed, points.identity
         groups = self.groups.arrays, points.row, *picks

@@ -8,8 +8,8 @@ eq. 10). Two estimators:
             by the balance heuristic (E. Veach and L. Guibas, "Optimally combining sampling
             techniques for Monte Carlo rendering", 1995). Which triangles are picked is up to each
             patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the scene,
-            the patch and the texel (``patch_draws``): neighbouring texels trace nearly parallel
-            rays, which Embree likes.
+            the patch and the texel (``patch_draws``): groups of neighbouring texels trace parallel
+            rays, which Embree does at half the cost.
 
 Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
 ``mis``: points that happen to agree stop early. Tests bound this by 1e-3 of S.
@@ -39,11 +39,12 @@ from usdbrdf.shading.incoming_light import (
 )
 from usdbrdf.shading.lights import Lights
 from usdbrdf.shading.patch_draws import (
-    STRATA,
+    TEXELS,
     independent_draws,
     interleaved,
     patch_draws,
-    strata_of_texels,
+    places_in_patch,
+    strata_by_place,
 )
 
 Float = npt.NDArray[np.float32]
@@ -90,14 +91,14 @@ class Irradiance:
 
 def patches_of_texels(texels: Texels) -> tuple[Long, Int]:
     """Texels in the order of 8 x 8 blocks of their atlas, near blocks near: order (T,), and the
-    patch of each texel in that order, (T,) int32 ascending from 0. Within a patch they are in the
-    order of the strata that suit them."""
+    patch of each texel in that order, (T,) int32 ascending from 0. Within a patch those that share
+    directions follow each other."""
     owner = texels.object_index()
     local = texels.pixel - texels.first_pixel[owner]
     width = texels.resolution[owner, 0]
     x, y = local % width, local // width
     block = interleaved(x // 8, y // 8)
-    order = np.lexsort((strata_of_texels(x % 8, y % 8), block, owner))
+    order = np.lexsort((places_in_patch(x % 8, y % 8), block, owner))
     key = np.stack([owner, block], axis=-1)[order]
     patch = np.concatenate([[0], np.cumsum((np.diff(key, axis=0) != 0).any(axis=1))])
     return order, patch.astype(np.int32)
@@ -118,7 +119,8 @@ def irradiance_at(
     """S at N surface points.
 
     position, normal (N, 3) float32, world; patch (N,) int32 ascending: points of one patch share
-    what lights they pick, part of their random bits, and their stopping. scene_size: metres, for
+    what lights they pick, part of their random bits, and their stopping; independent points have
+    patches that are ``patch_draws.PATCHES`` apart. scene_size: metres, for
     the lift off the surface. dark: (N,) W/m^2; where S is below it, the standard error is held
     against it instead of S.
     """
@@ -127,8 +129,8 @@ def irradiance_at(
     first = np.flatnonzero(np.diff(patch, prepend=-1))
     size = np.diff(first, append=len(patch))
     number = np.arange(len(patch)) - np.repeat(first, size)
-    identity = 64 * patch.astype(np.int64) + number
-    stratum = (STRATA * number // np.repeat(size, size)).astype(np.int32)
+    identity = TEXELS * patch.astype(np.int64) + number
+    stratum = strata_by_place()[TEXELS * number // np.repeat(size, size)]
     floor = np.zeros(len(patch)) if dark is None else dark.astype(np.float64)
     techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     rounds = _rounds(sampling, techniques)

@@ -16,7 +16,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.embree import closest_hits
+from usdbrdf.geometry.embree import closest_hits, closest_hits_of_groups
 from usdbrdf.geometry.packed_texture import (
     AHEAD,
     PackedArrays,
@@ -30,6 +30,7 @@ from usdbrdf.geometry.prefetch import prefetch
 from usdbrdf.kernel import loop
 from usdbrdf.shading.environment import EnvironmentArrays, environment_at
 from usdbrdf.shading.light_by_picks import PickArrays, PointDraws, turns
+from usdbrdf.shading.patch_draws import groups_of
 from usdbrdf.shading.warp_loops import fractions, on_hemisphere
 from usdbrdf.shading.warps import hashed_uniform, tangent_frame
 
@@ -94,7 +95,7 @@ def add_light_by_direction(
 ) -> None:
     """sums += L cos / (p_cosine + p_light) for samples ``start`` and on of P points (origin,
     normal (P, 3)), each into its ``block``; escaped (P,) += 1 for each ray that met nothing."""
-    frames, room = frames_of(normal), np.empty((3, AHEAD), np.float32)
+    frames, room, group = frames_of(normal), np.empty((3, AHEAD), np.float32), groups_of(draws[3])
     directions, face = np.empty((AHEAD, 3), np.float32), np.empty(AHEAD, np.int32)
     u, v, distance = np.empty((3, AHEAD), np.float32)
     weight, looks = np.empty(AHEAD, np.float32), empty_looks()
@@ -106,7 +107,12 @@ def add_light_by_direction(
         part = last - first
         d = directions[:part]
         cosine_directions(frames, draws, start + s, first, d, room)
-        closest_hits(scene, origin[first:last], d, face, u, v, distance)
+        if len(draws[0]):
+            closest_hits_of_groups(
+                scene, origin[first:last], d, group[first:last], face, u, v, distance
+            )
+        else:
+            closest_hits(scene, origin[first:last], d, face, u, v, distance)
         # In passes, so that what they wait for from memory is under way before it is read.
         count = 0
         for i in range(part):
