@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.texels import Texels
@@ -135,7 +136,11 @@ def fitted_objects(
     numbers = range(len(lit.scene.objects))
     stored = {i: run.checkpoint_if(f"object-{i}") for i in numbers}
     done = {i: found for i, found in stored.items() if found is not None}
-    with ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool:
+    with (
+        # With all cores for each object's small matrices BLAS's threads only wait for each other.
+        threadpool_limits(limits=1, user_api="blas"),
+        ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
+    ):
         jobs = {
             pool.submit(fit_object, lit, texels, frames, survey, i, options): i
             for i in numbers
