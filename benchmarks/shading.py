@@ -137,19 +137,18 @@ def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) 
         origin, normal, draws, start, block = arguments[4:9]
         frames, room, found = frames_of(normal), np.empty((3, AHEAD), np.float32), []
         groups = groups_of(draws[3])
-        for first, sample in turns(len(origin), len(block)):
-            origins = origin[first : first + AHEAD]
+        for first, last, sample in turns(groups, len(block)):
+            origins = origin[first:last]
             directions = np.empty_like(origins)
             cosine_directions(frames, draws, start + sample, first, directions, room)
-            found.append((origins, directions, groups[first : first + AHEAD]))
+            found.append((origins, directions, groups[first:last]))
         origins, directions, group = (np.concatenate(parts) for parts in zip(*found, strict=True))
         calls.append(Call(origins, directions, group=group))
 
     def by_picks(*arguments: Any) -> None:
         picks, origin, normal, draws, start, block = arguments[2:8]
         room, segments, found = empty_room(), empty_segments(), []
-        for first, sample in turns(len(origin), len(block)):
-            last = min(first + AHEAD, len(origin))
+        for first, last, sample in turns(groups_of(draws[3]), len(block)):
             count = light_segments(
                 picks, origin, normal, draws, start + sample, first, last, room, segments
             )

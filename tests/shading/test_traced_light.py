@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
+from usdbrdf.geometry.packed_texture import AHEAD
 from usdbrdf.shading import irradiance
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.shading.light_by_picks import turns
 from usdbrdf.shading.light_groups import picked
 from usdbrdf.shading.warp_loops import in_triangle, on_hemisphere
 from usdbrdf.shading.warps import cosine_direction, triangle_point
@@ -49,6 +51,19 @@ def test_picking_is_a_search(lights: int):
     picks = np.concatenate([rng.random(2000), steps, cumulative[:-1], [np.nextafter(1, 0)]])
     expected = np.minimum(np.searchsorted(cumulative, picks, side="right"), lights - 1)
     np.testing.assert_array_equal([picked(cumulative, guide, p) for p in picks], expected)
+
+
+def test_turns_go_through_all_points_and_samples_and_cut_no_group():
+    # Groups of 1 to 8 of several hundred points.
+    group = np.repeat(np.arange(120), np.arange(120) % 8 + 1).astype(np.int64)
+    found = turns(group, 3)
+    for sample in range(3):
+        own = sorted((first, last) for first, last, s in found if s == sample)
+        firsts, lasts = zip(*own, strict=True)
+        assert (firsts[0], lasts[-1]) == (0, len(group)) and firsts[1:] == lasts[:-1]
+        assert all(0 < last - first <= AHEAD for first, last in own)
+        assert min(last - first for first, last in own[:-1]) > AHEAD - 8
+        assert (group[list(firsts[1:])] != group[np.array(firsts[1:]) - 1]).all()
 
 
 @pytest.mark.parametrize("estimator", ["mis", "cosine"])

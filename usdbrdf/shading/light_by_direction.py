@@ -102,8 +102,8 @@ def add_light_by_direction(
     lamps, light = np.empty((2, AHEAD), np.int32)
     image, z_up = environment
     is_light, use_lights = picks[0][6], len(picks[4]) > 0
-    for first, s in turns(len(origin), len(block)):
-        last, total = min(first + AHEAD, len(origin)), sums[block[s]]
+    for first, last, s in turns(group, len(block)):
+        total = sums[block[s]]
         part = last - first
         d = directions[:part]
         cosine_directions(frames, draws, start + s, first, d, room)

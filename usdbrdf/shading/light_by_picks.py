@@ -20,6 +20,7 @@ from usdbrdf.geometry.packed_texture import (
 )
 from usdbrdf.kernel import loop
 from usdbrdf.shading.light_groups import GroupArrays, picked
+from usdbrdf.shading.patch_draws import groups_of
 from usdbrdf.shading.warp_loops import fractions, in_triangle
 
 Float = npt.NDArray[np.float32]
@@ -40,10 +41,10 @@ PickArrays: TypeAlias = tuple[GroupArrays, Int, Double, Short, Float]
 # the weight of what is found there, (N,) each; direction (N, 3), as long as the way there.
 Segments: TypeAlias = tuple[Int, Int, Float, Float, Float, Float]
 
-Turns: TypeAlias = list[tuple[int, int]]
+Turns: TypeAlias = list[tuple[int, int, int]]
 
-# Points whose sums, and whose patches' tables of lights, stay in the cache of a core together.
-_TOGETHER = 1 << 8
+# So many times AHEAD points' sums, and tables of lights, stay in the cache of a core together.
+_TOGETHER = 2
 # In the loops' own precision: with Python's constants the compiler would go over to doubles.
 _INVERSE_PI = np.float32(1 / math.pi)
 _TINY, _NEARLY = np.float32(1e-18), np.float32(0.9999)
@@ -66,8 +67,8 @@ def add_light_by_picks(
     segments, room, looks = empty_segments(), empty_room(), empty_looks()
     blocked, seen = np.empty(AHEAD, np.bool_), np.empty(AHEAD, np.int32)
     point, face, u, v, weight, directions = segments
-    for first, s in turns(len(origin), len(block)):
-        last, total = min(first + AHEAD, len(origin)), sums[block[s]]
+    for first, last, s in turns(groups_of(draws[3]), len(block)):
+        total = sums[block[s]]
         part = light_segments(picks, origin, normal, draws, start + s, first, last, room, segments)
         occlusion(scene, origin, point[:part], directions, _NEARLY, blocked)
         count = 0
@@ -83,14 +84,21 @@ def add_light_by_picks(
 
 
 @loop
-def turns(points: int, samples: int) -> Turns:
-    """First point and sample of each AHEAD points in turn: all samples of _TOGETHER points, then of
-    the next."""
+def turns(group: Long, samples: int) -> Turns:
+    """First and last + 1 of up to AHEAD points and their sample, in turn: all samples of a few
+    points, then of the next. Of points in the ``group`` (P,) all or none: whatever points come
+    before them, they find the same."""
+    ends = [0]
+    while ends[-1] < len(group):
+        end = min(ends[-1] + AHEAD, len(group))
+        while end < len(group) and group[end] == group[end - 1]:
+            end -= 1
+        ends.append(end)
     return [
-        (first, sample)
-        for part in range(0, points, _TOGETHER)
+        (ends[k], ends[k + 1], sample)
+        for part in range(0, len(ends) - 1, _TOGETHER)
         for sample in range(samples)
-        for first in range(part, min(part + _TOGETHER, points), AHEAD)
+        for k in range(part, min(part + _TOGETHER, len(ends) - 1))
     ]
 
 
