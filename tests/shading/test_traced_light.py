@@ -60,7 +60,8 @@ def test_turns_go_through_all_points_and_samples_and_cut_no_group():
     for sample in range(3):
         own = sorted((first, last) for first, last, s in found if s == sample)
         firsts, lasts = zip(*own, strict=True)
-        assert (firsts[0], lasts[-1]) == (0, len(group)) and firsts[1:] == lasts[:-1]
+        assert (firsts[0], lasts[-1]) == (0, len(group))
+        assert firsts[1:] == lasts[:-1]
         assert all(0 < last - first <= AHEAD for first, last in own)
         assert min(last - first for first, last in own[:-1]) > AHEAD - 8
         assert (group[list(firsts[1:])] != group[np.array(firsts[1:]) - 1]).all()
