@@ -14,7 +14,12 @@ import pytest
 from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import give_back_freed, resident_bytes
-from usdbrdf.shading.denoise import CHOICES, chosen_filter, denoise_lightmaps
+from usdbrdf.shading.denoise import (
+    CHOICES,
+    chosen_filter,
+    denoise_lightmaps,
+    denoise_picture,
+)
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.steps.trace import denoised_irradiance
@@ -130,8 +135,22 @@ def test_a_failure_of_the_filter_ends_it_with_what_to_do(monkeypatch):
     monkeypatch.setattr(pyoidn.Device, "get_error", lambda _: next(said))
     filtered = denoise_lightmaps([np.ones((4, 5, 3), np.float32)] * 3)
     next(filtered)
-    with pytest.raises(EnvironmentFailure, match=r"5 x 4 texels: out of memory.*--denoise none"):
+    with pytest.raises(EnvironmentFailure, match=r"5 x 4 pixels: out of memory.*--denoise none"):
         next(filtered)
+
+
+def test_a_picture_is_filtered_along_its_edges():
+    # As the library's own call does, whose filter is set up elsewhere.
+    pyoidn = pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
+    rng = np.random.default_rng(8)
+    albedo = np.full((40, 50, 3), 0.2, np.float32)
+    albedo[:, 20:] = 0.8
+    normal = np.tile(np.float32([0, 0, 1]), (40, 50, 1))
+    radiance = (albedo * rng.gamma(4, 0.25, (40, 50, 1))).astype(np.float32)
+    filtered = denoise_picture(radiance, albedo, normal)
+    assert np.abs(filtered / albedo - 1).mean() < 0.1 * np.abs(radiance / albedo - 1).mean()
+    expected = pyoidn.denoise(radiance, albedo, normal, hdr=True, clean_aux=True)
+    np.testing.assert_array_equal(filtered, np.maximum(expected, 0))
 
 
 def test_an_interrupt_on_the_way_is_not_swallowed():

@@ -12,7 +12,6 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.job.progress import say
-from usdbrdf.relighting.denoise import AUTO, OIDN, chosen_filter, denoised
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.picture import (
@@ -29,6 +28,7 @@ from usdbrdf.relighting.surfaces import Float
 from usdbrdf.relighting.variant import mitsuba_variant
 from usdbrdf.relighting.views import View
 from usdbrdf.relighting.views_from_document import views_from_document
+from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter, denoise_picture
 from usdbrdf.stage.asset import Asset
 from usdbrdf.stage.compose import open_edited
 from usdbrdf.stage.published import eye_height, published
@@ -151,7 +151,10 @@ def _rendered(
         label = f"relight {i + 1} of {len(views)}"
         seed = (options.seed, i)
         found = render_view(mitsuba, loaded, view, samples=options.samples, seed=seed, label=label)
-        yield denoised(found) if denoise else found.radiance
+        if denoise:
+            yield denoise_picture(found.radiance, found.albedo, found.normal)
+        else:
+            yield found.radiance
 
 
 def _write_exposed_alike(targets: Sequence[Path], rendered: Iterator[Float]) -> float:

@@ -1,5 +1,5 @@
-"""Open Image Denoise (extra ``denoise``): whether it is there, and its lightmap filter over one
-object's atlas."""
+"""Open Image Denoise (extra ``denoise``): whether it is there, and its filters of lightmaps and of
+rendered pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NONE: Final = "none"
 OIDN: Final = "oidn"
 CHOICES: Final = (AUTO, NONE, OIDN)
 
-# Larger lightmaps than this suffices for are filtered in tiles.
+# Larger pictures than this suffices for are filtered in tiles.
 _MOST_MEGABYTES = 512
 
 
@@ -44,28 +44,45 @@ def denoise_lightmaps(pictures: Iterable[Float]) -> Iterator[Float]:
     The same bits in every run on one machine, with any number of threads. Raises
     EnvironmentFailure where Open Image Denoise gives up, as without memory.
     """
+    return _filtered("RTLightmap", (), ({"color": picture} for picture in pictures))
+
+
+def denoise_picture(radiance: Float, albedo: Float, normal: Float) -> Float:
+    """Radiance (H, W, 3) filtered along the edges of the first surfaces' albedo and normals,
+    (H, W, 3) float32 each, which are all but free of noise. Otherwise as ``denoise_lightmaps``."""
+    images = {"color": radiance, "albedo": albedo, "normal": normal}
+    (filtered,) = _filtered("RT", ("hdr", "cleanAux"), [images])
+    return filtered
+
+
+def _filtered(
+    filter_type: str, switches: tuple[str, ...], pictures: Iterable[dict[str, Float]]
+) -> Iterator[Float]:
+    """The "color" of each of the ``pictures``, filtered."""
     import pyoidn
 
     # Not pyoidn.denoise, which keeps its working memory, up to 2.4 GiB, until the process ends.
     with pyoidn.Device() as device:
         device.commit()
-        lightmap_filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT_LIGHTMAP)
+        oidn_filter = pyoidn.Filter(device, filter_type)
         try:  # not "with": its filters swallow errors
-            lightmap_filter.set_int("maxMemoryMB", _MOST_MEGABYTES)
-            for picture in pictures:
-                colour = np.ascontiguousarray(picture, np.float32)
-                filtered = np.empty_like(colour)
-                lightmap_filter.set_image("color", colour, pyoidn.OIDN_FORMAT_FLOAT3)
-                lightmap_filter.set_image("output", filtered, pyoidn.OIDN_FORMAT_FLOAT3)
-                lightmap_filter.commit()
-                lightmap_filter.execute()
+            oidn_filter.set_int("maxMemoryMB", _MOST_MEGABYTES)
+            for switch in switches:
+                oidn_filter.set_bool(switch, True)
+            for images in pictures:
+                given = {k: np.ascontiguousarray(v, np.float32) for k, v in images.items()}
+                filtered = np.empty_like(given["color"])
+                for name, image in {**given, "output": filtered}.items():
+                    oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+                oidn_filter.commit()
+                oidn_filter.execute()
                 error = device.get_error()
                 if error is not None:
                     raise EnvironmentFailure(
-                        f"Open Image Denoise failed on a lightmap of {picture.shape[1]} x "
-                        f"{picture.shape[0]} texels: {error}. Run again with --denoise none. "
+                        f"Open Image Denoise failed on a picture of {filtered.shape[1]} x "
+                        f"{filtered.shape[0]} pixels: {error}. Run again with --denoise none. "
                         "[shading.denoise]"
                     )
                 yield np.maximum(filtered, 0, out=filtered)
         finally:
-            lightmap_filter.release()
+            oidn_filter.release()
