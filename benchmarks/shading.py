@@ -7,9 +7,9 @@ ASSET was shaded. Measured are
     throughput  rays per second of the whole estimator (make rays, trace them, add up) over those of
                 embreex when it is called with the very same rays in the same order and nothing else
     order       first hits in our order, one sample's rays after the other's over patches of 8 x 8
-                texels and as the estimator traces them, a group's parallel rays together; against
-                the same rays in random order, one by one (together they take longer); and our
-                order one by one
+                texels and as the estimator traces them, a group's parallel rays in a packet;
+                against the same rays in random order, one by one; and beside that our order one by
+                one, and random order in packets
     noise       relative RMSE of S against a converged one for 10,000 independent cosine-distributed
                 rays (the paper's) and for ours with and without the lightmap filter; rays and time
                 for equal noise
@@ -106,8 +106,9 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     first_hits = [call for call in calls if call.distances is None]
     single = [call._replace(group=None) for call in first_hits]
     mixed = in_random_order(first_hits)
-    patches, one_by_one, random = side_by_side(
-        [partial(traced, lit, rays) for rays in (first_hits, single, mixed)], sizes.turns
+    packed = [call._replace(group=np.arange(len(call.origins)) // 8) for call in mixed]
+    patches, one_by_one, random, random_packets = side_by_side(
+        [partial(traced, lit, rays) for rays in (first_hits, single, mixed, packed)], sizes.turns
     )
     rays = sum(len(call.origins) for call in calls)
     per_ray = {name: median(times) / rays for name, times in (("ours", ours), ("embreex", embree))}
@@ -118,6 +119,7 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         "of_embreex": ratio(embree, ours)._asdict(),
         "patches_over_random_order": ratio(random, patches)._asdict(),
         "one_by_one_over_random_order": ratio(random, one_by_one)._asdict(),
+        "random_packets_over_random_order": ratio(random, random_packets)._asdict(),
     }
 
 
@@ -213,8 +215,11 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     rows = [
         figure("rays per CPU second, of embreex's own", 100 * of_embreex["cpu"], "%", least=85),
         figure("the same by the clock", 100 * of_embreex["wall"], "%"),
-        figure("first hits in patches over random order, CPU", order["cpu"], "x", least=1.8),
-        figure("the same one by one", traced["one_by_one_over_random_order"]["cpu"], "x"),
+        figure("first hits in patches and packets over random order", order["cpu"], "x", least=1.8),
+        figure("in patches, one by one", traced["one_by_one_over_random_order"]["cpu"], "x"),
+        figure(
+            "in random order, in packets", traced["random_packets_over_random_order"]["cpu"], "x"
+        ),
         figure("RMSE of S by 10,000 cosine rays", 100 * study["paper"]["rmse"], "%"),
         figure("rays for that, unfiltered", study["rays_for_equal_noise"], "", most=100),
         figure("tracing time, unfiltered, CPU", study["unfiltered_tracing"]["cpu"], "x"),

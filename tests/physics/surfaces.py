@@ -20,7 +20,7 @@ from usdbrdf.geometry.texels import Texels, texels_from_atlas
 from usdbrdf.shading.environment import Environment, black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at
 from usdbrdf.shading.lights import Lights, lights_from_radiance
-from usdbrdf.shading.patch_draws import PATCHES
+from usdbrdf.shading.patch_draws import independent_patches
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -189,7 +189,7 @@ def estimates(
 ) -> tuple[Double, Irradiance]:
     """S at points (N, 3), each ``repeat`` times with random numbers of its own: (repeat, N, 3).
 
-    Every repetition is a patch of its own, far from the others: they are independent.
+    Every repetition is a patch of its own, and independent of the others.
     """
     count = len(points)
     found = irradiance_at(
@@ -199,7 +199,7 @@ def estimates(
         environment or black_environment(),
         np.tile(np.asarray(points, np.float32), (repeat, 1)),
         np.tile(np.asarray(normals, np.float32), (repeat, 1)),
-        PATCHES * np.arange(count * repeat, dtype=np.int32),
+        independent_patches(count * repeat),
         Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=seed),  # type: ignore[arg-type]
         world.size,
     )

@@ -8,20 +8,20 @@ import pytest
 from scipy import stats
 
 from usdbrdf.shading.patch_draws import (
-    PATCHES,
+    STRATA_BY_PLACE,
     TEXELS,
     PatchDraws,
     groups_of,
+    independent_patches,
     patch_draws,
     places_in_patch,
     scrambles_of_points,
-    strata_by_place,
     strata_of_texels,
 )
 
 X, Y = (axis.ravel() for axis in np.meshgrid(np.arange(8), np.arange(8)))
 # Patches whose groups share random bits, and what these divide the cell of a direction into.
-RUN, STEPS = PATCHES, 16
+RUN, STEPS = 16, 16
 
 
 def _quadrants(stratum: np.ndarray, bits: int) -> np.ndarray:
@@ -31,7 +31,7 @@ def _quadrants(stratum: np.ndarray, bits: int) -> np.ndarray:
 
 def _points(draws: PatchDraws, patches: int, samples: int) -> np.ndarray:
     """All numbers of whole patches in [0, 1), (samples, 4, patches * 64)."""
-    identity, stratum = np.arange(patches * TEXELS), np.tile(strata_by_place(), patches)
+    identity, stratum = np.arange(patches * TEXELS), np.tile(STRATA_BY_PLACE, patches)
     scrambles = scrambles_of_points(identity, stratum, draws.seed, draws.shared)
     return (draws.sobol[:samples, :, None] ^ scrambles) * 2.0**-32
 
@@ -47,12 +47,19 @@ def test_aligned_squares_of_texels_have_a_stratum_in_each_part_of_the_cell(bits:
 def test_a_patch_has_groups_of_eight_one_of_each_square_of_four():
     place = places_in_patch(X, Y)
     assert sorted(place) == list(range(TEXELS))
-    np.testing.assert_array_equal(strata_by_place()[place], strata_of_texels(X, Y))
+    np.testing.assert_array_equal(STRATA_BY_PLACE[place], strata_of_texels(X, Y))
     group = groups_of(place.astype(np.int64))
     for one in range(8):
         x, y = X[group == one], Y[group == one]
         assert len(set(zip(x // 2, y // 2, strict=True))) == len(x) == 8
         assert np.ptp(y // 2) == 1
+
+
+def test_every_ninth_texel_or_so_lies_in_another_row_and_column():
+    # Those at which a patch looks for what lights it.
+    place = places_in_patch(X, Y)
+    found = np.flatnonzero(np.isin(place, [8 * i + 5 * i % 8 for i in range(8)]))
+    assert sorted(X[found]) == sorted(Y[found]) == list(range(8))
 
 
 @pytest.mark.parametrize("samples", [8, 32])
@@ -86,7 +93,7 @@ def test_the_groups_of_a_run_of_patches_are_stratified_in_one_cell():
         assert len({tuple(cell) for cell in np.floor(own / size).astype(int).T}) == 1
         strata = (own / size % 1 * STEPS).astype(int)
         assert len({tuple(cell) for cell in strata.T}) == 8 * RUN
-        for x, y in ((16, 8), (8, 16), (4, 32 // 2)):
+        for x, y in ((16, 8), (8, 16), (4, 16)):
             cell = strata[0] * x // STEPS * y + strata[1] * y // STEPS
             assert (np.bincount(cell, minlength=x * y) == 8 * RUN // (x * y)).all()
         # Of each patch one in each of 8, of each square of 2 x 2 texels one in each quarter.
@@ -111,7 +118,7 @@ def test_every_texel_is_uniform_over_the_strata_and_within_them():
     draws = patch_draws(7, 32, 32)
     identity = np.arange(4096) * RUN * TEXELS
     for texel in (0, 21, 63):
-        stratum = np.full(4096, strata_by_place()[texel], np.int32)
+        stratum = np.full(4096, STRATA_BY_PLACE[texel], np.int32)
         scrambles = scrambles_of_points(identity + texel, stratum, draws.seed, draws.shared)
         within = (draws.sobol[0, :, None] ^ scrambles) * 2.0**-32
         within = within * np.array([8, 4, 8, 4])[:, None] % 1
@@ -135,3 +142,27 @@ def test_a_patch_integrates_as_stratified_samples_do_and_without_bias(technique:
     assert of_patches < most * of_texels / TEXELS
     assert abs(error.mean()) < 4 * np.sqrt(of_patches / 512)
     assert abs(error[:, 9].mean()) < 4 * np.sqrt(of_texels / 512)
+
+
+@pytest.mark.parametrize("groups", [1, 2, 3, 4, 6])
+def test_what_small_patches_have_of_a_run_is_stratified(groups: int):
+    # As above, over runs of patches whose last groups are missing.
+    draws, runs = patch_draws(11, 32, 32), 400
+    patch, group = np.divmod(np.arange(runs * RUN * groups), groups)
+    identity = TEXELS * patch + 8 * group
+    scrambles = scrambles_of_points(identity, np.zeros(len(identity), np.int32), 11, draws.shared)
+    points = (draws.sobol[:32, :2, None] ^ scrambles[:2]) * 2.0**-32
+    inside = points[:, 0] ** 2 + points[:, 1] ** 2 < 0.8
+    error = inside.mean(axis=0).reshape(runs, -1) - np.pi / 4 * 0.8
+    assert error.mean(axis=1).var() < 0.4 * error.var() / error.shape[1]
+
+
+def test_independent_patches_share_no_random_bits():
+    draws = patch_draws(3, 32, 32)
+    identity = TEXELS * independent_patches(4096).astype(np.int64)
+    scrambles = scrambles_of_points(identity, np.zeros(4096, np.int32), 3, draws.shared)
+    # Neighbours' exclusive or in the bits of strata and below is any, in all four dimensions.
+    for d in range(4):
+        below = 32 - draws.shared[d % 2]
+        mixed = (scrambles[d, 1:] ^ scrambles[d, :-1]) >> np.uint32(below - 4)
+        assert stats.chisquare(np.bincount(mixed, minlength=16)).pvalue > 1e-4

@@ -28,7 +28,7 @@ def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) 
         found = irradiance_at(
             world.rays, world.texture(lit), world.lights(lit), black_environment(),
             world.texels.position[order], world.texels.normal[order], patch,
-            Sampling(standard_error=0.01, max_rays=512, seed=bounce), world.size,
+            Sampling(standard_error=0.003, max_rays=4096, seed=bounce), world.size,
         )  # fmt: skip
         irradiance = np.empty_like(lit)
         irradiance[order] = found.mean

@@ -157,11 +157,7 @@ def closest_hits(
     point = 0
     for r in range(len(directions)):
         _aim(ray, words, origins, point, directions, r)
-        ray[_FAR] = _FARTHEST
-        words[_GEOMETRY], words[_INSTANCE] = -1, -1
-        _intersect(scene, place, 0)
-        face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
-        u[r], v[r], distance[r] = ray[_U], ray[_V], ray[_FAR]
+        _find(scene, ray, words, place, (face, u, v, distance), r)
         point = point + 1 if point + 1 < count else 0
 
 
@@ -176,8 +172,11 @@ def closest_hits_of_groups(
     v: Float,
     distance: Float,
 ) -> None:
-    """``closest_hits`` of rays of which those with the same number in ``group`` (R,) follow each
-    other, start close together and are nearly parallel: they go through the scene together."""
+    """``closest_hits`` of rays with origins and directions (R, 3), of which those with the same
+    number in ``group`` (R,) follow each other, start close together and are nearly parallel: they
+    go through the scene together, eight at a time."""
+    ray = _aligned(_WORDS, _ALIGNED)
+    ray_words, ray_place = ray.view(np.int32), ray.ctypes.data
     # In one piece: the packet, which of its rays count, RTCIntersectArguments.
     memory = _aligned((_WORDS + 2) * _LANES, _ALIGNED_PACKET)
     words, place = memory.view(np.int32), memory.ctypes.data
@@ -189,6 +188,11 @@ def closest_hits_of_groups(
         lanes = 1
         while lanes < _LANES and start + lanes < end and group[start + lanes] == group[start]:
             lanes += 1
+        if lanes == 1:  # alone it is nearly twice as fast
+            _aim(ray, ray_words, origins, start, directions, start)
+            _find(scene, ray, ray_words, ray_place, (face, u, v, distance), start)
+            start += 1
+            continue
         for j in range(lanes):
             r = start + j
             for c in range(3):
@@ -232,6 +236,24 @@ def _aligned(words: int, size: int) -> Float:
     memory = np.zeros(words + size // 4, np.float32)
     first = (-memory.ctypes.data % size) // 4
     return memory[first : first + words]
+
+
+@loop
+def _find(
+    scene: int,
+    ray: Float,
+    words: Int,
+    place: int,
+    found: tuple[Int, Float, Float, Float],
+    r: int,
+) -> None:
+    """What the aimed ``ray`` meets, into face, u, v and distance at ``r``."""
+    face, u, v, distance = found
+    ray[_FAR] = _FARTHEST
+    words[_GEOMETRY], words[_INSTANCE] = -1, -1
+    _intersect(scene, place, 0)
+    face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
+    u[r], v[r], distance[r] = ray[_U], ray[_V], ray[_FAR]
 
 
 @loop

@@ -8,8 +8,8 @@ eq. 10). Two estimators:
             by the balance heuristic (E. Veach and L. Guibas, "Optimally combining sampling
             techniques for Monte Carlo rendering", 1995). Which triangles are picked is up to each
             patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the scene,
-            the patch and the texel (``patch_draws``): groups of neighbouring texels trace parallel
-            rays, which Embree does at half the cost.
+            of neighbours and of the texel or group (``patch_draws``): groups of neighbouring texels
+            trace nearly parallel rays, which Embree does at six tenths of the cost.
 
 Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
 ``mis``: points that happen to agree stop early. Tests bound this by 1e-3 of S.
@@ -39,12 +39,12 @@ from usdbrdf.shading.incoming_light import (
 )
 from usdbrdf.shading.lights import Lights
 from usdbrdf.shading.patch_draws import (
+    STRATA_BY_PLACE,
     TEXELS,
     independent_draws,
     interleaved,
     patch_draws,
     places_in_patch,
-    strata_by_place,
 )
 
 Float = npt.NDArray[np.float32]
@@ -118,11 +118,11 @@ def irradiance_at(
 ) -> Irradiance:
     """S at N surface points.
 
-    position, normal (N, 3) float32, world; patch (N,) int32 ascending: points of one patch share
-    what lights they pick, part of their random bits, and their stopping; independent points have
-    patches that are ``patch_draws.PATCHES`` apart. scene_size: metres, for
-    the lift off the surface. dark: (N,) W/m^2; where S is below it, the standard error is held
-    against it instead of S.
+    position, normal (N, 3) float32, world; patch (N,) int32 ascending, at most 64 points each:
+    points of one patch share what lights they pick, part of their random bits, and their stopping;
+    patches that follow each other share random bits as well, ``independent_patches`` do not.
+    scene_size: metres, for the lift off the surface. dark: (N,) W/m^2; where S is below it, the
+    standard error is held against it instead of S.
     """
     # A point's number within its patch of at most 64: so no two points of the scene share their
     # random numbers, and a point draws the same ones whatever tile it comes in.
@@ -130,7 +130,7 @@ def irradiance_at(
     size = np.diff(first, append=len(patch))
     number = np.arange(len(patch)) - np.repeat(first, size)
     identity = TEXELS * patch.astype(np.int64) + number
-    stratum = strata_by_place()[TEXELS * number // np.repeat(size, size)]
+    stratum = STRATA_BY_PLACE[TEXELS * number // np.repeat(size, size)]
     floor = np.zeros(len(patch)) if dark is None else dark.astype(np.float64)
     techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     rounds = _rounds(sampling, techniques)

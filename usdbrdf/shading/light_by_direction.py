@@ -3,7 +3,8 @@
 The loops here and in ``light_by_picks`` run on one thread, mostly in single precision, and let go
 of Python's lock; each thread takes points of its own. They take AHEAD points at a time, so that all
 that a ray needs from its making to what it brought stays in the nearest cache. One sample's rays of
-all points follow each other: within a patch they are nearly parallel.
+all points follow each other: within a patch they point in much the same direction, a group's are
+nearly parallel and traced together.
 
 Sums are kept in four blocks of samples, (4, P, 4), whose last column fills up a row, so that the
 estimator can tell its own error.

@@ -86,8 +86,8 @@ def add_light_by_picks(
 @loop
 def turns(group: Long, samples: int) -> Turns:
     """First and last + 1 of up to AHEAD points and their sample, in turn: all samples of a few
-    points, then of the next. Of points in the ``group`` (P,) all or none: whatever points come
-    before them, they find the same."""
+    points, then of the next. Of points in the same ``group`` (P,), less than AHEAD, all or none:
+    whatever points come before them, they find the same."""
     ends = [0]
     while ends[-1] < len(group):
         end = min(ends[-1] + AHEAD, len(group))

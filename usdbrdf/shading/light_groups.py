@@ -168,7 +168,7 @@ def weighed_groups(
         first, points = first_point[q], first_point[q + 1] - first_point[q]
         reach = _reach(origin[first : first + points])
         for i in range(_WEIGHED_AT):
-            # In the order of strata these lie one in each row and each column of a patch of 8 x 8.
+            # Of whole patches one in each row and each column.
             k = first + ((i * _WEIGHED_AT + i * 5 % _WEIGHED_AT) * points) // _WEIGHED_AT**2
             _add_importance(bounds, power, (origin[k], normal[k], reach), own, weight)
         total = _dot(weight, power)

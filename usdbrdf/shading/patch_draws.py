@@ -14,9 +14,9 @@ after A. Ahmed and P. Wonka, "Screen-Space Blue-Noise Diffusion of Monte Carlo S
 Hierarchical Ordering of Pixels", 2020.
 
 Of points on lights each texel of a patch of 8 x 8 has one of 64 strata. Directions are a group's of
-8 texels, of each square of 2 x 2 texels in 8 x 4 one: parallel rays, which Embree traces together
-at less cost, and neighbours' errors still differ, as filters need it. The groups of 16 patches have
-128 strata.
+8 texels, in whole patches one of each square of 2 x 2 texels in 8 x 4: parallel rays where the
+surface is flat, which Embree traces together at less cost, and neighbours' errors still differ, as
+filters need it. The groups of a run of 16 patches have 128 strata.
 """
 
 from __future__ import annotations
@@ -33,10 +33,9 @@ Int = npt.NDArray[np.int32]
 Long = npt.NDArray[np.int64]
 Bits = npt.NDArray[np.uint32]
 
-# Patches that follow each other and share random bits: numbers so far apart share none.
-PATCHES = 16
-# Texels of a patch; of a group; groups of so many patches.
-TEXELS, _GROUP, _GROUPS = 64, 8, 8 * PATCHES
+# Texels of a patch and of a group; patches of a run, and its groups.
+TEXELS, _GROUP, _RUN = 64, 8, 16
+_RUN_GROUPS = _RUN * TEXELS // _GROUP
 # Bits of a texel's and of a group's stratum in each of the two dimensions.
 _TEXEL_BITS, _GROUP_BITS = 3, 4
 
@@ -63,16 +62,34 @@ def places_in_patch(x: Long, y: Long) -> Long:
     return _GROUP * group + interleaved(y // 2, x // 2) % _GROUP
 
 
-def strata_by_place() -> Int:
-    """The stratum of the texel that comes first in a patch, second, ..., (64,)."""
+def _strata_by_place() -> Int:
     y, x = np.divmod(np.arange(TEXELS), 8)
     strata = np.empty(TEXELS, np.int32)
     strata[places_in_patch(x, y)] = strata_of_texels(x, y)
     return strata
 
 
-# The strata of these groups in each of two dimensions, (128, 2).
-_STRATA_OF_GROUPS = sobol_bits(7).astype(np.int64) >> 32 - _GROUP_BITS
+# The stratum of the texel that comes first in a patch, second, ..., (64,).
+STRATA_BY_PLACE = _strata_by_place()
+
+
+def _strata_of_groups() -> Long:
+    """The strata of a run's groups in each of two dimensions, (128, 2): all different, those of a
+    patch one in each eighth of the cell, and those of each square of 2 x 2 texels one in each
+    quarter. In smaller patches the last groups are missing: so that what is left of a run is
+    stratified too, eighths and quarters change places from patch to patch."""
+    number = np.arange(_RUN_GROUPS)
+    patch = number // (TEXELS // _GROUP)
+    points = sobol_bits(7).astype(np.int64) >> 32 - _GROUP_BITS
+    return np.asarray(points[number ^ patch >> 2 & 3 ^ (patch >> 1 & 1) << 2])
+
+
+_STRATA_OF_GROUPS = _strata_of_groups()
+
+
+def independent_patches(count: int) -> Int:
+    """Patches (count,) of points that share no random bits but the scene's."""
+    return _RUN * np.arange(count, dtype=np.int32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +141,13 @@ def scrambles_of_points(identity: Long, stratum: Int, seed: int, shared: tuple[i
         for k in range(len(identity)):
             if d < 2:
                 bits, owner = _GROUP_BITS, identity[k] // _GROUP
-                neighbours, place = owner // _GROUPS, _STRATA_OF_GROUPS[owner % _GROUPS, d]
+                run_or_patch = owner // _RUN_GROUPS
+                place = _STRATA_OF_GROUPS[owner % _RUN_GROUPS, d]
             else:
                 bits, owner = _TEXEL_BITS, identity[k]
-                neighbours, place = owner // TEXELS, _every_other_bit(stratum[k] >> 1 - d % 2)
-            flips = np.int64(hashed_uniform(seed, neighbours, 16 + d) * 2.0**bits)
+                run_or_patch = owner // TEXELS
+                place = _every_other_bit(stratum[k] >> 1 - d % 2)
+            flips = np.int64(hashed_uniform(seed, run_or_patch, 16 + d) * 2.0**bits)
             own = np.int64(hashed_uniform(seed, owner, d) * 2.0 ** (below - bits))
             scrambles[d, k] = (place ^ flips) << below - bits | own
     return scrambles

@@ -22,7 +22,7 @@ from usdbrdf.shading.environment import Environment, black_environment
 from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.shading.lights import lights_from_radiance
-from usdbrdf.shading.patch_draws import PATCHES
+from usdbrdf.shading.patch_draws import independent_patches
 from usdbrdf.steps.atlas import Atlas
 
 Float = npt.NDArray[np.float32]
@@ -176,7 +176,7 @@ def _traced(
         environment,
         texels.position[chosen],
         texels.normal[chosen],
-        PATCHES * np.arange(len(chosen), dtype=np.int32),  # their errors are independent
+        independent_patches(len(chosen)),
         Sampling(standard_error=_SAMPLING.standard_error, max_rays=_SAMPLING.max_rays, seed=seed),
         float(np.linalg.norm(np.ptp(scene.points, axis=0))),
     )
