@@ -11,6 +11,7 @@ from tests.physics.surfaces import World, quad, room, world_of
 from usdbrdf.job.stage import StageRun
 from usdbrdf.shading.environment import black_environment
 from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.shading.patch_draws import independent_patches
 from usdbrdf.steps.atlas import Atlas
 from usdbrdf.steps.clipped import ClippedLight, estimate_clipped_light
 
@@ -21,14 +22,15 @@ SATURATION = 3.0
 
 
 def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) -> np.ndarray:
-    """L_d (T, 3) after some bounces."""
-    order, patch = patches_of_texels(world.texels)
+    """L_d (T, 3) after some bounces, with noise of each texel's own, as pictures have it."""
+    order, _ = patches_of_texels(world.texels)
+    patch = independent_patches(len(order))
     lit = emitted
     for bounce in range(bounces):
         found = irradiance_at(
             world.rays, world.texture(lit), world.lights(lit), black_environment(),
             world.texels.position[order], world.texels.normal[order], patch,
-            Sampling(standard_error=0.003, max_rays=4096, seed=bounce), world.size,
+            Sampling(standard_error=0.01, max_rays=512, seed=bounce), world.size,
         )  # fmt: skip
         irradiance = np.empty_like(lit)
         irradiance[order] = found.mean
