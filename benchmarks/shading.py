@@ -71,7 +71,7 @@ class Call(NamedTuple):
 
 
 FULL = Sizes(1 << 15, 7, 3000, 1 << 13, 64)
-QUICK = Sizes(1 << 15, 3, 800, 1 << 12, 24)
+QUICK = Sizes(1 << 15, 7, 800, 1 << 12, 24)
 
 
 def main() -> int:
