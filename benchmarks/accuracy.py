@@ -24,6 +24,10 @@ from typing import Any
 import numpy as np
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.objects import read_shading
 from usdbrdf.evaluation.truth import (
     albedo_error,
     emitters,
@@ -32,16 +36,14 @@ from usdbrdf.evaluation.truth import (
     scored_texels,
     true_albedo,
 )
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.surface_radiance import surface_texture
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.lights import lights_from_radiance
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, open_measured, read_shading
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
-from usdbrdf.texturing.samples_from_frame import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.files.frames import read_frame
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.surface_texture import surface_texture
 
 REFERENCE_RAYS = 4096
 

@@ -32,12 +32,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.objects import aov_path
 from usdbrdf.files.arrays import load_arrays
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.surface_radiance import SurfaceTexture, surface_texture
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import aov_path, open_measured
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 MIN_SAMPLES = 3
 CONTACT = 0.045  # m

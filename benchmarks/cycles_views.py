@@ -26,19 +26,18 @@ from blender import in_blender
 from pxr import Sdf, Usd, UsdGeom
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.evaluation.flip import Pair, flip_maps
-from usdbrdf.evaluation.metrics import relative_l2
+from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.layers.preview_surface import lobe, preview_surface_from_fit, scale_texture
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.evaluation.metrics import Pair, flip_maps, relative_l2
 from usdbrdf.evaluation.score_views import exposure_of_views
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.evaluation.views_from_file import Views, views_from_file
 from usdbrdf.files.colour import to_display_srgb
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_radiance
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.preview_surface import lobe, preview_surface_from_fit, scale_texture
-from usdbrdf.stage.read import read_fit
-from usdbrdf.stage.scopes import Scopes
-from usdbrdf.steps.atlas import Atlas
+from usdbrdf.tasks.atlas import Atlas
 
 AS_WRITTEN = "as written"
 

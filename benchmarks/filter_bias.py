@@ -27,12 +27,12 @@ import numpy as np
 from against_reference import MIN_SAMPLES, Array, near_others, weighted_median
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import open_measured
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
-from usdbrdf.steps.lit import lit_scene
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.tasks.lit import lit_scene
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
 
 REFERENCE = Sampling(standard_error=0.0, max_rays=4096, seed=977)
 

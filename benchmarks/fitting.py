@@ -21,13 +21,14 @@ import numpy as np
 from measure import Lit, Spent, figure, lit_asset, parser_of, report, timed
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.material.fit_views import MIXTURE
-from usdbrdf.material.lobe_samples import LOBE_ALPHAS, Mixture
-from usdbrdf.scan.scan import Frames
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, open_measured
-from usdbrdf.steps import fit, fit_objects
+from usdbrdf.model.capture import Frames
+from usdbrdf.tasks import fit, fit_objects
 from usdbrdf.texturing.footprints import RINGS
+from usdbrdf.transport.lobe_samples import LOBE_ALPHAS, Mixture
 
 T = TypeVar("T")
 

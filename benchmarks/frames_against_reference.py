@@ -23,13 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
+from usdbrdf.model.camera import View
+from usdbrdf.model.capture import Frames
 from usdbrdf.relighting.render import pinhole
-from usdbrdf.relighting.views import View
-from usdbrdf.scan.adapters import read_scan
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.scan.scan import Frames
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 import make_study

@@ -24,9 +24,9 @@ import numpy as np
 from numba import prange
 
 from usdbrdf.files.images import write_exr
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.rays import RayScene
 from usdbrdf.kernel import parallel_kernel
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.transport.rays import RayScene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 from study_camera import look_at

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from measure import Lit, timed
 
-from usdbrdf.shading import irradiance
 from usdbrdf.shading.denoise import OIDN, chosen_filter
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
-from usdbrdf.steps.trace import denoised_irradiance
+from usdbrdf.tasks.trace import denoised_irradiance
+from usdbrdf.transport import irradiance
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 
 PAPERS_RAYS = 10_000
 COUNTS = (16, 32, 64, 100, 128)

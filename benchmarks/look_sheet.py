@@ -18,11 +18,11 @@ from blender import in_blender
 from pxr import Gf, Sdf, Usd, UsdLux
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_radiance, write_preview_png
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import open_edited
-from usdbrdf.stage.scopes import Scopes
 
 WIDTH, ACROSS = 172, 5
 # Degrees about x, y, z, irradiance; from above whatever way is up.

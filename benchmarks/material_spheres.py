@@ -20,11 +20,11 @@ from blender import in_blender
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.evaluation.flip import Pair, flip_maps
+from usdbrdf.asset.layers.preview_surface import preview_surface_from_fit, surface
+from usdbrdf.evaluation.metrics import Pair, flip_maps
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.images import read_radiance, write_preview_png
-from usdbrdf.material.lobe import lobe
-from usdbrdf.stage.preview_surface import preview_surface_from_fit, surface
+from usdbrdf.transport.brdf import lobe
 
 MATERIALS = ((0.05, 0.5), (0.1, 1.0), (0.3, 0.5), (0.3, 1.0), (0.6, 1.0), (1.0, 0.5))
 ALBEDO = (0.30, 0.10, 0.06)

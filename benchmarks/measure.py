@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from usdbrdf.material.lit_scene import LitScene
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import open_measured
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
-from usdbrdf.steps.lit import lit_scene
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.tasks.lit import lit_scene
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import LitScene
 
 T = TypeVar("T")
 

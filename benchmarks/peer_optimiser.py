@@ -12,13 +12,14 @@ import numpy as np
 from measure import Lit, Spent, timed
 from scipy.ndimage import uniform_filter
 
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.files.frames import read_frame
+from usdbrdf.model.camera import View, camera_rays, pixel_centres
+from usdbrdf.model.light import RelitScene
+from usdbrdf.model.material import Material, Surface, constant_map
 from usdbrdf.relighting import mitsuba_scene, render
-from usdbrdf.relighting.surfaces import Material, RelitScene, Surface, constant_map
-from usdbrdf.relighting.views import View
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, open_measured
 
 START = 0.5
 _OPTICS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")

@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.evaluation.flip import Pair, flip_maps
-from usdbrdf.evaluation.metrics import exposure_of, median_relative
+from usdbrdf.evaluation.metrics import Pair, exposure_of, flip_maps, median_relative
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.images import read_exr
 

@@ -22,7 +22,7 @@ import numpy as np
 from measure import Spent, figure, parser_of, report, saved_plot, timed
 
 import usdbrdf
-from usdbrdf.stage.asset import Asset
+from usdbrdf.asset.layout import Asset
 
 STEPS = ("ingest", "texture", "shade", "fit")
 
@@ -93,8 +93,9 @@ def converted(size: Size, folder: Path) -> dict[str, Any]:
 
 
 def found(asset: Asset) -> dict[str, int]:
-    from usdbrdf.stage.read import frames_from_stage, open_measured
-    from usdbrdf.steps.atlas import atlas_from_stage
+    from usdbrdf.asset.readers.compose import open_measured
+    from usdbrdf.asset.readers.frames import frames_from_stage
+    from usdbrdf.tasks.atlas import atlas_from_stage
 
     stage = open_measured(asset)
     atlas = atlas_from_stage(stage)

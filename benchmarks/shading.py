@@ -45,15 +45,15 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.geometry.embree import closest_hits, closest_hits_of_groups
-from usdbrdf.geometry.packed_texture import AHEAD
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.shading import incoming_light
-from usdbrdf.shading.incoming_light import whole_patches
-from usdbrdf.shading.irradiance import Sampling, patches_of_texels
-from usdbrdf.shading.light_by_direction import cosine_directions, frames_of
-from usdbrdf.shading.light_by_picks import empty_room, empty_segments, light_segments, turns
-from usdbrdf.shading.patch_draws import groups_of
+from usdbrdf.transport import incoming_light
+from usdbrdf.transport.cosine_sampling import cosine_directions, frames_of
+from usdbrdf.transport.embree import closest_hits, closest_hits_of_groups
+from usdbrdf.transport.incoming_light import whole_patches
+from usdbrdf.transport.irradiance import Sampling, patches_of_texels
+from usdbrdf.transport.light_sampling import empty_room, empty_segments, light_segments, turns
+from usdbrdf.transport.patch_draws import groups_of
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.surface_texture import AHEAD
 
 THREADS = os.cpu_count() or 1
 # Places of the scene that throughput is measured at.

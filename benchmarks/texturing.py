@@ -30,21 +30,17 @@ import numpy as np
 from measure import figure
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.scan.scan import Frames
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, open_measured
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.files.frames import read_frame
+from usdbrdf.model.capture import Frames
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.texturing import psquare
-from usdbrdf.texturing.radiance_from_frames import Observation, radiance_from_frames
-from usdbrdf.texturing.samples_from_frame import (
-    MIN_COSINE,
-    SAMPLE,
-    first_surfaces,
-    samples_of_texels,
-)
+from usdbrdf.texturing.observe import Observation, radiance_from_frames
+from usdbrdf.texturing.samples import MIN_COSINE, SAMPLE, first_surfaces, samples_of_texels
 from usdbrdf.texturing.texel_blocks import blocks_of_texels
+from usdbrdf.transport.rays import RayScene
 
 QUANTILE = 0.5
 T = TypeVar("T")

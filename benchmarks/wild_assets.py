@@ -30,13 +30,13 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Usd, UsdGeom, UsdShade
 
+from usdbrdf.asset.layout import Asset
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import read_radiance, write_exr
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.foreign import UsdMeshes, meshes_from_usd
-from usdbrdf.stage.triangulate import triangulate
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.mesh import triangulate
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.untrusted.usd_meshes import UsdMeshes, meshes_from_usd
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import validate
 

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.files.images import write_exr
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.rays import RayScene
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.transport.rays import RayScene
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]

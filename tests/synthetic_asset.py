@@ -7,19 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
+from usdbrdf.asset.header import Provenance, StageHeader
+from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
+from usdbrdf.asset.layers.material_layer import write_material_layer
+from usdbrdf.asset.layers.root_layer import write_edits, write_pending_layer, write_root
+from usdbrdf.asset.layers.scan_layer import write_scan_layer
+from usdbrdf.asset.layers.shading_layer import write_shading_layer
+from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.properties import Aov, FittedObject, ShadedObject, TexturedObject
+from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.files.images import write_exr, write_preview_png
-from usdbrdf.scan.scan import Frames, ObjectLabel, Scan, ScanMesh
+from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 from usdbrdf.shading.lamp_shapes import lamp_shapes
-from usdbrdf.stage.asset import ROLES, Asset
-from usdbrdf.stage.compose import open_weaker
-from usdbrdf.stage.header import Provenance, StageHeader
-from usdbrdf.stage.lights_layer import Lamp, world_from_root, write_lights_layer
-from usdbrdf.stage.material_layer import write_material_layer
-from usdbrdf.stage.records import Aov, FittedObject, ShadedObject, TexturedObject
-from usdbrdf.stage.root_layer import write_edits, write_pending_layer, write_root
-from usdbrdf.stage.scan_layer import write_scan_layer
-from usdbrdf.stage.shading_layer import write_shading_layer
-from usdbrdf.stage.texturing_layer import write_texturing_layer
 
 LABELS = ("Stuhl Nº 1", "wall", "lamp")
 IDENTIFIERS = ("Stuhl_No_1", "wall", "lamp")

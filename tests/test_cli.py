@@ -14,10 +14,10 @@ import pytest
 
 from tests.scenes import make_capture
 from usdbrdf import cli
+from usdbrdf.capture.adapters import Adapter
 from usdbrdf.cli import main
 from usdbrdf.job.lock import folder_lock
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.scan.adapters import Adapter
 
 COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 COMMANDS = (

@@ -16,25 +16,19 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 import usdbrdf
 from tests.scenes import MadeCapture, edited, make_capture, poses_down_and_up, write_ply
+from usdbrdf.asset.layers.looks import VARIANT_SET
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.objects import read_aovs, read_fit, read_shading
+from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.frames_from_stage import frames_from_stage
-from usdbrdf.stage.looks import VARIANT_SET
-from usdbrdf.stage.read import (
-    open_edited,
-    open_measured,
-    open_weaker,
-    read_aovs,
-    read_fit,
-    read_shading,
-    scene_from_stage,
-)
-from usdbrdf.steps.step import hash_of_files
+from usdbrdf.tasks.step import hash_of_files
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),

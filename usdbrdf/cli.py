@@ -16,6 +16,9 @@ from pathlib import Path
 from typing import NoReturn
 
 from usdbrdf import compare, evaluate, fit, ingest, options, relight, shade, texture, working_on
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.schema import plugin_path, validators_path
+from usdbrdf.capture.adapters import Adapter, list_adapters
 from usdbrdf.command_parser import command_parser
 from usdbrdf.delivery.command_options import package_options
 from usdbrdf.delivery.package import package
@@ -27,11 +30,8 @@ from usdbrdf.evaluation.evaluate_views import DOCUMENT as EVALUATION
 from usdbrdf.evaluation.report import summary_line, truth_line
 from usdbrdf.fit_options import fit_options
 from usdbrdf.job.progress import printable, say, set_quiet
-from usdbrdf.job.stage import StageResult
+from usdbrdf.job.task import StageResult
 from usdbrdf.relighting.command_options import relight_options
-from usdbrdf.scan.adapters import Adapter, list_adapters
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.schema import plugin_path, validators_path
 from usdbrdf.validation.cure_layer import write_cures
 from usdbrdf.validation.validate import has_errors, listed_rules, validate
 

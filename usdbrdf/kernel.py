@@ -14,7 +14,6 @@ import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-
 # One kernel at a time runs on all cores: numba's own pool of threads, which is all that some
 # machines have, ends the process when two threads of Python call it.
 _turn = threading.Lock()

@@ -10,12 +10,12 @@ import argparse
 import math
 from pathlib import Path
 
+from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
-from usdbrdf.scan.ingest_options import IngestOptions
 from usdbrdf.shading.denoise import CHOICES
-from usdbrdf.shading.irradiance import Sampling
-from usdbrdf.steps.shade import ShadeOptions
-from usdbrdf.steps.texture import TextureOptions
+from usdbrdf.tasks.shade import ShadeOptions
+from usdbrdf.tasks.texture import TextureOptions
+from usdbrdf.transport.irradiance import Sampling
 
 # The paper's number of independent directions per texel.
 _COSINE_RAYS = 10_000

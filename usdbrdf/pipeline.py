@@ -18,6 +18,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.layout import Asset
+from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.lock import folder_lock
 from usdbrdf.job.ownership import (
@@ -27,15 +30,12 @@ from usdbrdf.job.ownership import (
     removed_if_unused,
 )
 from usdbrdf.job.progress import say
-from usdbrdf.job.stage import StageResult
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.stage.adopt import adopt
-from usdbrdf.stage.asset import Asset
-from usdbrdf.steps.fit import fit
-from usdbrdf.steps.fit_objects import FitOptions
-from usdbrdf.steps.ingest import ingest
-from usdbrdf.steps.shade import ShadeOptions, shade
-from usdbrdf.steps.texture import TextureOptions, texture
+from usdbrdf.job.task import StageResult
+from usdbrdf.tasks.fit import fit
+from usdbrdf.tasks.fit_objects import FitOptions
+from usdbrdf.tasks.ingest import ingest
+from usdbrdf.tasks.shade import ShadeOptions, shade
+from usdbrdf.tasks.texture import TextureOptions, texture
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,9 @@ from pxr import Sdf, Usd, UsdShade
 
 from tests.blender import in_blender, needs_blender
 from tests.nondestruction.conftest import convert, photographed
+from usdbrdf.asset.layout import Asset
 from usdbrdf.files.images import read_radiance
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.stage.asset import Asset
 
 SCRIPT = Path(__file__).with_name("blender_report.py")
 FOLDERS = ["room", "Zimmer é 椅子 (1)"]

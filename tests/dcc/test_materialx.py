@@ -8,8 +8,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from tests.blender import needs_blender
 from tests.dcc.renderers import storm
+from usdbrdf.asset.layers.material_layer import write_material_layer
 from usdbrdf.files.images import write_exr
-from usdbrdf.stage.material_layer import write_material_layer
 
 pytestmark = needs_blender
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.validation.faults import FAULTS
-from usdbrdf.stage.schema import plugin_path
+from usdbrdf.asset.schema import plugin_path
 from usdbrdf.validation.rules import RULES
 
 pytestmark = pytest.mark.skipif(

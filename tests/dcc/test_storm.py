@@ -9,8 +9,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from tests.blender import needs_blender
 from tests.dcc.renderers import storm
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.preview_surface import surface
+from usdbrdf.asset.layers.preview_surface import surface
+from usdbrdf.asset.layout import Asset
 
 pytestmark = needs_blender
 MOVED = "Zimmer é 椅子 (1)"

@@ -7,8 +7,8 @@ import zipfile
 import pytest
 from pxr import Sdf, Usd
 
+from usdbrdf.asset.readers.surfaces import published_surfaces
 from usdbrdf.delivery.package import PackageOptions, package
-from usdbrdf.stage.published_surfaces import published_surfaces
 
 TIME = Usd.TimeCode.EarliestTime()
 CHAIR_FILE = """over "room" {{ over "mtl" {{ over "Stuhl_No_1" {{ over "BaseColorTexture" {{

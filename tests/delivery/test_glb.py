@@ -12,13 +12,13 @@ import pytest
 from pxr import Sdf, Usd
 
 from tests.blender import in_blender, needs_blender
+from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.glb import gltf_material, write_glb
 from usdbrdf.delivery.package import PackageOptions, package
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.relighting.model import surfaces_from_model
-from usdbrdf.relighting.surfaces import Surface, constant_map, preview_material
-from usdbrdf.stage.flat_stage import stage_in_look
-from usdbrdf.stage.published_surfaces import published_surfaces
+from usdbrdf.model.material import Surface, constant_map, preview_material
+from usdbrdf.relighting.inserted_models import surfaces_from_model
 
 pytest.importorskip("PIL", reason="Pillow is not installed")
 

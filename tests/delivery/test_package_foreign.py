@@ -10,12 +10,12 @@ import OpenImageIO as oiio
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from usdbrdf.asset.readers.surfaces import published_surfaces
 from usdbrdf.cli import main
+from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.package import PackageOptions, package
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_exr, read_radiance
-from usdbrdf.stage.flat_stage import stage_in_look
-from usdbrdf.stage.published_surfaces import published_surfaces
 from usdbrdf.validation.standard import standard_findings
 
 LAMP = "/room/prop/lamp"

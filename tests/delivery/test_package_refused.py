@@ -7,11 +7,11 @@ import pytest
 from pxr import Sdf
 
 from tests.delivery.packing import CHAIR_FILE, edit, packed
+from usdbrdf.delivery.flat_stage import look_of, stage_in_look
 from usdbrdf.delivery.package import package
+from usdbrdf.delivery.usdz import write_usdz
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.images import write_exr
-from usdbrdf.stage.flat_stage import look_of, stage_in_look
-from usdbrdf.stage.usdz import write_usdz
 
 
 @pytest.mark.parametrize(

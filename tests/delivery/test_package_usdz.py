@@ -14,11 +14,11 @@ from pxr import Usd, UsdGeom, UsdMedia
 from tests.blender import in_blender, needs_blender
 from tests.delivery.packing import TIME, edit, extracted, members, packed, surfaces_of
 from usdbrdf.cli import main
+from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.package import PackageOptions, package
+from usdbrdf.delivery.packaged_files import texture_uses
 from usdbrdf.delivery.textures import encoded_data, size_within
 from usdbrdf.files.images import image_size, write_exr
-from usdbrdf.stage.flat_stage import stage_in_look
-from usdbrdf.stage.packaged_files import texture_uses
 from usdbrdf.validation.standard import standard_findings
 
 ARKIT_CHECK = """

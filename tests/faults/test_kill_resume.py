@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-import usdbrdf.steps.fit_objects
-import usdbrdf.steps.texture
-import usdbrdf.steps.trace
+import usdbrdf.tasks.fit_objects
+import usdbrdf.tasks.texture
+import usdbrdf.tasks.trace
 from tests.scenes import make_capture
 from usdbrdf.cli import main
 from usdbrdf.files import atomic
@@ -29,8 +29,8 @@ from usdbrdf.job.ownership import edited_files
 TILE = 64  # texels
 PROGRAM = f"""
 import sys
-import usdbrdf.steps.trace
-usdbrdf.steps.trace._TILE = {TILE}
+import usdbrdf.tasks.trace
+usdbrdf.tasks.trace._TILE = {TILE}
 from usdbrdf.cli import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -91,7 +91,7 @@ def undisturbed(base):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    monkeypatch.setattr(usdbrdf.steps.trace, "_TILE", TILE)
+    monkeypatch.setattr(usdbrdf.tasks.trace, "_TILE", TILE)
 
 
 @pytest.fixture
@@ -174,11 +174,11 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(module, name, counting)
 
-    count(usdbrdf.steps.texture, "unwrap")
-    count(usdbrdf.steps.texture, "radiance_from_frames")
-    count(usdbrdf.steps.trace, "irradiance_at")
-    count(usdbrdf.steps.fit_objects, "choose_target_frames")
-    count(usdbrdf.steps.fit_objects, "fit_object")
+    count(usdbrdf.tasks.texture, "unwrap")
+    count(usdbrdf.tasks.texture, "radiance_from_frames")
+    count(usdbrdf.tasks.trace, "irradiance_at")
+    count(usdbrdf.tasks.fit_objects, "choose_target_frames")
+    count(usdbrdf.tasks.fit_objects, "fit_object")
     return counted
 
 

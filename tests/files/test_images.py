@@ -15,13 +15,7 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files import images
-from usdbrdf.files.images import (
-    image_size,
-    read_exr,
-    read_radiance,
-    write_exr,
-    write_preview_png,
-)
+from usdbrdf.files.images import image_size, read_exr, read_radiance, write_exr, write_preview_png
 
 
 @pytest.fixture

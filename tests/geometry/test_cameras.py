@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import look_at
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
+from usdbrdf.model.camera import camera_rays, pixel_centres
 
 LENS = np.array([120.0, 100.0, 31.5, 24.25])
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.geometry import embree
-from usdbrdf.geometry.embree import EmbreeScene, closest_hits
+from usdbrdf.transport import embree
+from usdbrdf.transport.embree import EmbreeScene, closest_hits
 
 _TRIANGLE = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0]], np.float32)
 _DOWN = np.array([[0.5, 0.25, 3]], np.float32), np.array([[0, 0, -1]], np.float32)

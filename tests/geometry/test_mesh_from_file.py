@@ -8,7 +8,7 @@ import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.mesh_from_file import mesh_from_file
+from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 _SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from usdbrdf.geometry import normals as normals_module
-from usdbrdf.geometry.normals import corner_normals, doubled_areas, face_normals
-from usdbrdf.geometry.weld import welded_ids
+from usdbrdf.geometry.normals import corner_normals
+from usdbrdf.model.mesh import doubled_areas, face_normals, welded_ids
 
 
 def _soup(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

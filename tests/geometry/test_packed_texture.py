@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.geometry.packed_texture import packed_colour, packed_faces, packed_pixels, packed_place
-from usdbrdf.geometry.surface_radiance import SurfaceTexture
+from usdbrdf.transport.surface_texture import (
+    SurfaceTexture,
+    packed_colour,
+    packed_faces,
+    packed_pixels,
+    packed_place,
+)
 
 
 def bilinear(picture: np.ndarray, x: float, y: float) -> np.ndarray:

@@ -7,9 +7,9 @@ import pytest
 
 from tests.physics.surfaces import World, box, quad, room, sphere, world_of
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.geometry import rays as rays_module
-from usdbrdf.geometry.embree import closest_hits_of_groups, occlusion
-from usdbrdf.geometry.rays import RayScene, lift_from_surface
+from usdbrdf.transport import rays as rays_module
+from usdbrdf.transport.embree import closest_hits_of_groups, occlusion
+from usdbrdf.transport.rays import RayScene, lift_from_surface
 
 
 @pytest.fixture(scope="module")

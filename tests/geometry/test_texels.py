@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, quad, sphere, world_of
-from usdbrdf.geometry.scene import Scene, SceneObject
-from usdbrdf.geometry.texels import Texels, texels_from_atlas
+from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import pack_triangles_singly
+from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.texels import Texels
 
 
 def _sphere() -> World:

@@ -8,9 +8,9 @@ import pytest
 
 from tests.scenes import look_at, ring_of_poses, room_mesh
 from usdbrdf.geometry import visible_faces as module
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.rays import BOX_FACES, RayScene
 from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.transport.rays import BOX_FACES, RayScene
 
 SIZE = np.array([160, 120], np.int32)
 LENS = np.array([90.0, 110.0, 77.3, 61.9])

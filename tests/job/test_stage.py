@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.job import stage
 from usdbrdf.job import stamp as stamp_module
-from usdbrdf.job.stage import run_stage
+from usdbrdf.job import task as stage
+from usdbrdf.job.task import run_stage
 
 STAMP = ".usdbrdf/stamps/20-toy.json"
 

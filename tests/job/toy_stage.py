@@ -13,7 +13,7 @@ import numpy as np
 from usdbrdf.files.images import write_exr
 from usdbrdf.job.lock import folder_lock
 from usdbrdf.job.ownership import prepare_asset_folder
-from usdbrdf.job.stage import StageResult, StageRun, run_stage
+from usdbrdf.job.task import StageResult, StageRun, run_stage
 
 TILES = 3
 FRAMES = 6

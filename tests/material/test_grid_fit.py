@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from usdbrdf.material.grid_fit import GridFit, fit_grid, multiple_of, nothing
+from usdbrdf.material.fit_target import GridFit, fit_grid, multiple_of, nothing
 
 PIXELS = 300
 Residual = Literal["paper", "scaled"]

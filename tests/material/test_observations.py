@@ -8,13 +8,12 @@ from scipy.ndimage import gaussian_filter
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.material import observations
-from usdbrdf.material.lit_scene import LitScene, View
-from usdbrdf.material.observations import Follower
-from usdbrdf.material.patches import SIDE
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.lights import lights_from_radiance
+from usdbrdf.material.observations import SIDE, Follower
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lit_scene import LitScene, View
 
 SIZE = 16
 LENS = np.array([16.0, 16.0, 8.0, 8.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.physics.surfaces import quad, world_of
-from usdbrdf.material.patches import SIDE, on_flat_squares, sides_of_samples
+from usdbrdf.material.observations import SIDE, on_flat_squares, sides_of_samples
 
 WIDE = quad((-1, -1, 0), (2, 0, 0), (0, 2, 0), size=(24, 24))
 NARROW = quad((3, -1, 0), (2, 0, 0), (0, 0.3, 0), size=(24, 4))

@@ -8,8 +8,8 @@ from functools import partial
 
 import pytest
 
+from usdbrdf.material.fit_lobe import mean_of_repeats, repeated_where_noisy
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate
-from usdbrdf.material.ray_noise import mean_of_repeats, repeated_where_noisy
 
 ONE = LobeEstimate(
     phi=0.1, psi=0.5, phi_error=0.02, psi_error=0.06, unresolved=0.01, cost=1.0, evidence=0.8,

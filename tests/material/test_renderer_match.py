@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.physics.brdf import directional_albedo
-from usdbrdf.material.renderer_match import (
+from usdbrdf.transport.renderer_match import (
     cycles_albedo,
     fitted_albedo,
     measured_lobe,

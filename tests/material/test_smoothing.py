@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from usdbrdf.material.fit_views import _likely
-from usdbrdf.material.smoothing import correlations, smoothing_of
+from usdbrdf.material.observations import correlations, smoothing_of
 
 
 def _noise(smoothed_by: float, later: float = 0.0, tiles: int = 200):

@@ -7,16 +7,16 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
-from usdbrdf.geometry.cameras import pixel_centres
-from usdbrdf.material.prior import class_prior
 from usdbrdf.material.target_frames import (
     FrameCounts,
     choose_target_frames,
     count_frame,
     mirror_hits_emitter,
     object_pixels,
-    visible_points,
 )
+from usdbrdf.material.verdict import class_prior
+from usdbrdf.model.camera import pixel_centres
+from usdbrdf.transport.lit_scene import visible_points
 
 WIDTH, HEIGHT = 80, 60
 LENS = np.array([60.0, 60.0, 40.0, 30.0])

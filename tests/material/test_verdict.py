@@ -7,15 +7,16 @@ import math
 import pytest
 
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN
-from usdbrdf.material.prior import PRIOR_ERROR, with_prior
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
+    PRIOR_ERROR,
     SOME_EVIDENCE,
     Verdict,
     verdict_on_frame,
     verdict_on_views,
+    with_prior,
 )
 
 PRIOR = (0.6, 0.3)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
+from usdbrdf.asset.layout import Asset
 from usdbrdf.files.images import write_exr
-from usdbrdf.stage.asset import Asset
 
 MINE = "/room/mtl/mine"
 # Of an edited stage, by what was done: the value as it composes.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tests.scenes import MadeCapture, make_capture, poses_down_and_up, write_ply
+from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.stage.asset import Asset
 
 COARSE = ["-q", "--texel-size", "0.2", "--standard-error", "0.2", "--rays", "32"]
 COARSE += ["--max-pixels", "60", "--denoise", "none"]

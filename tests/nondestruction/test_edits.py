@@ -10,8 +10,8 @@ from pxr import Usd
 
 from tests.nondestruction.artist import EXPECTED, IN_SHOT, edit, in_shot, read
 from tests.nondestruction.conftest import bytes_of, convert
-from usdbrdf.stage.asset import ROLES, Asset
-from usdbrdf.stage.compose import open_edited, open_measured
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.readers.compose import open_edited, open_measured
 
 # Options that differ from the first run's, and the layers that come out otherwise because of them.
 RERUNS = {

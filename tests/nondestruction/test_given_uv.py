@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.geometry.given_uv import atlas_side
+from usdbrdf.geometry.unwrap import atlas_side
 
 TEXEL = 0.05
 # Two triangles of a square of 1 x 1, and the same again one metre above.

@@ -11,14 +11,14 @@ from pxr import Gf, Usd, UsdGeom, UsdShade, UsdUtils
 from tests.nondestruction import studio
 from tests.nondestruction.conftest import COARSE, bytes_of, convert, photographed
 from tests.scenes import ROOM
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_edited, open_weaker
+from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.cli import main
 from usdbrdf.pipeline import working_on
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.compose import open_edited, open_weaker
-from usdbrdf.stage.foreign import meshes_from_usd
-from usdbrdf.stage.scene_from_stage import scene_from_stage
-from usdbrdf.steps.ingest import ingest
+from usdbrdf.tasks.ingest import ingest
+from usdbrdf.untrusted.usd_meshes import meshes_from_usd
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import validate
 

@@ -13,14 +13,15 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.scene import Scene, SceneObject
-from usdbrdf.geometry.surface_radiance import SurfaceTexture, surface_texture
-from usdbrdf.geometry.texels import Texels, texels_from_atlas
-from usdbrdf.shading.environment import Environment, black_environment
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at
-from usdbrdf.shading.lights import Lights, lights_from_radiance
-from usdbrdf.shading.patch_draws import independent_patches
+from usdbrdf.geometry.texels import texels_from_atlas
+from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.texels import Texels
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at
+from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.patch_draws import independent_patches
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]

@@ -13,8 +13,8 @@ from tests.physics.surfaces import World, box, estimates, quad, room, world_of
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import unwrap
 from usdbrdf.shading.albedo import albedo_from_irradiance
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 
 RHO = np.array([0.2, 0.5, 0.8])
 EMITTED = np.array([1.0, 0.5, 0.25])

@@ -8,9 +8,9 @@ from scipy import stats
 
 from tests.physics.chi2 import sidak
 from tests.physics.surfaces import World, box, estimates, room, world_of
-from usdbrdf.shading.environment import Environment, black_environment
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.lights import Lights
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.lights import Lights
 
 # Quads of the room and its two boxes; those of the lamp follow.
 NUM_REFLECTORS = 18

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.brdf import directional_albedo, f_nd
-from usdbrdf.material.lobe import alpha_of_phi, distribution, grazing, lobe, masking
+from usdbrdf.transport.brdf import alpha_of_phi, distribution, grazing, lobe, masking
 
 # Directional albedo at psi = 1 for light leaving at 10, 45 and 75 degrees, by an independent
 # quadrature of the paper's equations (three digits).

@@ -10,10 +10,10 @@ import pytest
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, quad, room, world_of
-from usdbrdf.material.lobe_samples import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
-from usdbrdf.material.target_frames import SurfacePoints
-from usdbrdf.shading.environment import Environment, black_environment
-from usdbrdf.shading.lights import Lights
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.lights import Lights
+from usdbrdf.transport.lit_scene import SurfacePoints
+from usdbrdf.transport.lobe_samples import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
 
 PHIS = (0.0, 0.02, 0.1, 0.3, 0.7, 1.0)
 RGB = np.array([3.0, 2.0, 1.0])

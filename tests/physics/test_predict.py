@@ -10,11 +10,10 @@ import pytest
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.material import predict
-from usdbrdf.material.lit_scene import LitScene
-from usdbrdf.material.predict import non_diffuse_radiance
-from usdbrdf.material.target_frames import SurfacePoints
-from usdbrdf.shading.environment import Environment, black_environment
+from usdbrdf.transport import lobe_radiance as predict
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
+from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
 
 RGB = np.array([3.0, 2.0, 1.0])
 # (degrees, phi, psi) of points that are asked for in one call.

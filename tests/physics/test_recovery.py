@@ -13,12 +13,12 @@ import pytest
 from tests.physics.brdf import f_nd
 from tests.physics.surfaces import World, box, room, sphere, world_of
 from tests.scenes import look_at
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.material.fit_target import fit_target_frame
 from usdbrdf.material.fit_views import fit_views
-from usdbrdf.material.lit_scene import LitScene, View
 from usdbrdf.material.observations import Follower
-from usdbrdf.shading.environment import black_environment
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import LitScene, View
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.35
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.6])

@@ -14,8 +14,8 @@ from tests.physics.chi2 import (
     sidak,
 )
 from tests.physics.surfaces import disc, quad, world_of
-from usdbrdf.material.lobe import distribution, half_vector, reflected_density, sample_half_vector
-from usdbrdf.shading.warps import (
+from usdbrdf.transport.brdf import distribution, half_vector, reflected_density, sample_half_vector
+from usdbrdf.transport.warps import (
     cosine_direction,
     hashed_uniform,
     patch_shifts,

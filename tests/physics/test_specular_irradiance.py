@@ -7,9 +7,9 @@ import pytest
 
 from tests.physics.brdf import directional_albedo
 from tests.physics.surfaces import World, room, world_of
-from usdbrdf.material.lit_scene import LitScene
-from usdbrdf.material.specular_irradiance import specular_irradiance
-from usdbrdf.shading.environment import black_environment
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import LitScene
+from usdbrdf.transport.lobe_radiance import specular_irradiance
 
 RGB = np.array([3.0, 2.0, 1.0])
 LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])

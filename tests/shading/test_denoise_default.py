@@ -10,12 +10,12 @@ import pytest
 
 import usdbrdf
 from tests.scenes import make_capture
+from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.options import add_shade_options
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.header import read_provenance
-from usdbrdf.stage.read import open_measured
-from usdbrdf.steps.atlas import atlas_from_stage
+from usdbrdf.tasks.atlas import atlas_from_stage
 
 OPTIONS = usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64))
 

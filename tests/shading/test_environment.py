@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.shading.environment import black_environment, environment_at
+from usdbrdf.transport.environment import black_environment, environment_at
 
 
 def _numbered(height: int, width: int) -> np.ndarray:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.shading import incoming_light
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.light_by_picks import pick_triangles
-from usdbrdf.shading.light_groups import LightGroups, weighed_groups
-from usdbrdf.shading.lights import Lights
+from usdbrdf.transport import incoming_light
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.light_groups import LightGroups, weighed_groups
+from usdbrdf.transport.light_sampling import pick_triangles
+from usdbrdf.transport.lights import Lights
 
 
 def _soup(count: int) -> Lights:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from usdbrdf.shading.patch_draws import (
+from usdbrdf.transport.patch_draws import (
     STRATA_BY_PLACE,
     TEXELS,
     PatchDraws,

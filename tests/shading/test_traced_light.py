@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.geometry.packed_texture import AHEAD
-from usdbrdf.shading import irradiance
-from usdbrdf.shading.environment import black_environment
-from usdbrdf.shading.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
-from usdbrdf.shading.light_by_picks import turns
-from usdbrdf.shading.light_groups import picked
-from usdbrdf.shading.warp_loops import in_triangle, on_hemisphere
-from usdbrdf.shading.warps import cosine_direction, triangle_point
+from usdbrdf.transport import irradiance
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.light_groups import picked
+from usdbrdf.transport.light_sampling import turns
+from usdbrdf.transport.surface_texture import AHEAD
+from usdbrdf.transport.warps import cosine_direction, in_triangle, on_hemisphere, triangle_point
 
 
 def _square(rng: np.random.Generator) -> np.ndarray:

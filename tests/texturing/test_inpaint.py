@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import Part, World, box, quad, world_of
-from usdbrdf.geometry.scene import SceneObject
 from usdbrdf.geometry.texels import texels_from_atlas
+from usdbrdf.model.scene import SceneObject
 from usdbrdf.texturing.inpaint import inpaint
 
 

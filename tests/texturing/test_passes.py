@@ -11,7 +11,7 @@ import pytest
 from tests.physics.surfaces import World, quad, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB
-from usdbrdf.scan.scan import Frames
+from usdbrdf.model.capture import Frames
 from usdbrdf.texturing import passes
 from usdbrdf.texturing.passes import (
     OF_TEXTURING,

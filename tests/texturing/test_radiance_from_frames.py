@@ -13,15 +13,11 @@ import pytest
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, look_at, ring_of_poses, room_mesh
 from usdbrdf.files.images import write_exr
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
 from usdbrdf.geometry.unwrap import pack_triangles_singly
-from usdbrdf.scan.scan import Frames
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.capture import Frames
+from usdbrdf.texturing.observe import Observation, radiance_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
-from usdbrdf.texturing.radiance_from_frames import (
-    Observation,
-    radiance_from_frames,
-    spread_order,
-)
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
 SATURATION = 4.0

@@ -9,8 +9,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
-from usdbrdf.texturing.footprints import blurred, footprints, widest
-from usdbrdf.texturing.restore import SAMPLE_BLUR, restored
+from usdbrdf.texturing.footprints import SAMPLE_BLUR, blurred, footprints, restored, widest
 
 SIDE, TEXEL = 64, 0.02
 LENS = np.array([100.0, 100.0, 40.0, 30.0])

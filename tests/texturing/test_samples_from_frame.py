@@ -10,13 +10,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
-from usdbrdf.texturing.samples_from_frame import (
-    CLIPPED,
-    NOTHING,
-    SAMPLE,
-    first_surfaces,
-    samples_from_frame,
-)
+from usdbrdf.texturing.samples import CLIPPED, NOTHING, SAMPLE, first_surfaces, samples_from_frame
 
 WIDTH, HEIGHT = 80, 60
 LENS = np.array([80.0, 80.0, 40.0, 30.0])

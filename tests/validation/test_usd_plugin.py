@@ -9,10 +9,10 @@ import pytest
 from pxr import Sdf, Usd, UsdValidation
 
 from tests.validation.faults import FAULTS
+from usdbrdf.asset.schema import validators_path
 from usdbrdf.cli import main
-from usdbrdf.stage.schema import validators_path
 from usdbrdf.validation.rules import RULES
-from usdbrdf.validation.usd_plug_info import PLUGIN, plug_info
+from usdbrdf.validation.usd_plugin import PLUGIN, plug_info
 
 pytestmark = pytest.mark.skipif(
     not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"),
@@ -30,7 +30,7 @@ def errors_of(stage):
 
 def test_plug_info_is_that_of_the_rules():
     written = (validators_path() / "plugInfo.json").read_text(encoding="utf-8")
-    assert written == plug_info(), "run python -m usdbrdf.validation.usd_plug_info"
+    assert written == plug_info(), "run python -m usdbrdf.validation.usd_plugin"
 
 
 def test_a_sound_asset_has_no_errors(built):

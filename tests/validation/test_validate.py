@@ -4,8 +4,8 @@ import pytest
 from pxr import Sdf
 
 from tests.validation.faults import edited, opinion
+from usdbrdf.asset.layout import ROLES
 from usdbrdf.cli import main
-from usdbrdf.stage.asset import ROLES
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import has_errors, listed_rules, validate
 

@@ -22,14 +22,17 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual.material import PBRMaterial
 
-from usdbrdf.delivery.textures import Byte, Float, encoded_colour, encoded_data, size_within
+from usdbrdf.delivery.textures import encoded_colour, encoded_data, size_within
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.images import resized
-from usdbrdf.relighting.surfaces import Material, Surface
+from usdbrdf.model.arrays import Byte, Float
+from usdbrdf.model.material import Material, Surface
 
 IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
+
 _WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
+
 _LINEAR, _LINEAR_MIPMAP = 9729, 9987
 
 

@@ -11,15 +11,10 @@ from typing import Any
 
 from pxr import Usd, UsdGeom
 
-from usdbrdf.delivery.glb import write_glb
-from usdbrdf.delivery.textures import EXR, PNG, PictureOptions, add_file, add_texture
-from usdbrdf.errors import OwnershipConflict, UsageError
-from usdbrdf.files.atomic import environment_failures
-from usdbrdf.job.progress import say
-from usdbrdf.relighting.insert import turned_up
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.export import export
-from usdbrdf.stage.flat_stage import (
+from usdbrdf.asset.layers.author import export
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.surfaces import paths_of, published_surfaces
+from usdbrdf.delivery.flat_stage import (
     fit_for_arkit,
     flattened,
     lights_of,
@@ -27,7 +22,8 @@ from usdbrdf.stage.flat_stage import (
     stage_in_look,
     take_materials_literally,
 )
-from usdbrdf.stage.packaged_files import (
+from usdbrdf.delivery.glb import write_glb
+from usdbrdf.delivery.packaged_files import (
     NewTexture,
     file_in_asset,
     other_files,
@@ -35,10 +31,15 @@ from usdbrdf.stage.packaged_files import (
     texture_uses,
     use_texture,
 )
-from usdbrdf.stage.published_surfaces import paths_of, published_surfaces
-from usdbrdf.stage.usdz import write_usdz
+from usdbrdf.delivery.textures import EXR, PNG, PictureOptions, add_file, add_texture
+from usdbrdf.delivery.usdz import write_usdz
+from usdbrdf.errors import OwnershipConflict, UsageError
+from usdbrdf.files.atomic import environment_failures
+from usdbrdf.job.progress import say
+from usdbrdf.relighting.insert import turned_up
 
 USDZ, GLB = ".usdz", ".glb"
+
 DEFAULT, ARKIT = "default", "arkit"
 
 

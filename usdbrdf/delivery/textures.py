@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from usdbrdf.asset.readers.materials import is_srgb, read_texture
+from usdbrdf.delivery.packaged_files import NewTexture, TextureUse
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
-from usdbrdf.stage.packaged_files import NewTexture, TextureUse
-from usdbrdf.stage.published_materials import is_srgb, read_texture
-
-Float = npt.NDArray[np.float32]
-Byte = npt.NDArray[np.uint8]
+from usdbrdf.model.arrays import Byte, Float
 
 EXR, PNG = "exr", "png"
+
 # What a package may hold as it is; of these, what has 8 bits already.
 EIGHT_BIT = frozenset({".png", ".jpg", ".jpeg"})
+
 IMAGES = EIGHT_BIT | {".exr"}
+
 # What becomes EXR or PNG.
 CONVERTED = frozenset({".hdr", ".tif", ".tiff"})
 

@@ -6,19 +6,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
-from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit
-from usdbrdf.evaluation.relit_pictures import write_pictures
-from usdbrdf.evaluation.report import table_text
+from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit, write_pictures
+from usdbrdf.evaluation.report import FILES, files_of, output_folder, table_text
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 from usdbrdf.job.progress import say
-from usdbrdf.stage.read import frames_from_stage
-from usdbrdf.steps.atlas import Atlas
+from usdbrdf.tasks.atlas import Atlas
 
 DOCUMENT = "comparison.json"
+
 # As textured, and after the specular light was taken out of it.
 _SETS = {
     "lit": MapNames(radiance="lit", irradiance="irradiance", albedo="albedo"),

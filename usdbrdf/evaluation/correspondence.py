@@ -9,16 +9,14 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.scene import Scene, SceneObject
-from usdbrdf.geometry.surface_radiance import surface_texture
-from usdbrdf.geometry.texels import Texels
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.texels import Texels
+from usdbrdf.transport.surface_texture import surface_texture
 
 # Points of two assets this close are the same, as a share of the scene's size.
 _SAME_POINT = 1e-5
+
 # On meshes that differ, a texel may be this many texels away.
 _REACH = 2.0
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.errors import UsageError
-from usdbrdf.evaluation.output_folder import FILES, files_of, output_folder
-from usdbrdf.evaluation.plot import write_plot
-from usdbrdf.evaluation.report import summary_of_views, table_text
+from usdbrdf.evaluation.pictures import write_plot
+from usdbrdf.evaluation.report import FILES, files_of, output_folder, summary_of_views, table_text
 from usdbrdf.evaluation.score_views import Quality, exposure_of_views, score_views
 from usdbrdf.evaluation.truth import compare_with_truth
 from usdbrdf.evaluation.viewed_asset import map_or, measured_atlas, viewed_asset

@@ -1,24 +1,28 @@
-"""Pictures for people: error maps in colour, and several pictures on one sheet."""
+"""Pictures for people: error maps in colour, several pictures on one sheet, and the errors over the
+views as in the paper's Fig. 8."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float32]
-Byte = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.job.progress import say
+from usdbrdf.model.arrays import Bool, Byte, Float
 
 # Matplotlib's magma (CC0) at nine equal steps, as FLIP shows its maps; linear in between.
 _MAGMA = np.array(
     [(0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100),
      (251, 135, 97), (254, 194, 135), (252, 253, 191)], np.float32,
 )  # fmt: skip
+
 _GREY = np.array((96, 96, 96), np.uint8)
+
 # A change of this much in FLIP gets the full colour.
 _FULL_CHANGE = 0.2
+
 _GAP = 4  # pixels between the pictures of a sheet
 
 
@@ -53,3 +57,44 @@ def sheet(rows: Sequence[Sequence[Byte]]) -> Byte:
 
 def _masked(colour: Byte, counted: Bool | None) -> Byte:
     return colour if counted is None else np.where(counted[..., None], colour, _GREY)
+
+
+_LINES = (("baseline", "diffuse baseline", "tab:blue"), ("full", "full model", "tab:orange"))
+
+_PANELS = (
+    ("l2", "relative $L_2$ without lamps"),
+    ("l2_shown", "the same, cut off at display white"),
+    ("flip", "mean FLIP"),
+)
+
+_MARKED = 60  # so many views still get a dot each
+
+
+def write_plot(path: Path, rows: Sequence[dict[str, float | str]]) -> bool:
+    """Panels of L2 and FLIP over the rows ``l2_baseline``, ``l2_full``, ... as PNG.
+
+    Without matplotlib nothing is drawn: one line says so, and False is returned.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        say(f"{path.name}: not drawn, matplotlib is missing. Install usdbrdf[report].")
+        return False
+    figure = Figure(figsize=(15, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (metric, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS, strict=True):
+        for key, label, colour in _LINES:
+            values = np.array([row[f"{metric}_{key}"] for row in rows], float)
+            mark = "o" if len(rows) <= _MARKED else None
+            axes.plot(values, label=label, color=colour, marker=mark, markersize=3, linewidth=1.2)
+            if np.isfinite(values).any():
+                axes.axhline(np.nanmean(values), color=colour, linestyle=":", linewidth=1)
+        axes.set(xlabel="view", title=title)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    axes.legend()
+    with temporary_beside(path) as staged:
+        figure.savefig(staged, dpi=110, metadata={"Software": None})
+        publish(staged, path)
+    return True

@@ -9,16 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from usdbrdf.geometry.surface_radiance import SurfaceTexture
-from usdbrdf.material.lit_scene import LitScene
-from usdbrdf.material.predict import non_diffuse_radiance
-from usdbrdf.material.target_frames import SurfacePoints, visible_points
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Double, Float
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
+from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # Surface points of a picture at once: what bounds the memory.
 _POINTS_AT_ONCE = 1 << 20

@@ -9,30 +9,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.evaluation.flip import Pair, flip_maps
-from usdbrdf.evaluation.metrics import exposure_of, finite, psnr, relative_l2
+from usdbrdf.evaluation.metrics import Pair, exposure_of, finite, flip_maps, psnr, relative_l2
 from usdbrdf.evaluation.pictures import change, magma, sheet
 from usdbrdf.evaluation.render_view import RenderedView, ViewedAsset, render_view
 from usdbrdf.evaluation.views_from_file import Views
 from usdbrdf.files.colour import to_display_srgb
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress
-from usdbrdf.scan.frame_reading import read_frame
-from usdbrdf.scan.scan import Frames
+from usdbrdf.model.arrays import Bool, Byte, Float
+from usdbrdf.model.capture import Frames
 
-Float = npt.NDArray[np.float32]
-Byte = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 Row = dict[str, Any]
 
 MODELS = ("baseline", "full")
+
 # Cameras and renderers smear a lamp over this many pixels around it.
 _LAMP_MARGIN = 2
+
 # Pixels of all photographs together that the exposure is taken from, at most.
 _EXPOSURE_PIXELS = 1 << 24
+
 # Pixels of views that wait for FLIP together, at most: what bounds the memory.
 _WAITING_PIXELS = 1 << 23
 

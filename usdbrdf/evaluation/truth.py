@@ -15,14 +15,13 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial import cKDTree
 
+from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import finite, median_relative, nrmse
 from usdbrdf.files.documents import read_json
-from usdbrdf.stage.read import read_fit
-from usdbrdf.steps.atlas import Atlas
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.tasks.atlas import Atlas
 
-Float = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
 Known: TypeAlias = Mapping[str, Mapping[str, Any]]
 
 # Fewer observations than this are no median.

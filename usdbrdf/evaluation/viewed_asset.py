@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.render_view import ViewedAsset
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.header import read_header
-from usdbrdf.stage.read import open_measured, read_fit
-from usdbrdf.steps.atlas import Atlas, atlas_from_stage
-from usdbrdf.steps.lit import lit_scene
-from usdbrdf.steps.surroundings import environment_from_file
+from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.tasks.lit import lit_scene
+from usdbrdf.tasks.surroundings import environment_from_file
 
 
 def measured_atlas(folder: Path) -> tuple[Asset, Atlas]:

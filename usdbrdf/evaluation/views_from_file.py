@@ -7,24 +7,25 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom
 
-from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.scene import Scene
-from usdbrdf.job.progress import say
-from usdbrdf.scan.findings import Findings
-from usdbrdf.scan.frame_reading import (
-    PHOTOGRAPH_ENCODING,
-    PHOTOGRAPH_NOISE_FLOOR,
-    PHOTOGRAPH_SATURATION,
+from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.capture.checks import (
+    check_frames,
+    refuse_photographs,
+    refuse_rays_that_miss,
+    rigid_records,
 )
-from usdbrdf.scan.frame_record import FrameRecord, frames_from_records
-from usdbrdf.scan.frame_rules import check_frames, refuse_photographs
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.scan.scan import Frames, ScanMesh
-from usdbrdf.scan.scan_from_parts import frames_at
-from usdbrdf.scan.scan_from_transforms import frame_records
-from usdbrdf.scan.scan_rules import refuse_rays_that_miss, rigid_records
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import frames_from_stage, read_provenance
+from usdbrdf.capture.findings import Findings, FrameRecord, frames_from_records
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.parts import frames_at
+from usdbrdf.capture.transforms import frame_records
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
+from usdbrdf.job.progress import say
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.model.scene import Scene
 
 # A reference may leave much of a picture unknown; a view that holds next to nothing is dropped.
 _MAX_UNKNOWN = 0.999

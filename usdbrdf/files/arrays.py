@@ -6,14 +6,11 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
-
-Array = npt.NDArray[Any]
+from usdbrdf.model.arrays import Array
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:

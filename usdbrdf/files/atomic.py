@@ -19,7 +19,9 @@ from pathlib import Path
 from usdbrdf.errors import EnvironmentFailure
 
 TEMPORARY_PREFIX = ".tmp-"
+
 _BLOCK = 1 << 20  # bytes hashed at a time
+
 _passes: Counter[str] = Counter()  # how often each fault point was passed in this process
 
 

@@ -15,8 +15,11 @@ from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import write_text_atomic
 
 MAX_BYTES = 256 << 20
+
 MAX_DEPTH = 64
+
 _INTEGER_LIMIT = 1 << 63
+
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
 
 

@@ -13,34 +13,42 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import fault_point, publish, temporary_beside
-
-Float = npt.NDArray[np.float32]
-Byte = npt.NDArray[np.uint8]
+from usdbrdf.model.arrays import Byte, Float
 
 MAX_SIDE = 65_536  # pixels
+
 MAX_PIXELS = 1 << 28
+
 MAX_CHANNELS = 64
+
 MAX_DECLARED_BYTES = 4 << 30
+
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
+
 HALF_MAX = 65_504.0
+
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
+
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
+
 # fmt: off
 _RAW_SUFFIXES = frozenset((
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
 ))
+
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 # Process-wide guards of the decoders themselves, before anything is allocated.
 oiio.attribute("limits:channels", MAX_CHANNELS)
+
 oiio.attribute("limits:resolution", MAX_SIDE)
+
 oiio.attribute("limits:imagesize_MB", MAX_DECLARED_BYTES >> 20)
 
 

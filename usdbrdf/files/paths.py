@@ -8,6 +8,7 @@ from pathlib import Path
 from usdbrdf.errors import InputRefused
 
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
+
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
 
 

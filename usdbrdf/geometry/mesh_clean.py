@@ -11,13 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.normals import doubled_areas
-from usdbrdf.geometry.weld import welded_ids
 from usdbrdf.job.child import run_child
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.mesh import doubled_areas, welded_ids
 
 
 @dataclass(frozen=True, kw_only=True)

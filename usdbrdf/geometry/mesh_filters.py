@@ -9,11 +9,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from usdbrdf.geometry.weld import welded_ids
-
-Array = npt.NDArray[Any]
+from usdbrdf.model.arrays import Array
+from usdbrdf.model.mesh import welded_ids
 
 # No object is reduced below this, or small ones would vanish beside a large one.
 _MIN_TRIANGLES = 32

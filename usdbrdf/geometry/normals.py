@@ -8,17 +8,16 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from usdbrdf.geometry.weld import welded_ids
 from usdbrdf.kernel import parallel_kernel
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
+from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.mesh import (
+    face_normals_and_angles,
+    welded_ids,
+)
 
 # The pairs of corners around one vertex grow with the square of their number. Beyond this a vertex
 # is the hub of a fan that no smoothing can help; its corners keep their faces' normals.
 _MAX_CORNERS = 4096
-_AT_A_TIME = 1 << 18
 
 
 def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Float:
@@ -34,7 +33,7 @@ def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Fl
     """
     if len(triangles) == 0:
         return np.zeros((0, 3, 3), np.float32)
-    faces, angles = _face_normals_and_angles(points, triangles)
+    faces, angles = face_normals_and_angles(points, triangles)
     vertex_of_corner = welded_ids(points)[triangles].reshape(-1)
     corners = np.argsort(vertex_of_corner, kind="stable")
     starts = np.searchsorted(
@@ -45,45 +44,6 @@ def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Fl
     normals = np.zeros((3 * len(triangles), 3), np.float32)
     _sum_over_neighbours(corners, starts, faces, angles.reshape(-1), min_cosine, normals)
     return normals.reshape(-1, 3, 3)
-
-
-def face_normals(points: Float, triangles: Int) -> Double:
-    """(F, 3) float64 unit normals, counter-clockwise; zero where a triangle has no area."""
-    return _face_normals_and_angles(points, triangles)[0]
-
-
-def doubled_areas(points: Float, triangles: Int) -> Double:
-    """(F,) float64, twice the triangles' areas, in the points' unit squared; some triangles at a
-    time, which takes little memory."""
-    doubled = np.empty(len(triangles))
-    for start in range(0, len(triangles), _AT_A_TIME):
-        part = slice(start, start + _AT_A_TIME)
-        doubled[part] = np.linalg.norm(across_triangles(points, triangles[part]), axis=1)
-    return doubled
-
-
-def across_triangles(points: Float, triangles: Int) -> Double:
-    """(F, 3) float64 along the triangles' normals, as long as twice their areas."""
-    first, second, third = (points[triangles[:, k]].astype(np.float64) for k in range(3))
-    across: Double = np.cross(second - first, third - first)
-    return across
-
-
-def _face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:
-    """Unit face normals (F, 3) and corner angles (F, 3) in radians; zeros without area."""
-    corner = points.astype(np.float64)[triangles]
-    edge = np.roll(corner, -1, axis=1) - corner  # from each corner to the next
-    length = np.linalg.norm(edge, axis=2, keepdims=True)
-    # Unit edges first: the product of two tiny edges would underflow, that of unit ones cannot.
-    edge = np.divide(edge, length, out=np.zeros_like(edge), where=length > 0)
-    across = np.cross(edge, -np.roll(edge, 1, axis=1))
-    sine = np.linalg.norm(across, axis=2)
-    cosine = -(edge * np.roll(edge, 1, axis=1)).sum(axis=2)
-    best = np.take_along_axis(across, sine.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-    size = np.linalg.norm(best, axis=1, keepdims=True)
-    has_area = size > 1e-12
-    normal = np.divide(best, size, out=np.zeros_like(best), where=has_area)
-    return normal, np.where(has_area, np.arctan2(sine, cosine), 0.0)
 
 
 @parallel_kernel

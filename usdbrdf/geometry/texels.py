@@ -1,101 +1,28 @@
-"""The texel table: where on the surface each texel of each object's atlas lies."""
+"""From charts to texels: each triangle of the atlas drawn, texel by texel."""
 
 from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.geometry.scene import Scene
 from usdbrdf.kernel import kernel
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
-Number = TypeVar("Number", bound=np.generic)
+from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.scene import Scene
+from usdbrdf.model.texels import Texels
 
 # A texel whose centre lies outside every triangle, but no further than this from one (in texels),
 # still belongs to the chart: bilinear lookup at the chart's border reads it.
 _BORDER = 0.75
+
 # How far from its triangle's edges a texel's point stays, in texels (less in slivers).
 _INSET = 0.01
+
 # Texels computed at a time, by each thread.
 _AT_A_TIME = 1 << 16
-
-
-@dataclass(frozen=True, kw_only=True)
-class Texels:
-    """T texels of all objects; texels of one object are consecutive, in row order.
-
-    pixel           (T,) int64, index into the flat pixels of all atlases
-    face            (T,) int32; barycentric (T, 3) float32: the surface point
-    position        (T, 3) float32, metres, world; normal (T, 3) shading normal,
-    geometric_normal (T, 3) the triangle's; both unit
-    step_x, step_y  (T, 3) float32, metres: the surface spanned by one texel right and one down
-    area            (T,) float32, m^2
-    interior        (T,) bool: the centre lies inside a triangle (False: chart border)
-    resolution      (num_objects, 2) int32, width and height of each atlas
-    first_pixel     (num_objects + 1,) int64: flat pixels of object i are first_pixel[i:i+1]
-    first_texel     (num_objects + 1,) int64
-    nearest_texel   (P,) int32: for every flat pixel the texel that it shows; its own, or (gutter)
-                    the nearest one of the same atlas; -1 only in an atlas without texels
-    corner_pixel    (F, 3, 2) float32: x right, y down, in pixels of the face's atlas
-    """
-
-    pixel: npt.NDArray[np.int64]
-    face: Int
-    barycentric: Float
-    position: Float
-    normal: Float
-    geometric_normal: Float
-    step_x: Float
-    step_y: Float
-    area: Float
-    interior: Bool
-    resolution: Int
-    first_pixel: npt.NDArray[np.int64]
-    first_texel: npt.NDArray[np.int64]
-    nearest_texel: Int
-    corner_pixel: Float
-
-    def __len__(self) -> int:
-        return len(self.face)
-
-    def take(self, index: npt.NDArray[np.int64]) -> Texels:
-        """The surface points of some texels; the atlas stays the whole one."""
-        names = (
-            "pixel", "face", "barycentric", "position", "normal", "geometric_normal", "step_x",
-            "step_y", "area", "interior",
-        )  # fmt: skip
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
-
-    def of_object(self, index: int) -> slice:
-        """The texels of one object."""
-        return slice(int(self.first_texel[index]), int(self.first_texel[index + 1]))
-
-    def image(self, index: int, values: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """(H, W, ...) picture of per-texel values (T, ...) of one object, gutters dilated."""
-        width, height = self.resolution[index]
-        texel = self.nearest_texel[self.first_pixel[index] : self.first_pixel[index + 1]]
-        if not len(texel) or texel[0] < 0:
-            return np.zeros((height, width, *values.shape[1:]), values.dtype)
-        shown: npt.NDArray[Number] = values[texel].reshape(height, width, *values.shape[1:])
-        return shown
-
-    def from_image(self, index: int, image: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """The texels' values (T_i, ...) out of one object's picture (H, W, ...)."""
-        own = self.pixel[self.of_object(index)] - self.first_pixel[index]
-        values: npt.NDArray[Number] = image.reshape(-1, *image.shape[2:])[own]
-        return values
-
-    def object_index(self) -> Int:
-        """(T,) int32, the object of each texel."""
-        return np.repeat(np.arange(len(self.resolution), dtype=np.int32), np.diff(self.first_texel))
 
 
 def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:

@@ -14,20 +14,20 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from usdbrdf.geometry.cameras import camera_rays
-from usdbrdf.geometry.rays import BOX_FACES, RayScene
 from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.camera import camera_rays
+from usdbrdf.transport.rays import BOX_FACES, RayScene
 
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
 Vector = tuple[float, float, float]
 
 # Rays decide within this many pixels of an edge, and where two depths differ by less than this
 # share: single precision, in which rays are traced, errs by a tenth of both.
 _EDGE, _DEPTH = 4e-3, 2e-5
+
 # Bands of rows, drawn in any order by any thread.
 _BANDS = 32
+
 _BEHIND = 1e-9
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from urllib.parse import quote, unquote
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.arrays import Array, load_arrays, save_arrays
+from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import publish, sha256_of, temporary_beside
+from usdbrdf.model.arrays import Array
 
 _NAME = re.compile(r"(?P<key>[^@]*)(?:@(?P<index>\d{9}))?\.(?P<sha256>[0-9a-f]{64})\.npz")
 

@@ -23,12 +23,15 @@ from typing import Any
 
 from usdbrdf import errors
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.files.arrays import Array, load_arrays, save_arrays
+from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.documents import json_text
+from usdbrdf.model.arrays import Array
 
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
+
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
+
 _ERROR_CLASSES = {
     name: value
     for name, value in vars(errors).items()

@@ -19,9 +19,11 @@ from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.progress import say
 
 _POLL_SECONDS = 0.2
+
 # POSIX record locks belong to the process: a second one from another thread would just succeed,
 # and closing any descriptor of the file would free the first.
 _held_here: set[Path] = set()
+
 _guard = threading.Lock()
 
 

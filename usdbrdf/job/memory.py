@@ -8,7 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 GIB = 1 << 30
+
 _CONTAINER = Path("/sys/fs/cgroup/memory.max")
+
 _OF_PROCESS = Path("/proc/self/statm")
 
 

@@ -15,6 +15,7 @@ from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.job.stamp import known_hashes
 
 STATE_FOLDER = ".usdbrdf"
+
 JOB_SCHEMA = 1
 
 

@@ -10,7 +10,9 @@ from typing import TypeVar
 from tqdm import tqdm
 
 T = TypeVar("T")
+
 _SECONDS_BETWEEN_LINES = 30.0
+
 _quiet = False
 
 

@@ -1,30 +1,116 @@
-"""The lobe that explains many views best: two levels of roughness, specular in closed form."""
+"""The lobe that explains many views best: two levels of roughness, specular in closed form; and
+what the noise of the rays does to it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
-from usdbrdf.material.lobe_posterior import LobeEstimate, averaged, least_costs, lobe_from_costs
-from usdbrdf.material.lobe_samples import Basis
-from usdbrdf.material.ray_noise import error_of_rays
+from usdbrdf.material.lobe_posterior import (
+    NOTHING_KNOWN,
+    LobeEstimate,
+    averaged,
+    least_costs,
+    lobe_from_costs,
+)
+from usdbrdf.material.verdict import SOME_EVIDENCE
 from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.transport.lobe_samples import Basis
 
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
 Pair = tuple[Float, Float]
+
+# Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
+# many with rays of their own.
+_NOISY, _REPEATS = 0.5, 4
+
+
+def error_of_rays(
+    model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], phis: Sequence[float], psi: float
+) -> tuple[float, float]:
+    """Standard deviations of phi and psi that the rays' noise alone brings about.
+
+    radiance  (P, 3) of the samples
+    bases     twice (base, slope), (P, 3, 3) each, with independent noise, at three ``phis``: the
+              one that was found and its neighbours
+
+    (phi, psi) solve J1' C^-1 (I - M2) + J2' C^-1 (I - M1) = 0, M being the predicted lobe and J its
+    derivatives. Noise in them moves the solution by H^-1 / 2 times the sum over both of J' C^-1 n
+    and, the other way, d' C^-1 e; H = J1' C^-1 J2, e what is left of the samples. A sum of two
+    independent noises has the variance of their difference, which is known. Rays of different
+    texels are independent, those of one texel's views hang together.
+    """
+    lobes = [base + np.float32(psi) * slope for base, slope in bases]
+    step = phis[2] - phis[0]
+    first, second = (
+        np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
+        for lobe, (_, slope) in zip(lobes, bases, strict=True)
+    )
+    left = radiance - (lobes[0] + lobes[1])[..., 1] / 2
+    solved = model.solved(np.concatenate([first, second, left[..., None]], axis=-1))
+    along = (solved[..., :2] + solved[..., 2:4]) / 2
+    each = np.einsum("pci,pc->pi", along, (lobes[0] - lobes[1])[..., 1])
+    each -= np.einsum("pci,pc->pi", first - second, solved[..., 4])
+    pull = model.sums_of_texels(each) / 2
+    crossed = np.einsum("pci,pcj->ij", solved[..., :2], second)
+    moved = pull @ _inverse((crossed + crossed.T) / 2)
+    by_phi, by_psi = np.sqrt((moved**2).sum(axis=0))
+    return float(by_phi), float(by_psi)
+
+
+def _inverse(normal: Double) -> Double:
+    """Of a symmetric matrix with the prior's precision: noise may leave less than that of it."""
+    values, vectors = np.linalg.eigh(normal)
+    found: Double = (vectors / (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
+    return found
+
+
+def repeated_where_noisy(fit: Callable[[int, int], LobeEstimate], seed: int) -> LobeEstimate:
+    """``fit(seed, repeats)`` gets its rays from its seed. One fit, or, where their noise matters to
+    what it tells, the mean of several; these have seeds that no other ``seed`` brings about."""
+    first = (_REPEATS + 1) * seed
+    one = fit(first, 1)
+    noisy = np.any(np.array(one.of_rays) > _NOISY * np.array([one.phi_error, one.psi_error]))
+    if not noisy or one.evidence < SOME_EVIDENCE:
+        return mean_of_repeats([one])
+    return mean_of_repeats([fit(first + k, _REPEATS) for k in range(1, _REPEATS + 1)])
+
+
+def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
+    """The mean of fits that differ in their rays alone, its stated errors with the rays' share:
+    from their scatter, or as each of them says, whichever is more."""
+    values = np.array([[one.phi, one.psi] for one in found])
+    stated = np.array([[one.phi_error, one.psi_error] for one in found])
+    # Not their mean: with much noise H, and so what one of them says, may be far off.
+    of_rays = np.median([one.of_rays for one in found], axis=0)
+    if len(found) > 1:
+        of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
+    of_rays /= np.sqrt(len(found))
+    errors = np.minimum(np.hypot(stated.mean(axis=0), of_rays), NOTHING_KNOWN)
+    means = {
+        name: float(np.mean([getattr(one, name) for one in found]))
+        for name in ("phi", "psi", "unresolved", "cost", "evidence")
+    }
+    return LobeEstimate(
+        **means,
+        phi_error=float(errors[0]),
+        psi_error=float(errors[1]),
+        of_rays=(float(of_rays[0]), float(of_rays[1])),
+    )
+
 
 # Roughnesses that are tried, and how many more between the best one and each neighbour of it.
 _LEVEL_1 = (
     0.0, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9,
     1.0,
 )  # fmt: skip
+
 _LEVEL_2 = 3
+
 # Steps of expectation maximisation, each after a search of level 1; and how many more with another
 # candidate than the first.
 _UPDATES, _MORE = 4, 2

@@ -15,45 +15,48 @@ from functools import reduce
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.texels import Texels
-from usdbrdf.material.fit_lobe import Candidate, fit_lobe
-from usdbrdf.material.lit_scene import LitScene, View, sub_pixel_points
+from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
 from usdbrdf.material.lobe_posterior import LobeEstimate
-from usdbrdf.material.lobe_samples import Mixture, lobe_basis
 from usdbrdf.material.observations import Observations
-from usdbrdf.material.ray_noise import repeated_where_noisy
-from usdbrdf.material.target_frames import SurfacePoints
 from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.footprints import RINGS
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Long = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, View, sub_pixel_points
+from usdbrdf.transport.lobe_samples import Mixture, lobe_basis
 
 # A sample spreads over the pixels, by this many of standard deviation: half a pixel for a camera's
 # own blur, 0.4 for bilinear reading, 0.3 for the pixel's area.
 _FOOTPRINT = 0.7
+
 # Pictures are often smoothed besides. On curved objects, whose highlights that widens, these are
 # tried as well, as long as so many of the samples keep the whole footprint on the object.
 _WIDER = (0.5, 1.0, 1.4, 2.0)
+
 _KEPT = 0.4
+
 # How likely each is follows a normal distribution of the logarithm about the width that the
 # pictures' noise tells: what smooths noise may leave bright highlights sharper.
 _SPREAD_OF_WIDTHS = math.log(1.5)
+
 # From this deviation of the normal over a footprint on, in radians, an object counts as curved.
 _CURVED = 0.01
+
 # Fewer samples do not tell the variances of their errors: with 54 a ring was measured, and off by
 # three times what was stated.
 MIN_OBSERVATIONS = 100
+
 _MIN_VIEWS = 3
+
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
 # the brighter samples would be valid.
 _ABOVE_NOISE = 4.0
+
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
+
 _TIMES_FOR_CURVED = 2
+
 # Frames' errors hang together over about this many pixels.
 _PATCH_PIXELS = 16.0
 

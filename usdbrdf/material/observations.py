@@ -1,44 +1,154 @@
-"""Which texels, seen in which frames, tell most about an object's lobe.
-
-A lobe shows in how a texel's radiance changes with the view. So, of every object, some thousand
-texels are followed through all frames, and those are kept on which the light in the mirror
-direction changes most between the frames that see them, along with as many taken at random. On
-flat objects a sample is the mean over a square of texels: see ``patches``.
-"""
+"""Which texels, seen in which frames, tell most about an object's lobe: squares of flat surface,
+how far pictures were smoothed, and the texels that are followed through all frames."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.geometry.rays import lift_from_surface
-from usdbrdf.geometry.texels import Texels
-from usdbrdf.material.lit_scene import LitScene, View
-from usdbrdf.material.patches import sides_of_samples
-from usdbrdf.material.smoothing import noise_correlation, smoothing_of
-from usdbrdf.shading.warps import patch_shifts
-from usdbrdf.texturing.samples_from_frame import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.texels import Texels
+from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.transport.lit_scene import LitScene, View, visible_points
+from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.warps import patch_shifts
 
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+# Side of the squares in texels, which are about as large as pixels.
+SIDE = 4.0
+
+# Normals this far apart, as a cosine, do not count as one plane's: 0.02 radians.
+_FLAT = 0.9998
+
+# An object is seen in squares if so many of its texels have one, and these are no wider than this
+# share of the scene: from within it a few hundredths of a radian.
+_MOST, _WIDEST = 0.5, 0.02
+
+
+def sides_of_samples(texels: Texels, usable: Bool, scene_size: float) -> tuple[Float, Bool]:
+    """The side of what samples of each object average, (num_objects,), in texels: SIDE or 1; and
+    which of the ``usable`` texels (T,) have so much surface around them. scene_size in metres."""
+    owner = texels.object_index()
+    objects = len(texels.resolution)
+    small = SIDE * np.sqrt(texels.area) <= _WIDEST * scene_size
+    flat = usable & small & on_flat_squares(texels, round(SIDE) // 2)
+    share = np.bincount(owner, flat, objects) / np.maximum(np.bincount(owner, usable, objects), 1)
+    in_squares = share >= _MOST
+    side = np.where(in_squares, np.float32(SIDE), np.float32(1))
+    return side, np.where(in_squares[owner], flat, usable)
+
+
+def on_flat_squares(texels: Texels, reach: int) -> Bool:
+    """(T,): whether a texel's atlas shows surface of its own plane ``reach`` texels around it."""
+    owner = texels.object_index()
+    width, height = texels.resolution[owner].T
+    row, column = np.divmod(texels.pixel - texels.first_pixel[owner], width)
+    flat: Bool = (np.minimum(row, column) >= reach) & (row + reach < height)
+    flat &= column + reach < width
+    for down, right in product((-reach, 0, reach), repeat=2):
+        pixel = texels.pixel + np.where(flat, down * width.astype(np.int64) + right, 0)
+        other = texels.nearest_texel[pixel]
+        flat &= texels.pixel[other] == pixel
+        flat &= np.einsum("td,td->t", texels.normal, texels.normal[other]) > _FLAT
+    return flat
+
+
+# The noise is looked at in tiles of so many pixels that show one object alone, so many per frame.
+_TILE, _TILES = 24, 60
+
+_FEWEST_TILES = 30
+
+_LAGS = 3
+
+# Errors of the model hang together a little too: less than this at neighbouring pixels is nothing,
+# and what hangs together farther than any smoothing, in pixels, is structure of the surface.
+_WHITE = 0.05
+
+_WIDEST_BLUR = 3.0
+
+
+def noise_correlation(lit: LitScene, view: View) -> Double:
+    """(N, 3): of N tiles of a frame, the correlation of its relative deviation from L_d between
+    pixels 1, 2 and 3 apart."""
+    height, width = view.valid.shape
+    corners = [
+        (row, column)
+        for row in range(0, height - _TILE + 1, _TILE)
+        for column in range(0, width - _TILE + 1, _TILE)
+        if view.valid[row : row + _TILE, column : column + _TILE].all()
+    ]
+    chosen = np.linspace(0, len(corners) - 1, min(_TILES, len(corners))).round().astype(int)
+    if not len(chosen):
+        return np.zeros((0, _LAGS))
+    within = np.moveaxis(np.indices((_TILE, _TILE)), 0, -1)
+    place = np.array(corners)[chosen][:, None, None] + within
+    pixels = place[..., ::-1].reshape(-1, 2) + 0.5
+    seen = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, pixels)
+    diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _TILE, _TILE, 3)
+    owner = lit.owner(seen.face).reshape(len(chosen), -1)
+    alone = (owner[:, 0] >= 0) & (owner == owner[:, :1]).all(axis=1)
+    alone &= (diffuse > 0).all(axis=(1, 2, 3))
+    shown = view.radiance[place[alone, ..., 0], place[alone, ..., 1]]
+    return correlations((shown / diffuse[alone]).mean(axis=-1, dtype=np.float64))
+
+
+def correlations(tiles: Double) -> Double:
+    """(N, 3) correlation between pixels 1, 2 and 3 apart in tiles (N, H, W)."""
+    rest = tiles - tiles.mean(axis=(1, 2), keepdims=True)
+    power = np.maximum((rest**2).mean(axis=(1, 2)), 1e-30)
+    each = [
+        (rest[:, lag:] * rest[:, :-lag]).mean(axis=(1, 2))
+        + (rest[:, :, lag:] * rest[:, :, :-lag]).mean(axis=(1, 2))
+        for lag in range(1, _LAGS + 1)
+    ]
+    found: Double = np.stack(each, axis=1) / (2 * power[:, None])
+    return found
+
+
+def smoothing_of(tiles: Sequence[Double]) -> float:
+    """Standard deviation in pixels of what smoothed the pictures, 0 if nothing did, NaN if they do
+    not tell.
+
+    White noise that a normal distribution of standard deviation s has smoothed correlates as
+    exp(-d^2 / (4 s^2)) over a distance d. White noise that came on top, later, lessens all alike:
+    so the ratio of two correlations tells s. tiles: ``noise_correlation`` of frames.
+    """
+    every = np.concatenate([np.zeros((0, _LAGS)), *tiles])
+    if len(every) < _FEWEST_TILES:
+        return math.nan
+    first, _, last = np.median(every, axis=0)
+    if first < _WHITE:
+        return 0.0
+    ratio = max(float(last / first), 0.01)
+    if ratio > math.exp(-(_LAGS**2 - 1) / (4 * _WIDEST_BLUR**2)):
+        return math.nan
+    return math.sqrt((_LAGS**2 - 1) / (-4 * math.log(ratio)))
+
 
 # Followed per object, kept per object, and views kept per texel.
 _FOLLOWED = 3000
+
 _KEPT = 200
+
 _VIEWS = 12
+
 _MIN_VIEWS = 3
+
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
 # whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
 _MAX_CELLS = 12_000_000
+
 _FEWEST = 40
+
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
 _PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
+
 # How far pictures were smoothed is measured on about so many frames.
 _FRAMES_OF_NOISE = 20
 

@@ -2,47 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.rays import RayScene, lift_from_surface
-from usdbrdf.geometry.scene import Scene
-from usdbrdf.geometry.surface_radiance import SurfaceTexture
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfacePoints:
-    """What R rays meet: face (R,) int32 (-1: nothing), position, shading normal turned to where the
-    ray came from (a camera), and direction there, each (R, 3) float32, the latter two unit."""
-
-    face: Int
-    u: Float
-    v: Float
-    position: Float
-    normal: Float
-    to_camera: Float
-
-    def take(self, index: npt.NDArray[np.int64]) -> SurfacePoints:
-        """Some of the points."""
-        return SurfacePoints(**{name: values[index] for name, values in vars(self).items()})
-
-    @staticmethod
-    def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
-        """Points after points."""
-        names = vars(parts[0])
-        return SurfacePoints(
-            **{name: np.concatenate([vars(part)[name] for part in parts]) for name in names}
-        )
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.camera import pixel_centres
+from usdbrdf.model.scene import Scene
+from usdbrdf.transport.lit_scene import SurfacePoints, visible_points
+from usdbrdf.transport.rays import RayScene, lift_from_surface
+from usdbrdf.transport.surface_texture import SurfaceTexture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,34 +24,6 @@ class FrameCounts:
 
     mirrored: npt.NDArray[np.int64]
     valid: npt.NDArray[np.int64]
-
-
-def visible_points(
-    rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
-) -> SurfacePoints:
-    """The surface under pixel coordinates (R, 2)."""
-    return points_of_rays(rays, scene, *camera_rays(world_from_camera, intrinsics, pixels))
-
-
-def points_of_rays(
-    rays: RayScene, scene: Scene, origins: Float, directions: Float
-) -> SurfacePoints:
-    """The surface that rays (R, 3) meet first, seen from where they come."""
-    hits = rays.closest(origins, directions)
-    face = np.maximum(hits.face, 0)
-    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
-    normal = np.einsum("rc,rcd->rd", weights, scene.corner_normals[face])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    towards = np.einsum("rd,rd->r", normal, directions) > 0
-    position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
-    return SurfacePoints(
-        face=hits.face,
-        u=hits.u,
-        v=hits.v,
-        position=position.astype(np.float32),
-        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
-        to_camera=-directions,
-    )
 
 
 def mirror_hits_emitter(

@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.errors import UsageError
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.relighting.surfaces import (
-    Double,
-    Int,
+from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.material import (
     Material,
     Surface,
     constant_map,
     normal_reflectance,
     preview_material,
 )
+from usdbrdf.transport.rays import RayScene
 
 _UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 NAME = "usdbrdf_lobe"
+
 _registered: set[str] = set()
 
 

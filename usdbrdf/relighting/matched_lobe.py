@@ -5,9 +5,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 
-Double = npt.NDArray[np.float64]
+from usdbrdf.model.arrays import Double
 
 _ANGLES, _SLOPES, _AZIMUTHS = 24, 48, 24
 

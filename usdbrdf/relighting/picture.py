@@ -9,13 +9,15 @@ import numpy as np
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import write_exr, write_preview_png
-from usdbrdf.relighting.surfaces import Float
+from usdbrdf.model.arrays import Float
 
 LINEAR = (".exr",)
+
 DISPLAYED = (".png", ".jpg", ".jpeg")
 
 # Automatic exposure: this percentile of the mean of red, green and blue comes out as this value.
 _PERCENTILE, _SHOWN_AS = 90.0, 0.8
+
 _LEVELS = 1 << 16  # pixels of a picture that the percentile is taken from
 
 

@@ -8,10 +8,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_edited
+from usdbrdf.asset.readers.render_scene import eye_height, published, published_camera, time_code
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.job.progress import say
+from usdbrdf.model.arrays import Float
+from usdbrdf.model.camera import View
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.picture import (
@@ -23,16 +28,9 @@ from usdbrdf.relighting.picture import (
     write_picture,
 )
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
-from usdbrdf.relighting.render import render_view
-from usdbrdf.relighting.surfaces import Float
-from usdbrdf.relighting.variant import mitsuba_variant
-from usdbrdf.relighting.views import View
+from usdbrdf.relighting.render import mitsuba_variant, render_view
 from usdbrdf.relighting.views_from_document import views_from_document
 from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter, denoise_picture
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.compose import open_edited
-from usdbrdf.stage.published import eye_height, published
-from usdbrdf.stage.published_cameras import published_camera, time_code
 
 MIN_BOUNCES = 4
 

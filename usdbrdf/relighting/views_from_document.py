@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.layout import Asset
+from usdbrdf.capture.checks import rigid_records
+from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
-from usdbrdf.relighting.views import View
-from usdbrdf.scan.findings import Findings
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.scan.scan_from_transforms import frame_records
-from usdbrdf.scan.scan_rules import rigid_records
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.read import read_provenance
+from usdbrdf.model.camera import View
 
 
 def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> tuple[View, ...]:

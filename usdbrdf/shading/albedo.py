@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-Float = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Float
 
 
 def albedo_from_irradiance(

@@ -15,10 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 
-from usdbrdf.shading.correlated_errors import restricted_cost, weight_without_mean
+from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.shading.lamp_evidence import (
     AMBIENT_SPREAD,
     Evidence,
@@ -26,29 +25,34 @@ from usdbrdf.shading.lamp_evidence import (
     lamp_share,
     log_irradiance,
     normal_equations,
+    restricted_cost,
     segment_covariance,
     segments_of,
+    weight_without_mean,
 )
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
 
 # With a larger relative standard error nothing is claimed.
 MAX_ERROR = 0.5
+
 # What surfaces that obey the model exactly would still not tell: errors of the geometry, of the
 # Lambertian model, of a lamp that is not evenly bright.
 _LEAST_ERROR = 0.02
+
 # Fewer objects than this are too few to tell from them how much objects differ.
 _FEW_OBJECTS = 8
+
 _STUDENT_FREEDOM = 4.0
+
 _ROUNDS = 6
+
 _STEPS = 30
+
 # Of log g, log-normal and wide: keeps the undetermined ones finite.
 LAMP_PRIOR = (1.4, 1.5)
+
 # First noise, agreeing part (both of log L_d) and its length in metres; and their limits.
 _START = np.log([0.05, 0.05, 0.5])
+
 _LIMITS = np.log([[0.003, 1.0], [0.003, 1.0], [0.05, 5.0]])
 
 

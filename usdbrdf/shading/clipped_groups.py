@@ -10,21 +10,22 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from usdbrdf.geometry.texels import Texels
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.texels import Texels
 
 # Fewer clipped texels than this light nothing.
 _MIN_TEXELS = 16
+
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
+
 # Texels this many of their sizes apart hang together.
 _REACH = 3.0
+
 # A wall beside a lamp clips where it is brightest: what surrounds the clipped part is then nearly
 # as bright, at least this share of it. What surrounds a lamp is not.
 _NEARLY = 0.3
+
 # The surroundings of a clipped part reach this far, metres.
 _AROUND = 0.1
 

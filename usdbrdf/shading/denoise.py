@@ -7,14 +7,16 @@ from collections.abc import Iterable, Iterator
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.model.arrays import Float
 
-Float = npt.NDArray[np.float32]
 AUTO: Final = "auto"
+
 NONE: Final = "none"
+
 OIDN: Final = "oidn"
+
 CHOICES: Final = (AUTO, NONE, OIDN)
 
 # Larger pictures than this suffices for are filtered in tiles.

@@ -6,19 +6,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.geometry.texels import Texels
-
-Float = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.texels import Texels
 
 # pi L_d / S above this is emission. Specular light kept in L_d reaches about 1.1 on glossy dark
 # surfaces; lamps start near 3: between the two the exact value does not matter.
 EMITTER_RATIO = 1.2
+
 # An object more than half of whose seen surface shines is a lamp as a whole, its unseen back too.
 _WHOLE_LAMP = 0.5
+
 # A lit part of an object must hang together over this many texels: single ones are noise.
 _MIN_PATCH = 16
 

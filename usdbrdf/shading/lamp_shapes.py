@@ -6,26 +6,26 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from trimesh.bounds import oriented_bounds_2D
 
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Double, Float, Int
 
 # A lamp is replaced by at most so many flat lights (a box has six sides), which together must
 # carry this share of its power.
 _MAX_PARTS, _COVERED = 6, 0.98
+
 # Faces of one flat part: normals within this angle of its own, and no further from its plane than
 # this share of its diagonal.
 _SAME_DIRECTION, _FLAT = math.cos(math.radians(15)), 0.02
+
 # Share of the bounding rectangle, or of the disc about the farthest corner, that a part must fill.
 # A polygon of 12 corners fills 0.955 of its disc, a square 0.64.
 _RECTANGLE_FILL, _DISK_FILL = 0.95, 0.93
+
 # Of a sphere: how far corners may be off its radius, and the share of its surface that must be
 # there (a rod or a socket may take the rest).
 _ROUND, _SPHERE_FILL = 0.05, 0.9
+
 # Lights lie this share of their size off the lamp's surface, which would shade them otherwise.
 _GAP = 1e-3
 

@@ -1,26 +1,24 @@
-"""What a pixel covers of a surface, and surfaces as pixels blur them, in texels."""
+"""What a pixel covers of a surface, surfaces as pixels blur them, and textures with the contrast
+that pixels took restored."""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 from scipy import ndimage
 
-from usdbrdf.geometry.texels import Texels
 from usdbrdf.kernel import parallel_kernel
-from usdbrdf.texturing.samples_from_frame import project
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Long = npt.NDArray[np.int64]
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.texels import Texels
+from usdbrdf.texturing.samples import project
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
 _RING = np.pi / 4 * np.arange(8)
+
 RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
     [np.cos(_RING), np.sin(_RING)], axis=-1
 )
+
 # Variance of a texel's own area, in texels; and what a view along the surface counts as.
 _OF_TEXEL, _LARGEST = 1 / 12, 1e6
 
@@ -131,3 +129,36 @@ def _blur(
                 upper = (1 - fx) * picture[p, c] + fx * picture[p + right, c]
                 lower = (1 - fx) * picture[p + below, c] + fx * picture[p + below + right, c]
                 out[t, c] += ((1 - fy) * upper + fy * lower) / len(offsets)
+
+
+# Standard deviation of a sample's blur in pixels: the camera's own, bilinear reading, the pixel. A
+# little less than the fit of highlights takes: what was not blurred must not be sharpened.
+SAMPLE_BLUR = 0.6
+
+# What is detail and what is noise is decided over three blurs of this many pixels.
+_NEIGHBOURHOOD = 2.0
+
+
+def restored(
+    texels: Texels, values: Float, measured: Bool, variance: Float, footprint: Float
+) -> Float:
+    """The surface's values, (T, 3), from what frames measured of them.
+
+    values     (T, 3) float32, with a fill where nobody looked
+    measured   (T,) bool
+    variance   (T,) float32, of the values' errors
+    footprint  (T, 3) float32, what a pixel covers: covariance xx, xy, yy in texels
+    """
+    kernel = SAMPLE_BLUR**2 * footprint
+    smooth = blurred(texels, values, kernel)
+    detail = values - smooth
+    energy = np.stack([(detail**2).mean(axis=1), variance], axis=-1)
+    energy = np.where(measured[:, None], energy, 0).astype(np.float32)
+    for _ in range(3):
+        energy = blurred(texels, energy, np.float32(_NEIGHBOURHOOD**2) * footprint)
+    seen, noise = energy.T
+    share = np.clip(1 - noise / np.maximum(seen, 1e-30), 0, 1)
+    # At the rim of what was measured the fill would pass for detail, and the last samples before a
+    # lamp hold some of its light.
+    surrounded = blurred(texels, measured[:, None].astype(np.float32), kernel)[:, 0] > 1 - 1e-3
+    return np.where(surrounded[:, None], smooth + 2 * share[:, None] * detail, values)

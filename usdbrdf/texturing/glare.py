@@ -7,10 +7,8 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.model.arrays import Bool, Float, Int
 
-Float = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
-Int = npt.NDArray[np.int32]
 Count = npt.NDArray[np.int64]
 
 # Pixels this many times brighter than the frame's median reach this many pixels far. Of such light

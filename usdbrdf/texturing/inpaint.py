@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from usdbrdf.geometry.texels import Texels
-
-Float = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
-Long = npt.NDArray[np.int64]
+from usdbrdf.model.arrays import Bool, Float, Long
+from usdbrdf.model.texels import Texels
 
 _NEIGHBOURS = 8
+
 # A normal that differs by 90 degrees counts as this share of the object's size in distance: the
 # unseen back of a box is filled from its own sides before the far end of its front.
 _NORMAL_WEIGHT = 0.25
+
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
+
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18
+
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
 # is never far.
 _MOST_SOURCES = 1 << 18

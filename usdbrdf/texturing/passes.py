@@ -6,30 +6,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.geometry.scene import Scene
-from usdbrdf.geometry.texels import Texels
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
-from usdbrdf.scan.scan import Frames
+from usdbrdf.model.arrays import Array, Float, Int
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.scene import Scene
+from usdbrdf.model.texels import Texels
 from usdbrdf.texturing import psquare
-from usdbrdf.texturing.radiance_from_frames import Observation
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
-Array = npt.NDArray[Any]
+from usdbrdf.texturing.observe import Observation
 
 # Without --memory this share of the machine's.
 _SHARE = 0.75
+
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
+
 _PROCESS = GIB // 2
+
 # A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
 _SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
 

@@ -14,9 +14,7 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
+from usdbrdf.model.arrays import Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,17 +20,18 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
+from usdbrdf.model.arrays import Float, Int
 from usdbrdf.texturing.passes import by_parts
-
-Float = npt.NDArray[np.float32]
-Int = npt.NDArray[np.int32]
 
 # Samples that are added at a time.
 _BATCH = 5
+
 # Deviations from which a sample loses weight, and steps of the reweighting.
 _OUTLYING, _STEPS = 2.5, 6
+
 # A sample whose distance from the mean is less than this share of its error says nothing of it.
 _LEFT = 0.05
+
 # Texels whose mean is worked out at a time.
 _AT_A_TIME = 1 << 18
 

@@ -8,14 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from usdbrdf.geometry.texels import Texels
 from usdbrdf.geometry.unwrap import MAX_SIDE
 from usdbrdf.kernel import parallel_kernel
-
-Float = npt.NDArray[np.float32]
-Double = npt.NDArray[np.float64]
-Int = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.texels import Texels
 
 # Texels to a side of a patch.
 _SIDE = 8

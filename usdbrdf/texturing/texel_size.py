@@ -7,15 +7,17 @@ from decimal import ROUND_CEILING, Context
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.cameras import camera_rays, pixel_centres
-from usdbrdf.geometry.normals import doubled_areas
-from usdbrdf.geometry.rays import RayScene
-from usdbrdf.geometry.scene import Scene
-from usdbrdf.scan.scan import Frames
+from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import doubled_areas
+from usdbrdf.model.scene import Scene
+from usdbrdf.transport.rays import RayScene
 
 _RAYS_PER_FRAME = 600
+
 # An atlas is never full; this share of its area is charts.
 _PACKING = 0.7
+
 _DIGITS = 2
 
 

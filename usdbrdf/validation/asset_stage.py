@@ -11,9 +11,9 @@ from typing import Any
 
 from pxr import Ar, Sdf, Usd, UsdShade
 
-from usdbrdf.stage.asset import ROLES, Asset
-from usdbrdf.stage.named_files import named_files
-from usdbrdf.stage.scopes import Scopes
+from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.delivery.packaged_files import named_files
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from usdbrdf.stage.capture_camera import lens_from_pinhole
+from usdbrdf.asset.layers.capture_camera import lens_from_pinhole
 from usdbrdf.validation.asset_stage import AssetStage, authored
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 
 _TOLERANCE = 1e-3
+
 _UV_TOLERANCE = 1e-4
 
 _EXPOSURE = ("exposure", *(f"exposure:{n}" for n in ("time", "fStop", "iso", "responsivity")))
+
 _LENS = (
     "focalLength",
     "horizontalAperture",
@@ -22,6 +24,7 @@ _LENS = (
     "horizontalApertureOffset",
     "verticalApertureOffset",
 )
+
 _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from pxr import Sdf, Usd
 
+from usdbrdf.asset.header import Provenance, new_layer, read_header
+from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
-from usdbrdf.stage.asset import Asset
-from usdbrdf.stage.header import Provenance, new_layer, read_header
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Finding, Rule, finding_of
 from usdbrdf.validation.rules import RULES

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd
 
-from usdbrdf.stage.frames_from_stage import asset_file
+from usdbrdf.asset.readers.frames import asset_file
 from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Rule, Severity, Site
 
 _UDIM = "<UDIM>"
+
 # A letter before a colon is a drive.
 _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 

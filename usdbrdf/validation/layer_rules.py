@@ -8,9 +8,9 @@ from typing import Any
 
 from pxr import Sdf
 
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.schema import schema_version
 from usdbrdf.job.ownership import edited_files
-from usdbrdf.stage.asset import ROLES, Asset
-from usdbrdf.stage.schema import schema_version
 from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Rule, Severity
 

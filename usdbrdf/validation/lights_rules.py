@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
-from usdbrdf.stage.lights_layer import EMISSIVE, USDLUX, VARIANT_SET
+from usdbrdf.asset.layers.lights_layer import EMISSIVE, USDLUX, VARIANT_SET
 from usdbrdf.validation.asset_stage import AssetStage, authored
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 

@@ -8,21 +8,26 @@ from typing import Any
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from usdbrdf.stage.preview_surface import PreviewLobe, preview_surface_from_fit
+from usdbrdf.asset.layers.preview_surface import PreviewLobe, preview_surface_from_fit
 from usdbrdf.validation.asset_stage import AssetStage, authored
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 
 Types = Sdf.ValueTypeNames
 
 _LINEAR_FORMATS = frozenset({".exr", ".hdr"})
+
 _SCOPES = ("materials", "looks")
+
 _BLACK = Gf.Vec3f(0.0)
+
 # Of numbers that a layer holds as 32-bit floats.
 _TOLERANCE = 1e-4
 
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
+
 _MAPPINGS = (_MEASURED, "matched")
+
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from pxr import Sdf, Usd
 
-from usdbrdf.stage.schema import schema_names
+from usdbrdf.asset.schema import schema_names
 from usdbrdf.validation.asset_stage import AssetStage, authored
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
-from usdbrdf.stage.usd_errors import in_one_line
+from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.validation.rule import Finding, Severity, Site, layer_in_words, site_in_words
 
 OPEN = "usd.Open"
@@ -18,8 +18,10 @@ _BUILT_IN = frozenset(
     ["usdValidation", "usdPhysicsValidators"]
     + [f"usd{name}Validators" for name in ("Geom", "Lux", "Media", "Shade", "Skel", "Utils")]
 )
+
 # Ours tell textures from photographs, and where a missing file is named.
 _REPLACED = frozenset({"usdUtilsValidators:MissingReferenceValidator"})
+
 _SEVERITIES = {
     UsdValidation.ValidationErrorType.Warn: Severity.WARNING,
     UsdValidation.ValidationErrorType.Info: Severity.INFO,

@@ -1,23 +1,55 @@
-"""Our rules as validators of UsdValidation, with their cures as fixers.
-
-USD imports this module by the name in plugInfo.json when somebody first asks for one of the
-validators. It needs usd-core 26.8 or newer, and 26.11 for the fixers: older ones take validators,
-or fixers, from C++ alone.
-"""
+"""Our rules as validators of UsdValidation, with their cures as fixers; and plugInfo.json, from
+which USD knows of them before it loads them."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from pxr import Sdf, Usd, UsdValidation
 
+from usdbrdf.asset.schema import validators_path
+from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Rule, Severity, Site
 from usdbrdf.validation.rules import RULES
-from usdbrdf.validation.usd_plug_info import PLUGIN, SUITE
+
+# USD imports the module of this name, and begins the names of its validators with it.
+PLUGIN = "usdbrdf.validation.usd_plugin"
+
+SUITE = "All"
+
+_KEYWORDS = ["usdBrdf"]
+
+
+def plug_info() -> str:
+    """The file's text."""
+    validators: dict[str, Any] = {
+        rule.name: {"doc": f"{rule.description} {rule.advice}", "keywords": _KEYWORDS}
+        for rule in RULES
+    }
+    validators[SUITE] = {"doc": "All rules of usdbrdf.", "isSuite": True, "keywords": _KEYWORDS}
+    plugin = {
+        "Info": {"Validators": validators},
+        "Name": PLUGIN,
+        "ResourcePath": ".",
+        "Root": ".",
+        "Type": "python",
+    }
+    return json.dumps({"Plugins": [plugin]}, indent=4, sort_keys=True) + "\n"
+
+
+def write_plug_info(folder: Path) -> None:
+    write_text_atomic(folder / "plugInfo.json", plug_info())
+
+
+if __name__ == "__main__":
+    write_plug_info(validators_path())
 
 # The first version that takes fixers from Python.
 _PYTHON_FIXERS = (0, 26, 11)
+
 _TYPES = {
     Severity.ERROR: UsdValidation.ValidationErrorType.Error,
     Severity.WARNING: UsdValidation.ValidationErrorType.Warn,

@@ -13,15 +13,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from usdbrdf.capture.checks import refuse_photographs
+from usdbrdf.capture.findings import Findings, FrameRecord
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.parts import (
+    as_photographs,
+    geometry_from_file,
+    radiance_encoding,
+    scan_from_parts,
+)
+from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import InputRefused
-from usdbrdf.scan.findings import Findings
-from usdbrdf.scan.frame_record import FrameRecord
-from usdbrdf.scan.frame_rules import refuse_photographs
-from usdbrdf.scan.geometry_from_file import geometry_from_file
-from usdbrdf.scan.ingest_options import IngestOptions
-from usdbrdf.scan.paths_in_capture import path_in_capture
-from usdbrdf.scan.scan import Scan
-from usdbrdf.scan.scan_from_parts import as_photographs, radiance_encoding, scan_from_parts
+from usdbrdf.model.capture import Scan
 from usdbrdf_colmap.text_model import Camera, Image, read_cameras, read_images
 
 NAME = "colmap"

@@ -14,9 +14,10 @@ from pxr import Sdf, Usd
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import make_capture
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
-from usdbrdf.scan.adapters import IngestOptions, read_scan
-from usdbrdf.stage.frames_from_stage import frames_from_stage
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,84 @@
+"""Edits made in files that are ours: kept beside edits.usda, never mixed into it."""
+
+import pytest
+from pxr import Sdf, Usd, UsdShade
+
+from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.layout import ROLES
+from usdbrdf.errors import OwnershipConflict
+
+
+def edit(path, change):
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    change(layer)
+    layer.Save()
+    return path
+
+
+def set_roughness(layer):
+    path = "/room/mtl/Stuhl_No_1/PreviewSurface.inputs:roughness"
+    layer.GetAttributeAtPath(path).default = 0.75
+
+
+def test_an_edited_layer_wins_once_the_artist_adds_it(built):
+    path = edit(built.asset.layer("material"), set_roughness)
+    edits_before = built.asset.edits_layer.read_bytes()
+    (adopted,) = adopt(built.asset, [path])
+    assert adopted == built.asset.folder / "adopted-1.usda"
+    assert built.asset.edits_layer.read_bytes() == edits_before
+    assert adopted.read_bytes().startswith(b"#usda")
+
+    built.write_layer("material")
+    edit(built.asset.edits_layer, lambda layer: layer.subLayerPaths.append(f"./{adopted.name}"))
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    stage.Reload()
+    surface = UsdShade.Shader.Get(stage, "/room/mtl/Stuhl_No_1/PreviewSurface")
+    assert surface.GetInput("roughness").Get() == 0.75
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_the_paths_of_an_adopted_layer_lead_to_the_same_files(built, role):
+    (adopted,) = adopt(built.asset, [built.asset.layer(role)])
+    layer = Sdf.Layer.FindOrOpen(str(adopted))
+    assert not [path for path in layer.subLayerPaths if "uv" in path]
+    paths = [p for p in layer.GetExternalReferences() if p] + list(
+        layer.GetCompositionAssetDependencies()
+    )
+    stage = Usd.Stage.Open(layer)
+    assert not stage.GetCompositionErrors()
+    for prim in stage.TraverseAll():
+        for attribute in prim.GetAttributes():
+            value = attribute.Get()
+            if isinstance(value, Sdf.AssetPath) and value.path:
+                assert value.path.startswith(("./", "../capture", "../../capture"))
+                assert value.resolvedPath, value
+    assert not [p for p in paths if p.startswith("/")]
+
+
+def test_an_edited_texture_is_copied_and_the_adopted_layer_points_to_the_copy(built):
+    texture = built.asset.folder / "textures" / "lamp.emission.exr"
+    texture.write_bytes(texture.read_bytes() + b"painted")
+    layer = edit(built.asset.layer("shading"), lambda layer: None)
+    adopted, copy = adopt(built.asset, [texture, layer])
+    assert copy == built.asset.folder / "adopted-1" / "textures" / "lamp.emission.exr"
+    assert copy.read_bytes() == texture.read_bytes()
+    assert adopted == built.asset.folder / "adopted-2.usda"
+    text = adopted.read_text()
+    assert "@./adopted-1/textures/lamp.emission.exr@" in text
+    assert "@./textures/lamp.irradiance.exr@" in text
+
+
+def test_what_was_adopted_before_stays(built):
+    layer = built.asset.layer("material")
+    (first,) = adopt(built.asset, [layer])
+    before = first.read_bytes()
+    (second,) = adopt(built.asset, [layer])
+    assert (first.name, second.name) == ("adopted-1.usda", "adopted-2.usda")
+    assert first.read_bytes() == before
+
+
+def test_a_layer_that_cannot_be_read_is_named(built):
+    built.asset.layer("material").write_text("#usda 1.0\nnonsense {")
+    with pytest.raises(OwnershipConflict, match=r"material\.usda.+\[ownership\.unreadable\]"):
+        adopt(built.asset, [built.asset.layer("material")])
+    assert not list(built.asset.folder.glob("adopted*"))

@@ -1,0 +1,201 @@
+"""The variant set ``lights``: the same light from surfaces or from UsdLux, never from both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
+
+from usdbrdf.asset.layers.lights_layer import (
+    EMISSIVE,
+    USDLUX,
+    VARIANT_SET,
+    Lamp,
+    write_lights_layer,
+)
+from usdbrdf.asset.readers.render_scene import published
+from usdbrdf.files.images import write_exr
+from usdbrdf.shading.lamp_shapes import LampShape
+from usdbrdf.validation.validate import validate
+
+RADIANCE = np.array([8.0, 4.0, 2.0])
+TIME = Usd.TimeCode.EarliestTime()
+
+
+@pytest.fixture(params=[(1.0, "Z"), (0.01, "Y")], ids=["metres", "centimetres"])
+def lit(tmp_path, synthetic, request):
+    """An asset whose lamp shines with the radiance that its lights have."""
+    unit, up_axis = request.param
+    scan = synthetic.make_scan(tmp_path / "capture", unit=unit, up_axis=up_axis)
+    built = synthetic.build(tmp_path / "room", scan)
+    emission = np.tile(np.float32(RADIANCE), (4, 4, 1))
+    write_exr(built.asset.folder / "textures/lamp.emission.exr", emission)
+    return built
+
+
+def opened(built, variant):
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    assert stage.GetDefaultPrim().GetVariantSet(VARIANT_SET).SetVariantSelection(variant)
+    return stage
+
+
+def irradiance_of_triangles(surfaces, point):
+    """On a floor at the point, by the midpoints of many small triangles; no occlusion."""
+    total = np.zeros(3)
+    for surface in surfaces:
+        corners = surface.points[surface.triangles]
+        for _ in range(4):
+            a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            parts = ([a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca])
+            corners = np.concatenate([np.stack(part, axis=1) for part in parts])
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        total += gathered(corners.mean(axis=1), cross, surface.material.emission[0, 0], point)
+    return total
+
+
+def irradiance_of_lights(lights, point):
+    total = np.zeros(3)
+    grid = (np.arange(40) + 0.5) / 20 - 1
+    x, y = (values.ravel() for values in np.meshgrid(grid, grid))
+    for light in lights:
+        assert light.kind == "rectangle"
+        pose = light.world_from_here
+        spots = np.column_stack([x, y, 0 * x, 1 + 0 * x]) @ pose.T
+        normal = np.cross(pose[:3, 0], pose[:3, 1]) * 4 / len(x)
+        total += gathered(spots[:, :3], normal[None], light.emission[0, 0], point)
+    return total
+
+
+def gathered(spots, area_vectors, radiance, point):
+    """Sum of L cos cos' dA / r^2 over spots that face a floor."""
+    away = spots - point
+    distance = np.linalg.norm(away, axis=1)
+    facing = np.maximum(-(away * area_vectors).sum(axis=1) / distance, 0)
+    cosine = np.maximum(away[:, 2] / distance, 0)
+    return (facing * cosine / distance**2).sum() * radiance
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, 1.2), (1.5, -1.0, 0.0)])
+def test_both_variants_light_the_floor_alike(lit, point):
+    glowing = published(opened(lit, EMISSIVE), TIME, pytest.fail)
+    assert not glowing.lights
+    emitters = [s for s in glowing.surfaces if s.material.emits]
+    assert len(emitters) == 1
+    expected = irradiance_of_triangles(emitters, np.array(point))
+    assert expected.min() > 0.01
+
+    replaced = published(opened(lit, USDLUX), TIME, pytest.fail)
+    assert not any(s.material.emits for s in replaced.surfaces)
+    found = irradiance_of_lights(replaced.lights, np.array(point))
+    assert found == pytest.approx(expected, rel=0.02)
+
+
+def test_glowing_surfaces_are_the_default(built):
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    variants = stage.GetDefaultPrim().GetVariantSet(VARIANT_SET)
+    assert variants.GetVariantNames() == [EMISSIVE, USDLUX]
+    assert variants.GetVariantSelection() == EMISSIVE
+    assert not [prim for prim in stage.TraverseAll() if prim.HasAPI(UsdLux.LightAPI)]
+
+
+def test_radiance_is_intensity_times_exposure_times_colour(built):
+    stage = opened(built, USDLUX)
+    lights = [UsdLux.LightAPI(p) for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI)]
+    assert len(lights) == 6
+    for light in lights:
+        assert str(light.GetPath()).startswith("/room/lights/lamp/")
+        assert light.GetNormalizeAttr().Get() is False
+        scale = light.GetIntensityAttr().Get() * 2 ** light.GetExposureAttr().Get()
+        assert np.array(light.GetColorAttr().Get()) * scale == pytest.approx(RADIANCE)
+
+
+@pytest.mark.parametrize("look", ["lit", "irradiance", "shaded"])
+def test_the_looks_switch_in_either_variant(built, look):
+    for variant in (EMISSIVE, USDLUX):
+        stage = opened(built, variant)
+        stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection(look)
+        (chair,) = (
+            stage.GetPrimAtPath("/room/geo/Stuhl_No_1")
+            .GetRelationship("material:binding")
+            .GetTargets()
+        )
+        expected = "/room/mtl" if look == "shaded" else f"/room/looks/{look}"
+        assert chair == f"{expected}/Stuhl_No_1"
+        # A map of the lamp is a map still: only the lamp's own material is switched off.
+        emits = [
+            s.name for s in published(stage, TIME, lambda _: None).surfaces if s.material.emits
+        ]
+        assert ("/room/geo/lamp" in emits) == (look != "shaded" or variant == EMISSIVE)
+
+
+def test_a_muted_layer_leaves_the_lamps_on(built):
+    stage = opened(built, USDLUX)
+    layers = [layer for layer in stage.GetLayerStack() if layer.GetDisplayName() == "lights.usda"]
+    stage.MuteLayer(layers[0].identifier)
+    found = published(stage, TIME, pytest.fail)
+    assert not found.lights
+    assert any(surface.material.emits for surface in found.surfaces)
+
+
+def test_both_variants_validate(built):
+    assert [str(found) for found in validate(built.asset.root_layer)] == []
+    edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
+    edits.GetPrimAtPath("/room").variantSelections[VARIANT_SET] = USDLUX
+    edits.Save()
+    assert [str(found) for found in validate(built.asset.root_layer)] == []
+
+
+def test_a_ball_is_hidden_inside_its_light(built):
+    lamp = ball_lamp(built)
+    common = (built.asset, built.header, built.provenance("shading"))
+    write_lights_layer(built.asset.lights_layer, *common, [lamp], np.eye(4))
+    stage = opened(built, USDLUX)
+    (light,) = (p for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI))
+    assert light.GetTypeName() == "SphereLight"
+    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp"))
+    assert imageable.ComputeVisibility() == UsdGeom.Tokens.invisible
+    stage = opened(built, EMISSIVE)
+    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp"))
+    assert imageable.ComputeVisibility() == UsdGeom.Tokens.inherited
+
+
+def test_an_asset_whose_scan_knew_no_lights_gets_a_name_that_no_input_has(built):
+    scan = Sdf.Layer.FindOrOpen(str(built.asset.layer("scan")))
+    data = scan.customLayerData
+    del data["usdbrdf"]["scopes"]["lights"]
+    scan.customLayerData = data
+    scan.Save()
+    built.write_lights()
+    stage = opened(built, USDLUX)
+    found = [str(p.GetPath()) for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI)]
+    assert found
+    assert all(path.startswith("/room/usdbrdf_lights/") for path in found)
+
+
+def test_lights_stand_in_the_world_whatever_the_root_does(built):
+    root = np.array([[0, -2.0, 0, 1], [2.0, 0, 0, 2], [0, 0, 2.0, 3], [0, 0, 0, 1]])
+    edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
+    prim = edits.GetPrimAtPath("/room")
+    types = Sdf.ValueTypeNames
+    op = Sdf.AttributeSpec(prim, "xformOp:transform", types.Matrix4d)
+    op.default = Gf.Matrix4d(root.T.tolist())
+    order = Sdf.AttributeSpec(prim, "xformOpOrder", types.TokenArray, Sdf.VariabilityUniform)
+    order.default = ["xformOp:transform"]
+    edits.Save()
+    common = (built.asset, built.header, built.provenance("shading"))
+    write_lights_layer(built.asset.lights_layer, *common, [ball_lamp(built)], root)
+    (light,) = published(opened(built, USDLUX), TIME, pytest.fail).lights
+    assert light.world_from_here[:3, 3] == pytest.approx([1.0, 2.0, 2.5])
+    scale = abs(np.linalg.det(light.world_from_here[:3, :3])) ** (1 / 3)
+    assert scale == pytest.approx(0.2)
+
+
+def ball_lamp(built):
+    pose = np.eye(4)
+    pose[:3, 3] = 1.0, 2.0, 2.5
+    shape = LampShape(
+        kind="sphere", size=(0.4, 0.4), world_from_light=pose, radiance=tuple(RADIANCE)
+    )
+    return Lamp(prim_path=built.prims[2], identifier="lamp", shapes=(shape,))

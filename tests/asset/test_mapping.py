@@ -1,0 +1,139 @@
+"""What UsdPreviewSurface and MaterialX are told of phi and psi, and that readers undo it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf
+
+from usdbrdf.asset.layers.preview_surface import fit_from_preview_surface, preview_surface_from_fit
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.render_scene import published_file
+from usdbrdf.transport.renderer_match import shown_lobe
+
+CHAIR, LAMP = 0, 2
+
+
+def write(built, mapping, **changes):
+    built.fitted = tuple(replace(item, mapping=mapping, **changes) for item in built.fitted)
+    built.write_layer("material")
+
+
+def surfaces(built, overriding=None):
+    """Materials as rendered, by object; ``overriding``: an artist's opinions on the chair's."""
+    layer = Sdf.Layer.CreateNew(str(built.asset.folder / f"shot{id(overriding)}.usda"))
+    layer.subLayerPaths = [f"./{built.asset.root_layer.name}"]
+    material = f"/{built.asset.name}/mtl/{built.fitted[CHAIR].identifier}"
+    for name, value in (overriding or {}).items():
+        prim = Sdf.CreatePrimInLayer(layer, f"{material}/PreviewSurface")
+        Sdf.AttributeSpec(prim, f"inputs:{name}", Sdf.ValueTypeNames.Float).default = value
+    layer.Save()
+    found = published_file(Path(layer.realPath), lambda text: None).surfaces
+    return {surface.name.split("/")[-1]: surface.material for surface in found}
+
+
+def test_untouched_the_asset_is_the_same_under_both_mappings(built):
+    write(built, "measured")
+    measured = surfaces(built)
+    write(built, "matched")
+    matched = surfaces(built)
+    for name, one in measured.items():
+        for field in ("diffuse", "f0", "roughness", "emission"):
+            np.testing.assert_allclose(
+                getattr(matched[name], field), getattr(one, field), rtol=1e-5, err_msg=name
+            )
+    layer = Sdf.Layer.OpenAsAnonymous(str(built.asset.layer("material")))
+    material = f"/{built.asset.name}/mtl/{built.fitted[CHAIR].identifier}"
+    assert layer.GetAttributeAtPath(
+        f"{material}/PreviewSurface.inputs:ior"
+    ).default != pytest.approx(1.5, abs=0.01)
+
+
+def test_an_artists_opinion_counts(built):
+    write(built, "matched")
+    chair = built.fitted[CHAIR].identifier
+    ours, theirs = surfaces(built), surfaces(built, {"roughness": 0.8, "ior": 1.7})
+    # What they see in a renderer, as the fitted lobe shows it.
+    assert theirs[chair].roughness == pytest.approx(0.8)
+    shown = ((1.7 - 1) / (1.7 + 1)) ** 2
+    psi = float(theirs[chair].f0.flat[0]) / 0.08
+    assert float(shown_lobe(0.64, psi).f0) == pytest.approx(shown, rel=1e-4)
+    assert psi > float(ours[chair].f0.flat[0]) / 0.08
+    # A metal is none of ours: it stays what it is.
+    metal = surfaces(built, {"metallic": 1.0})[chair]
+    assert metal.metallic is not None
+    factor = preview_surface_from_fit(0.25, 0.5, "matched").diffuse
+    assert metal.base == pytest.approx(0.25 * factor, rel=1e-3)
+
+
+def test_the_mapping_is_recorded_where_there_is_a_lobe(built):
+    write(built, "matched")
+    stage = open_measured(built.asset)
+    assert [read_fit(stage, prim).mapping for prim in built.prims] == [
+        "matched", "measured", "matched"
+    ]  # fmt: skip
+    assert (
+        not stage.GetPrimAtPath(built.prims[1])
+        .GetAttribute("usdBrdf:fit:mapping")
+        .HasAuthoredValue()
+    )
+
+
+def test_the_factor_is_on_the_colour_that_is_shown(built):
+    root = f"/{built.asset.name}/mtl"
+    chair, wall, lamp = (item.identifier for item in built.fitted)
+    write(built, "matched")
+    factor = preview_surface_from_fit(0.25, 0.5, "matched").diffuse
+    scale = Sdf.ValueTypeNames.Float4.type.pythonClass(factor, factor, factor, 1)
+    layer = Sdf.Layer.OpenAsAnonymous(str(built.asset.layer("material")))
+    assert (
+        layer.GetAttributeAtPath(f"{root}/{chair}/BaseColorTexture.inputs:scale").default == scale
+    )
+    assert not layer.GetAttributeAtPath(f"{root}/{wall}/BaseColorTexture.inputs:scale")
+    # A lamp has no colour that could be scaled; no stray prims for it.
+    assert not layer.GetPrimAtPath(f"{root}/{lamp}/AlbedoTexture")
+    # Methods that refine no colour leave the albedo to be scaled.
+    write(built, "matched", aovs=())
+    layer = Sdf.Layer.OpenAsAnonymous(str(built.asset.layer("material")))
+    assert layer.GetAttributeAtPath(f"{root}/{chair}/AlbedoTexture.inputs:scale").default == scale
+    write(built, "measured", aovs=())
+    assert "inputs:scale" not in built.asset.layer("material").read_text().split('"looks"')[0]
+
+
+@pytest.mark.parametrize("mapping", ["measured", "matched"])
+def test_the_inverse_of_what_is_written(mapping):
+    for phi, psi in ((0.001, 0.0), (0.05, 0.3), (0.64, 1.0)):
+        shown = preview_surface_from_fit(phi, psi, mapping)
+        fitted = fit_from_preview_surface(shown.roughness, shown.ior, mapping)
+        literal = preview_surface_from_fit(phi, psi)
+        assert fitted.ior == pytest.approx(literal.ior, abs=1e-6)
+        assert fitted.diffuse == pytest.approx(shown.diffuse)
+
+
+def test_materialx_is_told_the_same(built):
+    from usdbrdf.asset.layers.material_layer import write_material_layer
+
+    built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
+    common = (built.asset, built.header, built.provenance("material"))
+    write_material_layer(
+        built.asset.layer("material"), *common, built.fitted, materialx=built.asset.materialx_layer
+    )
+    stage = open_measured(built.asset)
+    root = f"/{built.asset.name}/mtl"
+    chair, wall, lamp = (item.identifier for item in built.fitted)
+    shown = preview_surface_from_fit(0.25, 0.5, "matched")
+    network = stage.GetPrimAtPath(f"{root}/{chair}/OpenPBR")
+    assert network.GetAttribute("inputs:specular_ior").Get() == pytest.approx(shown.ior)
+    assert network.GetAttribute("inputs:specular_roughness").Get() == pytest.approx(0.5)
+    factor = stage.GetPrimAtPath(f"{root}/{chair}/MtlxScaled").GetAttribute("inputs:in2").Get()
+    assert factor == pytest.approx(shown.diffuse)
+    file = stage.GetPrimAtPath(f"{root}/{chair}/MtlxBaseColor").GetAttribute("inputs:file").Get()
+    assert file.path == f"../textures/{chair}.base_color.exr"
+    assert file.resolvedPath
+    # What glows, and what has no lobe, keeps its UsdPreviewSurface alone.
+    for name in (wall, lamp):
+        assert not stage.GetPrimAtPath(f"{root}/{name}/OpenPBR")
+    built.write_layer("material")
+    assert not open_measured(built.asset).GetPrimAtPath(f"{root}/{chair}/OpenPBR")

@@ -1,0 +1,180 @@
+"""The codeless schemas: generated from their source, found, documented, and missed politely."""
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pxr import Plug, Sdf, Usd
+
+from usdbrdf.asset import schema
+from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.schema import plugin_path, register, schema_names, schema_version, verify
+from usdbrdf.errors import UsdBrdfError
+
+SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
+UNITS = (
+    "metres|seconds|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
+    "units of the pixel values|[Nn]umber of|Loss of the fit"
+)
+NAMES = ("Object", "Capture", "Aov", "Texturing", "Shading", "MaterialFit", "Emitter")
+
+
+def run_python(code, *arguments, **environment):
+    """Standard output of a fresh interpreter, where no schema registry has been built yet."""
+    root = str(SCHEMAS.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, "PYTHONPATH": root, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_generated_files_are_those_of_the_source(tmp_path):
+    pytest.importorskip("jinja2", reason="usdGenSchema needs jinja2")
+    if Usd.GetVersion() < (0, 26, 8):
+        pytest.skip("usd-core brings what usdGenSchema needs from version 26.8 on")
+    spec = importlib.util.spec_from_file_location("generate", SCHEMAS / "generate.py")
+    generate = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generate)
+    generate.generate(tmp_path)
+    for name in ("generatedSchema.usda", "plugInfo.json"):
+        assert (tmp_path / name).read_text() == (SCHEMAS / name).read_text(), (
+            f"{name} is stale: run schemas/generate.py"
+        )
+
+
+def test_plug_info_is_plain_json_without_placeholders():
+    text = (SCHEMAS / "plugInfo.json").read_text()
+    (plugin,) = json.loads(text)["Plugins"]
+    assert plugin["Type"] == "resource"
+    assert set(plugin["Info"]["Types"]) == {f"UsdBrdf{name}API" for name in NAMES}
+    assert "@" not in text
+
+
+def test_plugin_path_holds_the_plug_info():
+    assert (plugin_path() / "plugInfo.json").is_file()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_attribute_is_known_and_documented(name):
+    register()
+    verify()
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(f"UsdBrdf{name}API")
+    properties = definition.GetPropertyNames()
+    assert properties
+    source = Sdf.Layer.FindOrOpen(str(SCHEMAS / "schema.usda"))
+    for attribute in properties:
+        documentation = definition.GetPropertyDocumentation(attribute)
+        assert len(documentation) > 30, attribute
+        spec = source.GetAttributeAtPath(
+            f"/UsdBrdf{name}API.{attribute.removeprefix('usdBrdf:aov:__INSTANCE_NAME__:')}"
+        )
+        kind = str(spec.typeName)
+        if kind.startswith(("float", "double", "int", "color")):
+            assert re.search(UNITS, spec.documentation), f"{attribute} has no unit"
+        assert (spec.default is not None) or kind == "asset", f"{attribute} has no fallback"
+        if spec.HasInfo("allowedTokens"):
+            assert spec.default in spec.GetInfo("allowedTokens")
+            for token in spec.GetInfo("allowedTokens"):
+                assert token in spec.documentation, f"{attribute}: {token} is not explained"
+
+
+def test_what_is_declared_is_authored_and_the_reverse(built):
+    """Names, types and variability. The lamp of the small asset is an estimated one."""
+    verify()
+    declared, authored = {}, {}
+    for name in schema_names():
+        definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(name)
+        for attribute in definition.GetPropertyNames():
+            spec = definition.GetSchemaAttributeSpec(attribute)
+            declared[attribute] = (str(spec.typeName), spec.variability)
+
+    def visit(path):
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.AttributeSpec) and spec.name.startswith("usdBrdf:"):
+            instance = re.sub(r"^usdBrdf:aov:\w+:", "usdBrdf:aov:__INSTANCE_NAME__:", spec.name)
+            authored[instance] = (str(spec.typeName), spec.variability)
+
+    for file in (built.asset.folder / "layers").iterdir():
+        layer = Sdf.Layer.FindOrOpen(str(file))
+        layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    assert authored == declared
+
+
+def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
+    register()
+    source = Sdf.Layer.FindOrOpen(str(SCHEMAS / "schema.usda"))
+    version = source.customLayerData["usdBrdf"]["schemaVersion"]
+    assert schema_version() == version
+    plugin = Plug.Registry().GetPluginWithName("usdBrdf")
+    assert plugin.metadata["UsdBrdf"]["schemaVersion"] == version
+    layers = [*(built.asset.folder / "layers").iterdir(), *built.asset.folder.glob("*.usda")]
+    assert len(layers) >= 7
+    for layer in layers:
+        assert read_provenance(layer)["schemaVersion"] == version, layer
+
+
+def test_schemas_of_another_version_are_refused_before_the_first_write(monkeypatch):
+    register()
+    monkeypatch.setattr(schema, "schema_version", lambda: 99)
+    with pytest.raises(UsdBrdfError, match=r"version 1.*99.*\[schema\.version\]"):
+        verify()
+
+
+READ = """
+import json, sys
+from pxr import Usd
+stage = Usd.Stage.Open(sys.argv[1])
+assert not stage.GetCompositionErrors()
+prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1")
+phi = prim.GetAttribute("usdBrdf:fit:phi")
+print(json.dumps({
+    "phi": phi.Get(),
+    "known": prim.HasAPI("UsdBrdfMaterialFitAPI"),
+    "documented": "Roughness parameter" in phi.GetDocumentation(),
+    "applied": "UsdBrdfMaterialFitAPI" in prim.GetMetadata("apiSchemas").GetAddedOrExplicitItems(),
+    "imported": "usdbrdf" in sys.modules,
+}))
+"""
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_an_application_reads_the_asset_with_and_without_the_schemas(built, known):
+    path = str(plugin_path()) if known else ""
+    found = json.loads(run_python(READ, str(built.asset.root_layer), PXR_PLUGINPATH_NAME=path))
+    assert found == {
+        "phi": 0.25, "known": known, "documented": known, "applied": True, "imported": False,
+    }  # fmt: skip
+
+
+def test_importing_the_package_makes_the_schemas_known():
+    code = "import usdbrdf.asset.schema as s; s.verify(); print('known')"
+    assert run_python(code, PXR_PLUGINPATH_NAME="") == "known"
+
+
+def test_a_late_import_is_explained_at_the_first_write():
+    code = (
+        "from pxr import Usd; Usd.SchemaRegistry()\n"
+        "import usdbrdf.asset.schema as s\n"
+        "try: s.verify()\n"
+        "except s.UsdBrdfError as error: print(error)"
+    )
+    message = run_python(code, PXR_PLUGINPATH_NAME="")
+    assert "before any stage is opened" in message
+    assert str(plugin_path()) in message
+
+
+def test_a_late_import_is_fine_with_the_environment_variable():
+    code = (
+        "from pxr import Usd; Usd.SchemaRegistry()\n"
+        "import usdbrdf.asset.schema as s; s.verify(); print('known')"
+    )
+    assert run_python(code, PXR_PLUGINPATH_NAME=str(plugin_path())) == "known"

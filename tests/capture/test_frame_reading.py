@@ -1,0 +1,117 @@
+"""Pixels become radiance, and each says whether it may be believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from usdbrdf.capture.findings import FrameRecord, frames_from_records
+from usdbrdf.files.frames import (
+    PHOTOGRAPH_NOISE_FLOOR,
+    PHOTOGRAPH_SATURATION,
+    photograph_limits,
+    radiance_scale,
+    read_frame,
+)
+from usdbrdf.model.capture import Frames
+
+
+def _write(path: Path, pixels: np.ndarray, kind: str) -> None:
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, kind)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(np.ascontiguousarray(pixels))
+    assert output.close()
+
+
+def _frames(path: Path, encoding: str = "lin_rec709_scene", **limits: float) -> Frames:
+    record = FrameRecord(
+        name=path.name,
+        image_path=path,
+        world_from_camera=np.eye(4),
+        intrinsics=(1, 1, 1, 1),
+        resolution=(4, 2),
+        **limits,
+    )
+    return frames_from_records([record], encoding=encoding, radiometric=True)
+
+
+def test_a_channel_that_half_floats_round_below_saturation_is_clipped(tmp_path):
+    pixels = np.full((2, 4, 3), 1.0, np.float32)
+    pixels[0, 0, 1] = 3.2  # stored as 3.19922
+    pixels[0, 1, 2] = 3.19
+    _write(tmp_path / "a.exr", pixels, "half")
+    frame = read_frame(_frames(tmp_path / "a.exr", saturation_radiance=3.2), 0)
+    assert frame.radiance[0, 0, 1] < 3.2
+    assert frame.clipped.sum() == 1
+    assert frame.clipped[0, 0]
+    assert frame.valid.sum() == 7
+
+
+def test_every_channel_must_rise_above_the_noise_floor(tmp_path):
+    pixels = np.full((2, 4, 3), 1.0, np.float32)
+    pixels[1, 2] = (1, 1, 0.01)
+    _write(tmp_path / "a.exr", pixels, "float")
+    frame = read_frame(_frames(tmp_path / "a.exr", noise_floor_radiance=0.02), 0)
+    assert frame.dark.sum() == 1
+    assert not frame.valid[1, 2]
+
+
+def test_nan_infinity_and_negative_light_are_unknown_not_black(tmp_path):
+    pixels = np.full((2, 4, 3), 1.0, np.float32)
+    pixels[0, 0, 0] = np.nan
+    pixels[0, 1, 1] = np.inf
+    pixels[0, 2, 2] = -0.5
+    pixels[0, 3, 0] = -1e-4
+    _write(tmp_path / "a.exr", pixels, "float")
+    frame = read_frame(_frames(tmp_path / "a.exr", saturation_radiance=10), 0)
+    assert frame.unknown.tolist() == [[True, True, True, False], [False] * 4]
+    assert np.isnan(frame.radiance[0, :3]).all()
+    assert frame.radiance[0, 3].tolist() == [0, 1, 1]
+    assert frame.num_clamped == 1
+    assert not frame.clipped.any()
+    assert frame.valid.sum() == 5
+
+
+def test_limits_belong_to_the_recorded_channels_not_to_rec709(tmp_path):
+    pixels = np.full((2, 4, 3), (1.0, 0.0, 0.0), np.float32)  # AP1 red leaves Rec.709
+    _write(tmp_path / "a.exr", pixels, "float")
+    frame = read_frame(_frames(tmp_path / "a.exr", "lin_ap1_scene", saturation_radiance=1.2), 0)
+    assert frame.radiance[0, 0, 0] > 1.2
+    assert frame.radiance[0, 0, 1] < 0
+    assert frame.valid.all()
+
+
+def test_photographs_are_linearised_and_brought_to_one_exposure(tmp_path):
+    codes = np.full((2, 4, 3), 128, np.uint8)
+    codes[0, 0] = 252
+    codes[0, 1] = 2
+    _write(tmp_path / "a.png", codes, "uint8")
+    saturation, floor = photograph_limits(np.array([0.01, 0.02, 0.04]))
+    linear = ((128 / 255 + 0.055) / 1.055) ** 2.4
+    for exposure in range(3):
+        frames = _frames(
+            tmp_path / "a.png",
+            "srgb_rec709_scene",
+            saturation_radiance=saturation[exposure],
+            noise_floor_radiance=floor[exposure],
+        )
+        scale = 0.02 / (0.01, 0.02, 0.04)[exposure]
+        assert radiance_scale(frames)[0] == pytest.approx(scale)
+        frame = read_frame(frames, 0)
+        np.testing.assert_allclose(frame.radiance[1], linear * scale, rtol=1e-5)
+        assert frame.clipped.sum() == frame.dark.sum() == 1
+        assert frame.valid.sum() == 6
+
+
+def test_radiance_scale_of_linear_images_is_one(tmp_path):
+    frames = _frames(tmp_path / "never_opened.exr", saturation_radiance=3.0)
+    assert radiance_scale(frames).tolist() == [1.0]
+
+
+def test_photograph_limits_are_linear_values():
+    assert pytest.approx(0.9560, abs=1e-4) == PHOTOGRAPH_SATURATION
+    assert pytest.approx(3 / 255 / 12.92) == PHOTOGRAPH_NOISE_FLOOR

@@ -1,0 +1,244 @@
+"""A capture whose geometry is USD, with materials and habits of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+
+from tests.scenes import edited, make_capture
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.untrusted import usd_meshes as foreign
+from usdbrdf.untrusted.usd_meshes import meshes_from_usd
+
+
+def _mesh(stage, path, points, counts, indices, **attributes):
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr([Gf.Vec3f(*map(float, p)) for p in points])
+    mesh.CreateFaceVertexCountsAttr(list(map(int, counts)))
+    mesh.CreateFaceVertexIndicesAttr(list(map(int, indices)))
+    mesh.CreateSubdivisionSchemeAttr(attributes.get("scheme", "none"))
+    return mesh
+
+
+def _stage(path, **metadata):
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, metadata.get("up_axis", "Z"))
+    UsdGeom.SetStageMetersPerUnit(stage, metadata.get("meters_per_unit", 1.0))
+    root = UsdGeom.Xform.Define(stage, "/scan")
+    stage.SetDefaultPrim(root.GetPrim())
+    return stage
+
+
+@pytest.fixture
+def without_child(monkeypatch):
+    """A new interpreter takes a second; what is read does not depend on where."""
+
+    def call(function, arrays, parameters, timeout_s, label, *, memory_limit_bytes):
+        return foreign.read_in_child(arrays, parameters)
+
+    monkeypatch.setattr(foreign, "run_child", call)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """The usual room, its mesh as USD: an Xform per object, bound to materials of its own."""
+    made = make_capture(tmp_path / "room")
+    (made.folder / "mesh.ply").unlink()
+    (made.folder / "objects.json").unlink()
+    stage = _stage(made.folder / "room.usda")
+    red = UsdShade.Material.Define(stage, "/scan/Looks/red")
+    for i, name in enumerate(made.names):
+        own = made.triangles[made.face_object == i]
+        group = UsdGeom.Xform.Define(stage, f"/scan/{name}")
+        group.AddTranslateOp().Set(Gf.Vec3d(0, 0, i))
+        lowered = made.points - np.float32([0, 0, i])
+        mesh = _mesh(stage, f"/scan/{name}/surface", lowered, [3] * len(own), own.ravel())
+        mesh.GetPrim().SetDisplayName(f"the {name}")
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(
+            red, UsdShade.Tokens.strongerThanDescendants
+        )
+    stage.Save()
+    with edited(made.manifest) as document:
+        document["mesh"] = "room.usda"
+    return made
+
+
+def test_geometry_stays_in_its_file_and_meshes_are_objects(capture):
+    before = (capture.folder / "room.usda").read_bytes()
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.usd_geometry == capture.folder / "room.usda"
+    assert scan.object_prims == tuple(f"{name}/surface" for name in capture.names)
+    assert [o.label for o in scan.objects] == [f"the {name}" for name in capture.names]
+    assert [o.identifier for o in scan.objects] == [f"the_{name}" for name in capture.names]
+    assert len(scan.mesh.triangles) == len(capture.triangles)
+    corner = scan.mesh.points[scan.mesh.triangles].reshape(-1, 3)
+    np.testing.assert_allclose(corner.min(axis=0), [0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(corner.max(axis=0), [4, 3, 2.5], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(scan.mesh.corner_normals, axis=2), 1, atol=1e-6)
+    assert scan.counts["rays_hit_percent"] == 100
+    assert (capture.folder / "room.usda").read_bytes() == before
+
+
+def test_referenced_geometry_is_not_reduced(capture):
+    with pytest.raises(UsageError, match=r"--decimate .* \[usage.option\]"):
+        read_scan(capture.folder, IngestOptions(decimate=10))
+
+
+@pytest.mark.usefixtures("without_child")
+def test_units_axis_and_options(tmp_path):
+    stage = _stage(tmp_path / "a.usdc", up_axis="Y", meters_per_unit=0.01)
+    _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+    stage.Save()
+    found = meshes_from_usd(tmp_path / "a.usdc")
+    assert (found.up_axis, found.meters_per_unit) == ("Y", 0.01)
+    assert (found.labels, found.object_prims, found.warnings) == (("m",), ("m",), ())
+
+
+@pytest.mark.usefixtures("without_child")
+def test_polygons_normals_and_handedness(tmp_path):
+    square = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    stage = _stage(tmp_path / "a.usda")
+    _mesh(stage, "/scan/plain", square, [4], range(4))
+    left = _mesh(stage, "/scan/left", square, [4], range(4))
+    left.CreateOrientationAttr("leftHanded")
+    mirrored = _mesh(stage, "/scan/mirrored", square, [4], range(4))
+    mirrored.AddScaleOp().Set(Gf.Vec3f(2, 1, -1))
+    shaded = _mesh(stage, "/scan/shaded", square, [4], range(4))
+    shaded.AddScaleOp().Set(Gf.Vec3f(1, 1, 0.5))
+    tilted = np.array([(1, 0, 1)] * 3 + [(0, 0, 1)], float)
+    shaded.CreateNormalsAttr([Gf.Vec3f(*n) for n in tilted])
+    shaded.SetNormalsInterpolation("faceVarying")
+    wrong = _mesh(stage, "/scan/wrong", square, [4], range(4))
+    wrong.CreateNormalsAttr([Gf.Vec3f(1, 0, 0)] * 3)
+    stage.Save()
+    mesh = meshes_from_usd(tmp_path / "a.usda").mesh
+    normals = mesh.corner_normals.reshape(5, 2, 3, 3)  # object, triangle, corner
+    np.testing.assert_allclose(normals[0], np.broadcast_to([0, 0, 1], (2, 3, 3)), atol=1e-6)
+    np.testing.assert_allclose(normals[1], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-6)
+    np.testing.assert_allclose(normals[2], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-6)
+    steep = np.array([1, 0, 2]) / np.sqrt(5)
+    np.testing.assert_allclose(normals[3, 0], [steep] * 3, atol=1e-6)
+    np.testing.assert_allclose(normals[3, 1], [steep, steep, [0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(normals[4], np.broadcast_to([0, 0, 1], (2, 3, 3)), atol=1e-6)
+    # The winding agrees with the normals, whatever the handedness.
+    p = mesh.points[mesh.triangles].astype(float)
+    facing = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    assert ((facing[:, None] * mesh.corner_normals).sum(axis=2) > 0).all()
+
+
+@pytest.mark.usefixtures("without_child")
+def test_instances_are_objects_one_by_one(tmp_path):
+    stage = _stage(tmp_path / "a.usda")
+    stage.CreateClassPrim("/chair")
+    _mesh(stage, "/chair/seat", np.eye(3), [3], [0, 1, 2])
+    for i in range(2):
+        chair = UsdGeom.Xform.Define(stage, f"/scan/chair_{i}")
+        chair.AddTranslateOp().Set(Gf.Vec3d(5 * i, 0, 0))
+        chair.GetPrim().GetReferences().AddInternalReference("/chair")
+        chair.GetPrim().SetInstanceable(True)
+    stage.Save()
+    found = meshes_from_usd(tmp_path / "a.usda")
+    assert found.object_prims == ("chair_0/seat", "chair_1/seat")
+    assert found.mesh.points[:, 0].tolist() == [1, 0, 0, 6, 5, 5]
+
+
+@pytest.mark.usefixtures("without_child")
+def test_what_is_left_out_is_said(tmp_path):
+    stage = _stage(tmp_path / "a.usda")
+    _mesh(stage, "/scan/cage", np.eye(3), [3], [0, 1, 2], scheme="catmullClark")
+    UsdGeom.Cube.Define(stage, "/scan/cube")
+    hidden = _mesh(stage, "/scan/hidden", np.eye(3), [3], [0, 1, 2])
+    hidden.MakeInvisible()
+    guide = _mesh(stage, "/scan/guide", np.eye(3), [3], [0, 1, 2])
+    guide.CreatePurposeAttr("guide")
+    _mesh(stage, "/elsewhere", np.eye(3), [3], [0, 1, 2])
+    stage.Save()
+    found = meshes_from_usd(tmp_path / "a.usda")
+    assert found.object_prims == ("cage",)
+    text = "\n".join(found.warnings)
+    assert "</scan/cube> (Cube)" in text
+    assert "1 meshes are subdivision cages" in text
+    assert "2 invisible or guide prims" in text
+
+
+def _no_default(stage):
+    _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+    stage.GetRootLayer().ClearDefaultPrim()
+
+
+def _instancer(stage):
+    UsdGeom.PointInstancer.Define(stage, "/scan/copies")
+
+
+def _bad(points, counts, indices):
+    return lambda stage: _mesh(stage, "/scan/m", points, counts, indices)
+
+
+def _asset(path):
+    def author(stage):
+        _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+        shader = UsdShade.Shader.Define(stage, "/scan/Looks/texture")
+        shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(path))
+
+    return author
+
+
+def _missing_layer(stage):
+    stage.GetDefaultPrim().GetReferences().AddReference("./missing.usda")
+
+
+_NAN = [(np.nan, 0, 0), (1, 0, 0), (0, 1, 0)]
+
+
+@pytest.mark.usefixtures("without_child")
+@pytest.mark.parametrize(
+    ("author", "rule", "words"),
+    [
+        (_no_default, "stage.default_prim", "Set defaultPrim"),
+        (lambda stage: None, "mesh.empty", "no visible mesh below </scan>"),
+        (_instancer, "stage.instancer", "</scan/copies>"),
+        (_bad(_NAN, [3], [0, 1, 2]), "mesh.topology", "</scan/m> has 1 NaN"),
+        (_bad(np.eye(3), [3], [0, 1, 99]), "mesh.topology", "outside its 3 points"),
+        (_bad(np.eye(3), [3], [0, 1, -1]), "mesh.topology", "outside its 3 points"),
+        (_bad(np.eye(3), [4], [0, 1, 2]), "mesh.topology", "3 corners where its faces need 4"),
+        (_bad(np.eye(3), [2], [0, 1]), "mesh.topology", "a face of 2 corners"),
+        (_bad(np.zeros((0, 3)), [], []), "mesh.topology", "is empty"),
+        (_asset("/etc/passwd"), "paths.outside", "'/etc/passwd' is an absolute path"),
+        (_asset("../../secret.png"), "paths.outside", "leads outside"),
+        (_asset("https://example.org/a.png"), "paths.outside", "is a URI"),
+        (_missing_layer, "stage.input", "does not compose"),
+    ],
+)
+def test_unusable_stages_are_refused(tmp_path, author, rule, words):
+    (tmp_path / "capture").mkdir()
+    stage = _stage(tmp_path / "capture" / "a.usda")
+    author(stage)
+    stage.Save()
+    with pytest.raises(InputRefused, match=rf"a\.usda: .*\[{rule}\]$") as refused:
+        meshes_from_usd(tmp_path / "capture" / "a.usda")
+    assert words in str(refused.value)
+
+
+@pytest.mark.usefixtures("without_child")
+def test_a_reference_may_lead_into_the_capture_but_not_beyond(tmp_path):
+    for folder in ("geo", "lib"):
+        (tmp_path / folder).mkdir()
+    library = _stage(tmp_path / "lib" / "chair.usda")
+    _mesh(library, "/scan/seat", np.eye(3), [3], [0, 1, 2])
+    library.Save()
+    stage = _stage(tmp_path / "geo" / "a.usda")
+    stage.GetDefaultPrim().GetReferences().AddReference("../lib/chair.usda")
+    stage.Save()
+    with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
+        meshes_from_usd(tmp_path / "geo" / "a.usda")
+    assert meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,)).labels == ("seat",)
+
+
+@pytest.mark.parametrize("content", [b"", b"#usda 1.0\ndef Xform {{{", b"PXR-USDC" + b"\xff" * 90])
+def test_damaged_files_are_refused(tmp_path, content):
+    (tmp_path / "a.usd").write_bytes(content)
+    with pytest.raises(InputRefused, match=r"a\.usd.*\[(stage|child)\.[a-z_]+\]"):
+        meshes_from_usd(tmp_path / "a.usd")

@@ -1,0 +1,85 @@
+"""Objects from labels, and from connectivity where there are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from usdbrdf.capture.labels import label_table, objects_with_faces, segmentation
+from usdbrdf.errors import InputRefused
+from usdbrdf.untrusted.mesh_files import FileMesh
+
+
+def _squares(sides: list[float], **more) -> FileMesh:
+    """Separate squares, whose triangles share no vertex number, only positions."""
+    points = np.concatenate(
+        [
+            np.array([[0, 0, 0], [s, 0, 0], [s, s, 0], [0, 0, 0], [s, s, 0], [0, s, 0]])
+            + np.array([10.0 * i, 0, 0])
+            for i, s in enumerate(sides)
+        ]
+    )
+    triangles = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
+    return FileMesh(points=points.astype(np.float32), triangles=triangles, label_names={}, **more)
+
+
+def test_connected_parts_come_largest_first_and_the_small_ones_together():
+    split = segmentation(_squares([0.05, 2, 1, 0.05]), None, table_path=None, min_area=0.01)
+    assert [name for name, _ in split.labels] == ["part_001", "part_002", "rest"]
+    assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
+
+
+def test_one_large_part_is_one_object():
+    split = segmentation(_squares([2, 0.05]), None, table_path=None, min_area=0.01)
+    assert split.labels == (("scan", ""),)
+    assert split.face_object.tolist() == [0] * 4
+
+
+def test_ids_may_be_sparse_and_negative(tmp_path):
+    path = tmp_path / "objects.json"
+    path.write_text('{"objects": [{"id": 7, "name": "chair", "class_name": "seat"}, {"id": 9}]}')
+    labels = np.array([900000, 7, -5, 9, -1, 7])
+    mesh = _squares([1, 1, 1], face_label=labels)
+    split = segmentation(mesh, label_table(path), table_path=path, min_area=0.01)
+    assert [split.labels[i] for i in split.face_object] == [
+        ("object_900000", ""),
+        ("chair", "seat"),
+        ("unlabelled", ""),
+        ("object_9", ""),
+        ("unlabelled", ""),
+        ("chair", "seat"),
+    ]
+
+
+def test_labels_of_the_document_count_the_broken_faces_too(tmp_path):
+    path = tmp_path / "objects.json"
+    path.write_text('{"objects": [], "face_object_id": [1, 2, 3, 4, 5]}')
+    kept = np.array([True, False, True, True, True])
+    split = segmentation(
+        _squares([1, 1], kept=kept), label_table(path), table_path=path, min_area=0.01
+    )
+    assert [name for name, _ in split.labels] == ["object_1", "object_3", "object_4", "object_5"]
+
+
+def test_too_many_objects_are_no_objects():
+    mesh = _squares([1.0] * 40_000, face_label=np.arange(80_000))
+    with pytest.raises(InputRefused, match=r"80000 different.*65535.*\[objects.limit\]"):
+        segmentation(mesh, None, table_path=None, min_area=0.01)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["3", '{"objects": {}}', '{"objects": [{"id": "a"}]}', '{"objects": [{"id": true}]}',
+     '{"objects": [{"id": 1, "name": 5}]}', '{"objects": [], "face_object_id": [0.5]}'],
+)  # fmt: skip
+def test_documents_of_another_shape_are_refused(tmp_path, text):
+    (tmp_path / "objects.json").write_text(text)
+    with pytest.raises(InputRefused, match=r"objects\.json: .*\[objects\.format\]$"):
+        label_table(tmp_path / "objects.json")
+
+
+def test_objects_without_faces_disappear():
+    labels = (("a", ""), ("b", "x"), ("c", ""))
+    face_object, objects = objects_with_faces(np.array([2, 1, 2], np.int32), labels)
+    assert face_object.tolist() == [1, 0, 1]
+    assert [(o.label, o.class_name) for o in objects] == [("b", "x"), ("c", "")]

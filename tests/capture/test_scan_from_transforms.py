@@ -1,0 +1,168 @@
+"""transforms.json in its dialects."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.scenes import edited, make_capture
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.frames import read_frame
+from usdbrdf.files.images import read_exr, write_preview_png
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return make_capture(tmp_path / "my room", exposure_times=(0.02, 0.08))
+
+
+def test_everything_the_capture_says_arrives(capture):
+    scan = read_scan(capture.folder, IngestOptions())
+    assert (scan.name, scan.adapter, scan.up_axis) == ("my room", "transforms", "Z")
+    assert scan.meters_per_unit == 1.0
+    assert [o.identifier for o in scan.objects] == list(capture.names)
+    assert [o.class_name for o in scan.objects] == list(capture.names)
+    assert scan.mesh.points.tobytes() == capture.points.tobytes()
+    assert scan.mesh.triangles.tobytes() == capture.triangles.tobytes()
+    np.testing.assert_array_equal(scan.mesh.face_object, capture.face_object)
+    frames = scan.frames
+    np.testing.assert_allclose(frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+    np.testing.assert_allclose(frames.intrinsics, np.tile(capture.intrinsics, (12, 1)))
+    assert frames.resolution.tolist() == [[32, 24]] * 12
+    assert frames.exposure_time[:2].tolist() == [0.02, 0.08]
+    assert frames.saturation_radiance[:2].tolist() == [64, 16]
+    assert frames.noise_floor_radiance[:2].tolist() == [0.001, 0.00025]
+    assert (frames.encoding, frames.radiometric) == ("lin_rec709_scene", True)
+    pixels = read_frame(frames, 0)
+    values = {tuple(value) for value in pixels.radiance.reshape(-1, 3).tolist()}
+    assert values <= set(capture.radiance.values())
+    assert pixels.valid.all()
+
+
+def test_the_document_itself_can_be_named(capture):
+    assert len(read_scan(capture.manifest, IngestOptions()).frames) == 12
+
+
+def test_intrinsics_from_the_angle_and_from_the_image_header(capture):
+    with edited(capture.manifest) as document:
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del document[key]
+        document["camera_angle_x"] = 2 * math.atan(0.5 * 32 / 19.2)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.intrinsics[3], capture.intrinsics)
+
+
+def test_intrinsics_of_a_frame_come_before_those_of_all(capture):
+    with edited(capture.manifest) as document:
+        document["frames"][4].update(fl_x=21.0, fl_y=22.0, cx=15.0, cy=11.0)
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.frames.intrinsics[4].tolist() == [21, 22, 15, 11]
+    np.testing.assert_allclose(scan.frames.intrinsics[5], capture.intrinsics)
+
+
+def test_applied_transform_and_scale_are_undone(capture):
+    applied = np.array([[1.0, 0, 0, 0.5], [0, 0, 1, -2], [0, -1, 0, 3], [0, 0, 0, 1]])
+    with edited(capture.manifest) as document:
+        document["applied_transform"] = applied[:3].tolist()
+        document["applied_scale"] = 2.0
+        for frame in document["frames"]:
+            stored = applied @ np.array(frame["transform_matrix"])
+            stored[:3, 3] *= 2
+            frame["transform_matrix"] = stored.tolist()
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-9)
+
+
+def test_almost_rigid_poses_are_snapped_and_the_user_hears_of_it(capture):
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"][0][0] += 2e-4
+    scan = read_scan(capture.folder, IngestOptions())
+    axes = scan.frames.world_from_camera[:, :3, :3]
+    gram = np.einsum("nij,nik->njk", axes, axes)
+    np.testing.assert_allclose(gram, np.tile(np.eye(3), (12, 1, 1)), atol=1e-12)
+    assert any("made rigid" in warning for warning in scan.warnings)
+
+
+def test_opencv_without_distortion_is_a_pinhole(capture):
+    with edited(capture.manifest) as document:
+        document.update(camera_model="OPENCV", k1=0, k2=0.0, p1=0, p2=0)
+    assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
+
+
+def test_options_come_before_the_document(capture, tmp_path):
+    (capture.folder / "mesh.ply").rename(tmp_path / "fused.ply")
+    (capture.folder / "objects.json").rename(tmp_path / "names.json")
+    with edited(tmp_path / "names.json") as document:
+        document["objects"] = document["objects"][:2]
+    options = IngestOptions(
+        mesh=tmp_path / "fused.ply",
+        objects=tmp_path / "names.json",
+        up_axis="Y",
+        meters_per_unit=0.01,
+        encoding="lin_ap1_scene",
+    )
+    scan = read_scan(capture.folder, options)
+    names = [o.identifier for o in scan.objects]
+    assert names == ["floor", "ceiling", "object_2", "object_3", "object_4"]
+    assert (scan.up_axis, scan.meters_per_unit) == ("Y", 0.01)
+    assert scan.frames.encoding == "lin_ap1_scene"
+
+
+def test_photographs_need_a_word_of_consent(capture):
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            image = np.clip(read_exr(capture.image(i)) * 255, 0, 255).astype(np.uint8)
+            frame["file_path"] = f"frames/{i:04d}.png"
+            write_preview_png(capture.folder / frame["file_path"], image)
+    with pytest.raises(InputRefused, match=r"0000\.png: .* --assume-srgb\. \[capture\.ldr\]"):
+        read_scan(capture.folder, IngestOptions())
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert (scan.frames.radiometric, scan.frames.encoding) == (False, "srgb_rec709_scene")
+    assert any("not radiometric" in warning for warning in scan.warnings)
+    with edited(capture.manifest) as document:
+        document["frames"][0]["file_path"] = "frames/0000.exr"
+    with pytest.raises(InputRefused, match="images of one kind"):
+        read_scan(capture.folder, IngestOptions(assume_srgb=True))
+
+
+def test_frames_without_saturation_are_accepted_with_a_warning(capture):
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            del frame["saturation_radiance"], frame["exposure_time"]
+    scan = read_scan(capture.folder, IngestOptions())
+    assert np.isinf(scan.frames.saturation_radiance).all()
+    assert (scan.frames.exposure_time == 1).all()
+    assert any("no saturation_radiance" in warning for warning in scan.warnings)
+
+
+@pytest.mark.parametrize("encoding", ["acescg", "srgb_rec709_scene"])
+def test_an_encoding_that_cannot_be_is_a_usage_error(capture, encoding):
+    with pytest.raises(UsageError, match=rf"--encoding '?{encoding}.*\[usage.option\]"):
+        read_scan(capture.folder, IngestOptions(encoding=encoding))
+
+
+def test_labels_may_come_as_a_list(capture):
+    with edited(capture.folder / "objects.json") as document:
+        document["face_object_id"] = [4] * 100 + [-1] * (len(capture.triangles) - 100)
+    scan = read_scan(capture.folder, IngestOptions())
+    assert [o.label for o in scan.objects] == ["unlabelled", "box"]
+    assert np.bincount(scan.mesh.face_object).tolist() == [len(capture.triangles) - 100, 100]
+
+
+def test_names_of_any_kind_pass_through_the_whole_reader(tmp_path):
+    capture = make_capture(tmp_path / "a #1 [x] é 椅子")
+    with edited(capture.folder / "objects.json") as document:
+        for entry, name in zip(
+            document["objects"], ["椅子", "../x", "", "chair/é", "chair/é"], strict=True
+        ):
+            entry["name"] = name
+    scan = read_scan(capture.folder, IngestOptions())
+    identifiers = [o.identifier for o in scan.objects]
+    assert len(set(identifiers)) == 5
+    assert all(name.isidentifier() and name.isascii() for name in identifiers)
+    assert [o.label for o in scan.objects][:3] == ["椅子", "../x", "object_2"]

@@ -1,0 +1,79 @@
+"""A document of views lines up with the asset of its capture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import usdbrdf
+from tests.scenes import edited, make_capture, ring_of_poses
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.errors import InputRefused
+from usdbrdf.evaluation.viewed_asset import measured_atlas
+from usdbrdf.evaluation.views_from_file import views_from_file
+
+
+def read(asset, document):
+    place, atlas = measured_atlas(asset)
+    return atlas, views_from_file(document, place, atlas.stage, atlas.scene)
+
+
+def test_the_captures_own_document_gives_its_frames(room):
+    atlas, views = read(room.asset, room.capture.manifest)
+    frames = frames_from_stage(atlas.stage)
+    assert np.abs(views.frames.world_from_camera - frames.world_from_camera).max() < 1e-9
+    assert np.array_equal(views.frames.intrinsics, frames.intrinsics)
+    assert np.array_equal(views.frames.saturation_radiance, frames.saturation_radiance)
+    assert views.names[:2] == ("frames/0000.exr", "frames/0001.exr")
+
+
+def test_in_another_unit_and_with_scaled_axes(tmp_path):
+    capture = make_capture(tmp_path / "scan")
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, :3] *= 2
+            frame["transform_matrix"] = pose.tolist()
+    options = usdbrdf.IngestOptions(meters_per_unit=0.5, pose_scale=2.0)
+    with usdbrdf.working_on(tmp_path / "room") as asset:
+        usdbrdf.ingest(capture.folder, asset, options)
+        usdbrdf.texture(asset, usdbrdf.TextureOptions(texel_size=0.3))
+    atlas, views = read(tmp_path / "room", capture.manifest)
+    frames = frames_from_stage(atlas.stage)
+    assert np.abs(frames.world_from_camera[:, :3, 3]).max() < 2
+    assert np.abs(views.frames.world_from_camera - frames.world_from_camera).max() < 1e-9
+
+
+def test_an_applied_transform_is_undone(room, tmp_path):
+    turn = np.array([[0.0, 1, 0, 3], [1, 0, 0, -2], [0, 0, -1, 1], [0, 0, 0, 1]])
+    held_out = make_capture(tmp_path, poses=ring_of_poses(5))
+    with edited(held_out.manifest) as document:
+        document["applied_transform"] = turn[:3].tolist()
+        for frame in document["frames"]:
+            frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
+    _, views = read(room.asset, held_out.manifest)
+    assert np.abs(views.frames.world_from_camera - held_out.world_from_camera).max() < 1e-9
+
+
+def test_a_view_that_cannot_be_used_is_left_out(room, tmp_path):
+    held_out = make_capture(tmp_path, poses=ring_of_poses(3))
+    held_out.image(1).unlink()
+    _, views = read(room.asset, held_out.manifest)
+    assert views.names == ("frames/0000.exr", "frames/0002.exr")
+
+
+def test_no_view_left_is_refused(room, tmp_path):
+    held_out = make_capture(tmp_path, poses=ring_of_poses(3))
+    for i in range(3):
+        held_out.image(i).write_bytes(b"no image")
+    with pytest.raises(InputRefused, match=r"0000.*not a readable image.*\[evaluate.views\]"):
+        read(room.asset, held_out.manifest)
+
+
+def test_cameras_that_do_not_see_the_asset_are_refused(room, tmp_path):
+    held_out = make_capture(tmp_path, poses=ring_of_poses(3))
+    with edited(held_out.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"][0][3] += 50
+    with pytest.raises(InputRefused, match=r"\[capture.convention\]"):
+        read(room.asset, held_out.manifest)

@@ -1,0 +1,61 @@
+"""The BSDF against equations 3 to 6 in plain NumPy, and its samples against its density."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.physics.brdf import f_nd
+from usdbrdf.relighting import lobe_plugin
+from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
+
+_CASES = [(0.05, 0.9, 0.1), (0.3, 0.5, 0.4), (0.9, 0.1, 0.7)]
+
+
+@pytest.fixture
+def mi() -> Any:
+    module = mitsuba_variant()
+    if module.variant() != VARIANTS[0]:
+        pytest.skip("no usable LLVM library")
+    lobe_plugin.register(module)
+    return module
+
+
+def _plugin(phi: float, psi: float, rho: float) -> dict[str, Any]:
+    return {
+        "type": lobe_plugin.NAME,
+        "diffuse": {"type": "rgb", "value": rho},
+        "f0": {"type": "rgb", "value": 0.08 * psi},
+        "phi": {"type": "uniform", "value": phi},
+    }
+
+
+@pytest.mark.parametrize(("phi", "psi", "rho"), _CASES)
+def test_value(mi: Any, phi: float, psi: float, rho: float) -> None:
+    import drjit as dr
+
+    rng = np.random.default_rng(1)
+    wi = np.array([0.6, 0.0, 0.8])
+    wo = rng.normal(size=(5000, 3)) * np.repeat([1.0, 0.1], 2500)[:, None]
+    wo[2500:] += [-0.6, 0, 0.8]  # half of them about the mirror direction
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(wo))
+    si.wi = mi.Vector3f(wi)
+    bsdf = mi.load_dict(_plugin(phi, psi, rho))
+    found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
+    normal = np.array([0.0, 0, 1])
+    expected = (rho / np.pi + f_nd(normal, wo, wi[None], phi, psi)) * np.maximum(wo[:, 2], 0)
+    assert found == pytest.approx(expected, rel=2e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize(("phi", "psi", "rho"), _CASES[1:])
+def test_samples_follow_the_density(mi: Any, phi: float, psi: float, rho: float) -> None:
+    sample, density = mi.chi2.BSDFAdapter(
+        lobe_plugin.NAME, _plugin(phi, psi, rho), wi=[0.6, 0.0, 0.8]
+    )
+    chi2 = mi.chi2.ChiSquareTest(
+        mi.chi2.SphericalDomain(), sample, density, sample_dim=3, res=101, ires=8
+    )
+    assert chi2.run(significance_level=0.001)

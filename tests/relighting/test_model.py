@@ -1,0 +1,246 @@
+"""Models of all formats come in with their shape, axes and materials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh.visual.material import PBRMaterial
+
+from tests.relighting.conftest import BASE
+from tests.relighting.scenes import MATTE, looking, material, photograph, plate
+from usdbrdf.asset.readers.render_scene import Published, published_file
+from usdbrdf.cli import main
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.images import read_radiance, write_exr
+from usdbrdf.model.light import SkyLight
+from usdbrdf.model.material import Surface
+from usdbrdf.relighting.insert import Insert
+from usdbrdf.relighting.inserted_models import surfaces_from_model
+from usdbrdf.relighting.relit_scene import relit_scene
+from usdbrdf.relighting.render import mitsuba_variant
+
+
+def _box() -> Any:
+    return trimesh.creation.box((0.2, 0.4, 0.6))
+
+
+def _linear(srgb: float) -> float:
+    return float(((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def test_ply_with_vertex_colours(tmp_path: Path) -> None:
+    box = _box()
+    box.visual.vertex_colors = np.tile(np.array([[255, 128, 64, 255]], np.uint8), (8, 1))
+    box.export(tmp_path / "box.ply")
+    (found,) = surfaces_from_model(tmp_path / "box.ply")
+    assert found.bounds == pytest.approx(np.array([[-0.1, -0.2, -0.3], [0.1, 0.2, 0.3]]))
+    assert found.corner_colour is not None
+    expected = [1.0, _linear(128 / 255), _linear(64 / 255)]
+    assert found.corner_colour.reshape(-1, 3) == pytest.approx(
+        np.tile(expected, (len(found.triangles) * 3, 1)), abs=1e-4
+    )
+    assert found.material.diffuse.ravel() == pytest.approx([1, 1, 1])
+
+
+def test_obj_with_its_mtl(tmp_path: Path) -> None:
+    (tmp_path / "box.mtl").write_text("newmtl red\nKd 0.8 0.2 0.1\n")
+    rows = [f"v {x} {y} {z}" for x, y, z in _box().vertices]
+    rows += ["usemtl red"] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in _box().faces]
+    (tmp_path / "box.obj").write_text("\n".join(["mtllib box.mtl", *rows]) + "\n")
+    (found,) = surfaces_from_model(tmp_path / "box.obj")
+    assert len(found.triangles) == 12
+    assert found.material.diffuse.ravel() == pytest.approx([0.8, 0.2, 0.1], abs=0.003)
+    assert not found.material.emits
+
+
+def test_glb_with_its_pbr_material(tmp_path: Path) -> None:
+    box = _box()
+    picture = np.zeros((2, 2, 3), np.uint8)
+    picture[0] = 255  # the upper row white
+    image = pytest.importorskip("PIL.Image", reason="textures of GLB need pillow")
+    uv = np.tile([[0.25, 0.75]], (8, 1))  # upper left in the v-up sense
+    stuff = PBRMaterial(
+        baseColorTexture=image.fromarray(picture),
+        baseColorFactor=[0.5, 1.0, 1.0, 1.0],
+        metallicFactor=1.0,
+        roughnessFactor=0.3,
+        emissiveFactor=[0.0, 0.5, 0.0],
+    )
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, material=stuff)
+    box.export(tmp_path / "box.glb")
+    (found,) = surfaces_from_model(tmp_path / "box.glb")
+    assert found.material.roughness.ravel() == pytest.approx([0.3])
+    assert found.material.f0[0, 0] == pytest.approx([0.5, 1, 1], abs=0.01)  # metal: its base colour
+    assert not found.material.diffuse.any()
+    assert found.material.emission.ravel() == pytest.approx([0, 0.5, 0])
+    assert found.corner_uv is not None
+    assert found.corner_uv.reshape(-1, 2) == pytest.approx(np.tile([0.25, 0.75], (36, 1)))
+
+
+def test_a_damaged_model_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    for name in ("a.ply", "a.obj", "a.glb", "a.stl"):
+        (tmp_path / name).write_text("nonsense")
+        with pytest.raises(InputRefused, match=rf"{name}.*\[.*\]$"):
+            surfaces_from_model(tmp_path / name)
+
+
+def _inserted(model: Path, stage: Published, **how: Any) -> tuple[Surface, ...]:
+    insert = Insert(model=model, **how)
+    scene = relit_scene(stage, None, [insert], keep_emitters=False, eye_height=2.0)
+    return scene.surfaces[len(stage.surfaces) :]
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Published:
+    """The small stage, in centimetres with z up: its floor is 1 m wide."""
+    file = tmp_path / "base.usda"
+    file.write_text(BASE.replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    return published_file(file, pytest.fail)
+
+
+def test_axes_and_units_of_models(tmp_path: Path, stage: Published) -> None:
+    box = _box()
+    box.export(tmp_path / "box.glb")
+    (glb,) = _inserted(tmp_path / "box.glb", stage)
+    assert np.ptp(glb.bounds, axis=0) == pytest.approx([0.2, 0.6, 0.4])  # y up, metres
+    box.export(tmp_path / "box.ply")
+    (ply,) = _inserted(tmp_path / "box.ply", stage)
+    assert np.ptp(ply.bounds, axis=0) == pytest.approx([0.002, 0.004, 0.006])  # as the stage
+    (turned,) = _inserted(tmp_path / "box.ply", stage, up="Y", scale=100.0)
+    assert np.ptp(turned.bounds, axis=0) == pytest.approx([0.2, 0.6, 0.4])
+
+
+_USD = """#usda 1.0
+(
+    defaultPrim = "thing"
+    metersPerUnit = 0.1
+    upAxis = "Y"
+)
+def Mesh "thing" (prepend apiSchemas = ["MaterialBindingAPI"])
+{
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0, 1, 2, 3, 4, 5, 6, 7]
+    point3f[] points = [(0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0),
+                        (0, 2, 0), (0, 2, 1), (1, 2, 1), (1, 2, 0)]
+    texCoord2f[] primvars:st = [(0, 0), (0, 1), (1, 1), (1, 0)] (interpolation = "faceVarying")
+    int[] primvars:st:indices = [0, 1, 2, 3, 0, 1, 2, 3]
+    rel material:binding = </mtl/plain>
+    def GeomSubset "upper" (prepend apiSchemas = ["MaterialBindingAPI"])
+    {
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [1]
+        rel material:binding = </mtl/glow>
+    }
+}
+def Scope "mtl"
+{
+    def Material "plain"
+    {
+        token outputs:surface.connect = </mtl/plain/s.outputs:surface>
+        color3f inputs:tint = (0.1, 0.3, 0.5)
+        def Shader "s"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor.connect = </mtl/plain.inputs:tint>
+            int inputs:useSpecularWorkflow = 1
+            color3f inputs:specularColor = (0.04, 0.05, 0.06)
+            float inputs:roughness = 0.7
+            token outputs:surface
+        }
+    }
+    def Material "glow"
+    {
+        token outputs:surface.connect = </mtl/glow/s.outputs:surface>
+        def Shader "s"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:emissiveColor.connect = </mtl/glow/t.outputs:rgb>
+            token outputs:surface
+        }
+        def Shader "t"
+        {
+            uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @glow.exr@
+            float4 inputs:scale = (2, 2, 2, 1)
+            float2 inputs:st.connect = </mtl/glow/r.outputs:result>
+            float3 outputs:rgb
+        }
+        def Shader "r"
+        {
+            uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "st"
+            float2 outputs:result
+        }
+    }
+}
+"""
+
+
+def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: Published) -> None:
+    write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
+    (tmp_path / "thing.usda").write_text(_USD)
+    found = _inserted(tmp_path / "thing.usda", stage)
+    glow, plain = sorted(found, key=lambda surface: not surface.material.emits)
+    assert plain.material.diffuse.ravel() == pytest.approx([0.1, 0.3, 0.5])
+    assert plain.material.f0.ravel() == pytest.approx([0.04, 0.05, 0.06])
+    assert plain.material.roughness.ravel() == pytest.approx([0.7])
+    assert glow.material.emission == pytest.approx(np.full((2, 3, 3), 3.0))
+    assert glow.corner_uv is not None
+    # Decimetres with y up: the upper face is 0.2 m above, facing up.
+    assert glow.bounds[:, 2] == pytest.approx([0.2, 0.2])
+    assert glow.corner_normals[..., 2] == pytest.approx(np.ones((2, 3)))
+
+
+def test_an_input_of_another_type_is_told_and_left(tmp_path: Path) -> None:
+    text = _USD.replace("float inputs:roughness = 0.7", "color3f inputs:roughness = (1, 1, 1)")
+    text = text.replace("float4 inputs:scale = (2, 2, 2, 1)", "string inputs:scale = 'wide'")
+    (tmp_path / "thing.usda").write_text(text)
+    write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
+    said: list[str] = []
+    found = published_file(tmp_path / "thing.usda", said.append).surfaces
+    glow, plain = sorted(found, key=lambda surface: not surface.material.emits)
+    assert plain.material.roughness.ravel() == pytest.approx([0.5])
+    assert glow.material.emission == pytest.approx(np.full((2, 3, 3), 1.5))
+    assert ["inputs:roughness" in s or "inputs:scale" in s for s in said] == [True, True]
+
+
+@pytest.mark.parametrize("mode", ["repeat", "clamp", "mirror"])
+def test_textures_are_wrapped_as_the_stage_says(tmp_path: Path, mode: str) -> None:
+    wraps = f'token inputs:wrapS = "{mode}"\ntoken inputs:wrapT = "{mode}"\nasset inputs:file'
+    (tmp_path / "thing.usda").write_text(_USD.replace("asset inputs:file", wraps))
+    write_exr(tmp_path / "glow.exr", np.ones((2, 3, 3), np.float32))
+    found = published_file(tmp_path / "thing.usda", pytest.fail).surfaces
+    assert sorted(surface.material.wrap for surface in found) == sorted([mode, "clamp"])
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+def test_beyond_its_edge_a_texture_goes_on_as_its_mode_says(wrap: str) -> None:
+    image = np.zeros((1, 4, 3), np.float32)
+    image[:, :2] = 0.8  # the left half
+    stuff = replace(material(), diffuse=image, wrap=wrap, **MATTE)
+    floor = plate(stuff)
+    assert floor.corner_uv is not None
+    # Where the camera looks, u is 1.25: a quarter into the next copy.
+    floor = replace(floor, corner_uv=floor.corner_uv + np.array([0.75, 0], np.float32))
+    sky = SkyLight(image=np.ones((2, 4, 3), np.float32), world_from_here=np.eye(3))
+    eye = looking((0, 0, 2), (0, 0, 0))
+    seen = photograph(mitsuba_variant("scalar_rgb"), [floor], eye, lights=[sky]).mean()
+    assert seen == pytest.approx(0.8 if wrap == "repeat" else 0.0, abs=0.05)
+
+
+def test_a_model_that_fell_is_in_the_picture(room: Path, tmp_path: Path) -> None:
+    _box().export(tmp_path / "box.ply")
+    target = tmp_path / "picture.exr"
+    insert = ["--insert", str(tmp_path / "box.ply"), "drop=0,0,1", "color=0,0.5,0", "ior=1"]
+    arguments = ["relight", str(room), "-o", str(target), "--camera", "/room/eye"]
+    common = ["--width", "9", "--samples", "64", "-q"]
+    assert main([*arguments, *common, *insert]) == 0
+    middle = read_radiance(target)[4, 4]
+    assert middle[0] < 0.05 * middle[1]  # green, where the floor is bluish
+    assert middle[2] < 0.05 * middle[1]

@@ -1,0 +1,119 @@
+"""The texturing step on captures that show little or are in another unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import usdbrdf
+from tests.scenes import make_capture, ring_of_poses, write_ply
+from usdbrdf.asset.layout import Asset
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.images import read_exr
+from usdbrdf.job.task import StageRun
+from usdbrdf.model.scene import SceneObject
+from usdbrdf.tasks import texture as module
+from usdbrdf.tasks.atlas import MapWriter, TexelMap
+
+OPTIONS = usdbrdf.TextureOptions(texel_size=0.2)
+
+
+def _textured(base, made):
+    with usdbrdf.working_on(base / "asset") as asset:
+        usdbrdf.ingest(made.folder, asset, usdbrdf.IngestOptions())
+        return usdbrdf.texture(asset, OPTIONS)
+
+
+def test_faces_wound_away_from_all_cameras_are_refused(tmp_path):
+    made = make_capture(tmp_path / "scan", frames=8, subdivisions=1)
+    inside_out = made.triangles[:, ::-1]
+    write_ply(made.folder / "mesh.ply", made.points, inside_out, made.face_object)
+    with pytest.raises(InputRefused, match=r"front.*\[texturing.unseen\]") as caught:
+        _textured(tmp_path, made)
+    assert caught.value.exit_code == 3
+    assert not (tmp_path / "asset" / "textures").exists()
+
+
+def test_a_capture_that_shows_little_of_the_mesh_is_warned_about(capsys):
+    seen = np.arange(100) < 9
+    module._check_seen(seen, ~seen)
+    assert "91.0 % of the texels" in capsys.readouterr().err
+    module._check_seen(~seen, seen)
+    assert capsys.readouterr().err == ""
+    with pytest.raises(InputRefused, match="unseen"):
+        module._check_seen(np.zeros(3, bool), np.zeros(3, bool))
+
+
+def test_passes_for_lack_of_memory_change_no_byte(tmp_path, monkeypatch, capsys):
+    made = make_capture(tmp_path / "scan", frames=9, subdivisions=1)
+    once, thrice = tmp_path / "once", tmp_path / "thrice"
+    _textured(once, made)
+
+    def three(texels, *_):
+        ends = [0, len(texels) // 3, len(texels) // 2, len(texels)]
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    monkeypatch.setattr(module, "groups_of_texels", three)
+    capsys.readouterr()
+    _textured(thrice, made)
+    assert "3 passes over the frames" in capsys.readouterr().err
+    files = sorted((once / "asset" / "textures").iterdir())
+    assert len(files) == 25
+    for file in files:
+        assert (thrice / "asset" / "textures" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_the_memory_is_no_parameter_of_the_result(tmp_path):
+    made = make_capture(tmp_path / "scan", frames=9, subdivisions=1)
+    _textured(tmp_path, made)
+    with usdbrdf.working_on(tmp_path / "asset") as asset:
+        again = usdbrdf.texture(asset, replace(OPTIONS, memory=2.0))
+    assert not again.reran
+    with pytest.raises(UsageError, match="memory"):
+        replace(OPTIONS, memory=0.0)
+
+
+class _Picture:
+    """Texels of one object that are its whole picture."""
+
+    def image(self, index: int, values: np.ndarray) -> np.ndarray:
+        return values.reshape(2, 4, 3)
+
+
+def test_large_values_are_kept_where_they_matter_and_counted_where_not(tmp_path, capsys):
+    values = np.full((8, 3), 0.5, np.float32)
+    values[3] = (70_001, 1, 70_003)
+    writer = MapWriter(StageRun(tmp_path, "texture", tmp_path / "work"), Asset(tmp_path, "a"),
+                       _Picture())  # fmt: skip
+    obj = SceneObject(
+        prim_path="/a/box", identifier="box", label="", class_name="", first_face=0, num_faces=1
+    )
+    writer.warn()
+    assert capsys.readouterr().err == ""
+    maps = {
+        "lit": TexelMap(values, 1.0, "W/(m^2 sr)", exact=True),
+        "mean": TexelMap(values, 1.0, "W/(m^2 sr)"),
+    }
+    lit, mean = writer.write(0, obj, maps)
+    np.testing.assert_array_equal(read_exr(writer.run.output(lit.file)).reshape(8, 3), values)
+    assert read_exr(writer.run.output(mean.file)).max() == 65_504
+    assert writer.clamped == 2
+    writer.warn()
+    printed = capsys.readouterr().err
+    assert printed.count("[image.clamped]") == 1
+    assert "2 values" in printed
+    assert "unit" in printed
+
+
+def test_a_capture_near_the_end_of_half_floats_keeps_its_lit_map(tmp_path, capsys):
+    made = make_capture(
+        tmp_path / "scan", subdivisions=1, room=False, poses=ring_of_poses(8),
+        radiance={"box": (64_000, 61_000, 62_000)}, saturation_radiance=65_500,
+    )  # fmt: skip
+    _textured(tmp_path, made)
+    lit = read_exr(tmp_path / "asset" / "textures" / "box.lit.exr")
+    assert lit.max() == pytest.approx(64_000)
+    assert "[image.clamped]" not in capsys.readouterr().err

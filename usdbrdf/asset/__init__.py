@@ -1,0 +1,5 @@
+"""Everything that reads or writes USD."""
+
+from usdbrdf.asset import schema
+
+schema.register()

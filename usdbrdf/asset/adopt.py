@@ -1,0 +1,84 @@
+"""Keeping what somebody edited by hand in files that the tool is about to write again."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pxr import Sdf, Tf, UsdUtils
+
+from usdbrdf.asset.layers.capture_camera import relative_path
+from usdbrdf.asset.layout import Asset
+from usdbrdf.errors import OwnershipConflict
+from usdbrdf.files.atomic import temporary_beside
+
+_LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
+
+
+def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
+    """Copy edited tool-owned files beside edits.usda and return the copies, for the artist to use.
+
+    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go
+    to a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
+    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it.
+    """
+    layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
+    others = [path for path in edited if path.suffix not in _LAYER_SUFFIXES]
+    numbers = (n for n in itertools.count(1) if not _taken(asset, n))
+    copies: dict[Path, Path] = {}
+    if others:
+        folder = asset.folder / f"adopted-{next(numbers)}"
+        for path in others:
+            # The same name may occur in several folders.
+            copies[path] = folder / path.absolute().relative_to(asset.folder)
+            _copy(path, copies[path])
+    adopted = [asset.folder / f"adopted-{next(numbers)}.usda" for _ in layers]
+    for path, target in zip(layers, adopted, strict=True):
+        _adopt_layer(path, target, asset, copies)
+    return [*adopted, *copies.values()]
+
+
+def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, Path]) -> None:
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+        text = Sdf.Layer.CreateAnonymous(".usda")
+        text.TransferContent(layer)
+    except (Tf.ErrorException, TypeError) as error:
+        raise OwnershipConflict(
+            f"{path}: the layer was edited and USD cannot read it any more, so its edits cannot be "
+            "adopted. Repair it, or give it up with --discard. [ownership.unreadable]"
+        ) from error
+    copied = {os.path.realpath(source): copy for source, copy in copies.items()}
+
+    def from_new_place(asset_path: str) -> str:
+        if not asset_path.startswith(("./", "../")):
+            return asset_path
+        file = Path(os.path.normpath(path.parent / asset_path))
+        return relative_path(copied.get(os.path.realpath(file), file), asset.folder)
+
+    # The tool's own sublayers stay where they are: they are in the stage anyway.
+    own = {f"./{sub.name}" for sub in (asset.uv_layer, asset.lights_layer, asset.materialx_layer)}
+    text.subLayerPaths = [sub for sub in layer.subLayerPaths if sub not in own]
+    UsdUtils.ModifyAssetPaths(text, from_new_place)
+    text.documentation = (
+        f"Adopted from {path.absolute().relative_to(asset.folder).as_posix()}, which was edited by "
+        "hand. Add this layer to the sublayers of edits.usda, or take from it what you need."
+    )
+    with temporary_beside(target) as written:
+        text.Export(str(written))
+        os.replace(written, target)
+
+
+def _taken(asset: Asset, number: int) -> bool:
+    stem = asset.folder / f"adopted-{number}"
+    return stem.exists() or stem.with_suffix(".usda").exists()
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with temporary_beside(target) as copy:
+        shutil.copyfile(source, copy)
+        os.replace(copy, target)

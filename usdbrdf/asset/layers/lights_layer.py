@@ -1,0 +1,144 @@
+"""Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``.
+
+A lighter wants lights: something to dim, to link, to sample well. The measured emission is in the
+materials, and a renderer that honoured both would count every lamp twice. So the default prim has a
+variant set: ``emissive``, the default, has no lights; ``usdlux`` has them, and scales the emission
+of the lamps they stand for to nothing. A shot that references the asset chooses by one opinion of
+its own, which neither a muted layer nor invisible lights in the root would allow: mutes are a
+session's, not a file's, and visibility would leave the glowing surfaces on. A layer may still be
+muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+
+Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
+``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
+an object only, keep their emission in both variants. Flat lights shine from the front of the faces;
+their lamps are dark where a renderer does not show lights to the camera. A ball is hidden, since
+its light encloses it, and some renderers draw such a light from its centre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
+from usdbrdf.asset.layers.author import attribute, define, export, over
+from usdbrdf.asset.layout import Asset
+from usdbrdf.model.arrays import Double
+from usdbrdf.shading.lamp_shapes import LampShape
+
+Types = Sdf.ValueTypeNames
+
+VARIANT_SET = "lights"
+
+EMISSIVE, USDLUX = "emissive", "usdlux"
+
+# The texture node of the materials' emission, which has no scale of its own.
+EMISSION_TEXTURE = "EmissionTexture"
+
+_TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp:
+    """An emitter and the lights that may stand for it; none where it has no shape for that."""
+
+    prim_path: str
+    identifier: str
+    shapes: tuple[LampShape, ...]
+
+
+def write_lights_layer(
+    path: Path,
+    asset: Asset,
+    header: StageHeader,
+    provenance: Provenance,
+    lamps: Sequence[Lamp],
+    world_from_root: Double,
+) -> None:
+    """Write lights.usda to ``path``; without a lamp that has shapes it holds nothing.
+
+    world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
+    """
+    scopes = Scopes.of(asset)
+    layer = new_layer(header, provenance)
+    root = over(layer, scopes.root)
+    shaped = [lamp for lamp in lamps if lamp.shapes]
+    if shaped:
+        emissive, usdlux = (
+            Sdf.Path(scopes.root).AppendVariantSelection(VARIANT_SET, name)
+            for name in (EMISSIVE, USDLUX)
+        )
+        over(layer, str(emissive))
+        root.variantSelections[VARIANT_SET] = EMISSIVE
+        define(layer, _within(usdlux, scopes.path("lights")), "Scope")
+        for lamp in shaped:
+            _author_lamp(layer, usdlux, scopes, lamp, world_from_root, header.meters_per_unit)
+    export(layer, path, folder=path.parent)
+
+
+def world_from_root(stage: Usd.Stage) -> Double:
+    """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+    return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
+
+
+def _author_lamp(
+    layer: Sdf.Layer,
+    variant: Sdf.Path,
+    scopes: Scopes,
+    lamp: Lamp,
+    world_from_root: Double,
+    meters_per_unit: float,
+) -> None:
+    """The lights, and what keeps the lamp itself from shining beside them."""
+    lights = _within(variant, scopes.path("lights", lamp.identifier))
+    define(layer, lights, "Scope")
+    for number, shape in enumerate(lamp.shapes, start=1):
+        prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
+        _author_light(prim, shape, world_from_root, meters_per_unit)
+    texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
+    prim = over(layer, _within(variant, texture))
+    attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(0, 0, 0, 1))
+    if lamp.shapes[0].kind == "sphere":
+        hidden = over(layer, _within(variant, lamp.prim_path))
+        attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
+
+
+def _within(variant: Sdf.Path, path: str) -> str:
+    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
+
+
+def _author_light(
+    prim: Sdf.PrimSpec,
+    shape: LampShape,
+    world_from_root: Double,
+    meters_per_unit: float,
+) -> None:
+    """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
+    brightest = max(shape.radiance)
+    exposure = math.log2(brightest)
+    colour = Gf.Vec3f(*(value / brightest for value in shape.radiance))
+    attribute(prim, "inputs:intensity", Types.Float, 1.0)
+    attribute(prim, "inputs:exposure", Types.Float, exposure)
+    attribute(prim, "inputs:color", Types.Color3f, colour)
+    attribute(prim, "inputs:normalize", Types.Bool, False)
+    width, height = (side / meters_per_unit for side in shape.size)
+    if shape.kind == "rectangle":
+        attribute(prim, "inputs:width", Types.Float, width)
+        attribute(prim, "inputs:height", Types.Float, height)
+    else:
+        attribute(prim, "inputs:radius", Types.Float, width / 2)
+    half = Gf.Vec3f(width / 2, height / 2, width / 2 if shape.kind == "sphere" else 0)
+    attribute(prim, "extent", Types.Float3Array, [-half, half])
+    # Rigid in the world, in units of the stage: what the root does to sizes is undone here.
+    in_units = shape.world_from_light.copy()
+    in_units[:3, 3] /= meters_per_unit
+    pose = np.linalg.inv(world_from_root) @ in_units
+    # USD multiplies row vectors from the left: its matrices are ours transposed.
+    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
+    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)

@@ -1,0 +1,159 @@
+"""UsdPreviewSurface networks: the measured material, and unlit ones for review."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pxr import Gf, Sdf
+
+from usdbrdf.asset.layers.author import attribute, connect, define, over
+from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.transport.renderer_match import measured_lobe, shown_lobe
+
+Types = Sdf.ValueTypeNames
+
+Colour = Sequence[float]
+
+SURFACE = "PreviewSurface"
+
+
+class PreviewLobe(NamedTuple):
+    """Inputs of UsdPreviewSurface, and the factor that its diffuse colour has been given."""
+
+    roughness: float
+    ior: float
+    diffuse: float
+
+
+# Without a fitted lobe there is none: index of refraction 1 reflects nothing, and shading is
+# purely diffuse. Written out, because applications differ in what they assume.
+NO_LOBE = PreviewLobe(roughness=1.0, ior=1.0, diffuse=1.0)
+
+
+def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") -> PreviewLobe:
+    """UsdPreviewSurface's inputs for the paper's parameters.
+
+    alpha = max(0.001, phi) and USD squares its roughness: roughness = sqrt(alpha).
+    measured  F0 = 0.08 psi
+    matched   F0 and the diffuse colour as renderers need them to show that (``renderer_match``)
+    F0 = ((ior - 1) / (ior + 1))^2: ior = (1 + sqrt(F0)) / (1 - sqrt(F0)).
+    """
+    f0, diffuse = 0.08 * psi, 1.0
+    if mapping == "matched":
+        f0, diffuse = (float(value) for value in shown_lobe(phi, psi))
+    sqrt_f0 = math.sqrt(f0)
+    return PreviewLobe(math.sqrt(max(0.001, phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
+
+
+def fit_from_preview_surface(roughness: float, ior: float, mapping: str) -> PreviewLobe:
+    """The inverse, for whoever renders with the fitted lobe: the roughness, the ior that has the
+    F0 of the fit, and the factor that the diffuse colour was given.
+
+    Whatever was written over our values is understood as what renderers show of it; so an opinion
+    counts, and what nobody touched comes back as it was fitted.
+    """
+    if mapping != "matched":
+        return PreviewLobe(roughness, ior, 1.0)
+    shown = ((ior - 1) / (ior + 1)) ** 2
+    psi, diffuse = measured_lobe(roughness**2, shown)
+    sqrt_f0 = math.sqrt(0.08 * psi)
+    return PreviewLobe(roughness, (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
+
+
+def surface(
+    layer: Sdf.Layer,
+    material: str,
+    *,
+    roughness: float = NO_LOBE.roughness,
+    ior: float = NO_LOBE.ior,
+) -> Sdf.PrimSpec:
+    """A material with one UsdPreviewSurface, black until a colour is given; returns the shader.
+
+    ``specularColor`` stays away: some applications multiply it onto the reflectance of ``ior``.
+    """
+    shader = f"{material}/{SURFACE}"
+    connect(
+        define(layer, material, "Material"),
+        "outputs:surface",
+        Types.Token,
+        f"{shader}.outputs:surface",
+    )
+    prim = define(layer, shader, "Shader")
+    attribute(prim, "info:id", Types.Token, "UsdPreviewSurface", uniform=True)
+    attribute(prim, "inputs:useSpecularWorkflow", Types.Int, 0)
+    attribute(prim, "inputs:metallic", Types.Float, 0.0)
+    attribute(prim, "inputs:diffuseColor", Types.Color3f, Gf.Vec3f(0.0))
+    attribute(prim, "inputs:emissiveColor", Types.Color3f, Gf.Vec3f(0.0))
+    attribute(prim, "outputs:surface", Types.Token)
+    lobe(layer, material, roughness, ior)
+    return prim
+
+
+def lobe(layer: Sdf.Layer, material: str, roughness: float, ior: float) -> None:
+    """The specular lobe of a material that this layer, or a weaker one, defines."""
+    prim = over(layer, f"{material}/{SURFACE}")
+    attribute(prim, "inputs:roughness", Types.Float, roughness)
+    attribute(prim, "inputs:ior", Types.Float, ior)
+
+
+def colour_from_texture(
+    layer: Sdf.Layer,
+    material: str,
+    surface_input: str,
+    texture: str,
+    file: str,
+    *,
+    scale: float = 1.0,
+    fallback: Colour = (0.0, 0.0, 0.0),
+) -> None:
+    """Connect an input of the material's surface to a linear texture over ``primvars:st``.
+
+    texture   name of the texture's shader prim
+    file      path relative to the asset folder
+    fallback  linear colour where the file is missing
+    """
+    reader = define(layer, f"{material}/StReader", "Shader")
+    attribute(reader, "info:id", Types.Token, "UsdPrimvarReader_float2", uniform=True)
+    attribute(reader, "inputs:varname", Types.String, "st")
+    attribute(reader, "outputs:result", Types.Float2)
+
+    prim = define(layer, f"{material}/{texture}", "Shader")
+    attribute(prim, "info:id", Types.Token, "UsdUVTexture", uniform=True)
+    attribute(prim, "inputs:file", Types.Asset, Sdf.AssetPath(path_in_layer(file)))
+    connect(prim, "inputs:st", Types.Float2, f"{material}/StReader.outputs:result")
+    # "auto" would decode float images as sRGB in some applications.
+    attribute(prim, "inputs:sourceColorSpace", Types.Token, "raw")
+    attribute(prim, "inputs:wrapS", Types.Token, "clamp")
+    attribute(prim, "inputs:wrapT", Types.Token, "clamp")
+    attribute(prim, "inputs:fallback", Types.Float4, Gf.Vec4f(*map(float, fallback), 1.0))
+    if scale != 1.0:
+        scale_texture(layer, material, texture, scale)
+    attribute(prim, "outputs:rgb", Types.Float3)
+
+    shader = over(layer, f"{material}/{SURFACE}")
+    source = f"{material}/{texture}.outputs:rgb"
+    connected = connect(shader, f"inputs:{surface_input}", Types.Color3f, source)
+    connected.ClearDefaultValue()
+
+
+def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -> None:
+    """A factor on the colour of a texture that this layer, or a weaker one, defines."""
+    prim = over(layer, f"{material}/{texture}")
+    attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(scale, scale, scale, 1.0))
+
+
+def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> None:
+    """A material that glows with a map and reflects nothing, so that any viewer shows the map.
+
+    A map of one channel shows as grey: applications repeat it over red, green and blue.
+    """
+    surface(layer, material)
+    colour_from_texture(layer, material, "emissiveColor", "AovTexture", file, scale=scale)
+
+
+def unlit_colour(layer: Sdf.Layer, material: str, colour: Colour) -> None:
+    """A material that glows with one linear colour and reflects nothing."""
+    shader = surface(layer, material)
+    attribute(shader, "inputs:emissiveColor", Types.Color3f, Gf.Vec3f(*map(float, colour)))

@@ -1,0 +1,163 @@
+"""The weakest layer: the capture as it came, its meshes, camera and photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
+from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over, relationship
+from usdbrdf.asset.layers.capture_camera import author_capture_camera
+from usdbrdf.asset.layers.input_bindings import competing_bindings, weaken_bindings
+from usdbrdf.asset.layers.input_geometry import (
+    author_overrides,
+    author_reference,
+    has_transform,
+    input_mesh,
+    open_input,
+)
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.schema import verify
+from usdbrdf.files.naming import readable_label
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
+
+Types = Sdf.ValueTypeNames
+
+
+def write_scan_layer(
+    path: Path, scan: Scan, asset: Asset, header: StageHeader, provenance: Provenance
+) -> None:
+    """Write scan.usdc to ``path``; objects without a face are left out."""
+    verify()
+    folder = asset.layer("scan").parent
+    stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
+    source = stage.GetDefaultPrim() if stage else None
+    taken = [child.GetName() for child in source.GetAllChildren()] if source else []
+    scopes = Scopes.beside(f"/{header.name}", taken)
+    meshes = _input_meshes(source, scan, scopes.root) if source else {}
+    layer = new_layer(
+        header,
+        provenance,
+        adapter=scan.adapter,
+        radiometric=scan.frames.radiometric,
+        counts=scan.counts,
+        scopes=scopes.names(),
+        competing_bindings={
+            path: competing_bindings(mesh, source, scopes.root) for path, mesh in meshes.items()
+        }
+        or None,
+    )
+    # A typed root would hide the input's own type.
+    typed = source is not None and source.GetTypeName() != ""
+    root = define(layer, scopes.root, "" if typed else "Xform")
+    _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
+    if source and scan.usd_geometry:
+        author_reference(layer, scopes.root, scan.usd_geometry, folder)
+        _author_input_meshes(layer, scopes.root, source, meshes, scan)
+    else:
+        _author_meshes(layer, scopes, scan)
+    define(layer, scopes.path("cameras"), "Scope")
+    camera = scopes.path("cameras", "capture")
+    moved = source is not None and has_transform(source)
+    author_capture_camera(
+        layer, camera, scan.frames, scan.meters_per_unit, folder, reset_transform=moved
+    )
+    _author_render_settings(layer, scopes, scan)
+    export(layer, path, folder=folder)
+
+
+def author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
+    """What makes a mesh one of our objects."""
+    apply_schema(prim, "UsdBrdfObjectAPI")
+    text = readable_label(label.label)
+    class_name = readable_label(label.class_name)
+    attribute(prim, "usdBrdf:label", Types.String, text, uniform=True)
+    attribute(prim, "usdBrdf:class", Types.String, class_name, uniform=True)
+    attribute(prim, "usdBrdf:identifier", Types.Token, label.identifier, uniform=True)
+    prim.SetInfo("displayName", text)
+    if class_name:
+        apply_schema(prim, "SemanticsLabelsAPI:class")
+        attribute(prim, "semantics:labels:class", Types.TokenArray, [class_name])
+
+
+def _author_root(root: Sdf.PrimSpec, asset: Asset, *, keep_kind: bool) -> None:
+    if not keep_kind:
+        root.SetInfo("kind", "assembly")
+    root.SetInfo(
+        "assetInfo",
+        {"identifier": Sdf.AssetPath(f"../{asset.root_layer.name}"), "name": asset.name},
+    )
+    apply_schema(root, "ColorSpaceAPI")
+    attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
+
+
+def _input_meshes(source: Usd.Prim, scan: Scan, root: str) -> dict[str, Usd.Prim]:
+    """The input's meshes by their paths in our stage, in the order of the objects."""
+    meshes = [input_mesh(source, below) for below in scan.object_prims]
+    here = Sdf.Path(root)
+    return {str(mesh.GetPath().ReplacePrefix(source.GetPath(), here)): mesh for mesh in meshes}
+
+
+def _author_input_meshes(
+    layer: Sdf.Layer, root: str, source: Usd.Prim, meshes: Mapping[str, Usd.Prim], scan: Scan
+) -> None:
+    """What the referenced meshes need to be our objects."""
+    for i, (path, mesh) in enumerate(meshes.items()):
+        weaken_bindings(layer, mesh, source, root)
+        normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
+        author_overrides(layer, path, mesh, normals)
+        author_label(over(layer, path), scan.objects[i])
+
+
+def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
+    geometry = define(layer, scopes.path("geometry"), "Scope")
+    geometry.SetInfo("kind", "group")
+    mesh = scan.mesh
+    # Files split vertices at seams; ours has its normals per corner and needs no copies.
+    _, first, number = np.unique(welded_ids(mesh.points), return_index=True, return_inverse=True)
+    mesh = replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
+    order = np.argsort(mesh.face_object, kind="stable")
+    objects = np.arange(len(scan.objects) + 1)
+    bounds = np.searchsorted(mesh.face_object[order], objects)
+    for i, label in enumerate(scan.objects):
+        faces = order[bounds[i] : bounds[i + 1]]
+        if len(faces):
+            prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
+            prim.SetInfo("kind", "component")
+            _author_mesh(prim, mesh, faces)
+            author_label(prim, label)
+
+
+def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:
+    """The triangles ``faces`` with only the points that they use."""
+    used, corners = np.unique(mesh.triangles[faces], return_inverse=True)
+    points = np.ascontiguousarray(mesh.points[used], np.float32)
+    normals = np.ascontiguousarray(mesh.corner_normals[faces], np.float32).reshape(-1, 3)
+    extent = Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
+    counts = Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32))
+    indices = Vt.IntArray.FromNumpy(corners.reshape(-1).astype(np.int32))
+    attribute(prim, "points", Types.Point3fArray, Vt.Vec3fArray.FromNumpy(points))
+    attribute(prim, "faceVertexCounts", Types.IntArray, counts)
+    attribute(prim, "faceVertexIndices", Types.IntArray, indices)
+    values = Vt.Vec3fArray.FromNumpy(normals)
+    attribute(prim, "normals", Types.Normal3fArray, values, interpolation="faceVarying")
+    attribute(prim, "extent", Types.Float3Array, extent)
+    attribute(prim, "subdivisionScheme", Types.Token, UsdGeom.Tokens.none, uniform=True)
+    # A scan has holes, and cameras look through them at the backs of things.
+    attribute(prim, "doubleSided", Types.Bool, True, uniform=True)
+
+
+def _author_render_settings(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
+    """Settings that render the capture's own view; the shading layer adds the products."""
+    define(layer, scopes.path("render"), "Scope")
+    settings = define(layer, scopes.path("render", "capture"), "RenderSettings")
+    width, height = (int(value) for value in scan.frames.resolution[0])
+    attribute(settings, "resolution", Types.Int2, Gf.Vec2i(width, height), uniform=True)
+    relationship(settings, "camera", scopes.path("cameras", "capture"))
+    attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)

@@ -1,0 +1,100 @@
+"""The asset folder: which file lies where. Everything else asks here."""
+
+from __future__ import annotations
+
+import posixpath
+from dataclasses import dataclass
+from pathlib import Path
+
+from pxr import Sdf, Tf
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.naming import identifier_from
+
+# The layers that the stages write, weakest first; each sees only those before it.
+ROLES = ("scan", "texturing", "shading", "material")
+
+
+@dataclass(frozen=True)
+class Asset:
+    """An asset folder and the name of its default prim, which is also its root layer's name."""
+
+    folder: Path
+    name: str
+
+    @staticmethod
+    def at(folder: Path) -> Asset:
+        """The asset in a folder: its name is the one it was made with, else the folder's name.
+
+        A folder that was renamed after its making keeps its files' names.
+        """
+        folder = Path(folder).absolute()
+        if not is_storable(folder) or "\\" in str(folder):
+            raise InputRefused(
+                f"{str(folder)!r}: the name of the folder, or of one above it, holds characters "
+                "that USD cannot store in a path. Choose another folder. [stage.asset_path]"
+            )
+        made_with = _default_prim(folder / "layers" / "scan.usdc")
+        return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
+
+    @property
+    def root_layer(self) -> Path:
+        return self.folder / f"{self.name}.usda"
+
+    @property
+    def edits_layer(self) -> Path:
+        return self.folder / "edits.usda"
+
+    @property
+    def uv_layer(self) -> Path:
+        """Texture coordinates: too big for text, hence a binary sublayer of texturing.usda."""
+        return self.folder / "layers" / "texturing_uv.usdc"
+
+    @property
+    def lights_layer(self) -> Path:
+        """The emitters as UsdLux lights: a sublayer of shading.usda that may be muted."""
+        return self.folder / "layers" / "lights.usda"
+
+    @property
+    def materialx_layer(self) -> Path:
+        """The materials as MaterialX networks: a sublayer of material.usda, where asked for."""
+        return self.folder / "layers" / "materialx.usda"
+
+    def layer(self, role: str) -> Path:
+        """Path of a stage's layer; ``role`` is one of ``ROLES``."""
+        suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
+        return self.folder / "layers" / f"{role}{suffix[role]}"
+
+    def texture(self, identifier: str, aov: str) -> str:
+        """Path of an object's map, relative to the asset folder."""
+        return f"textures/{identifier}.{aov}.exr"
+
+
+def is_storable(path: Path) -> bool:
+    """False if USD cannot hold the path: control characters, undecodable bytes, its own marks."""
+    try:
+        Sdf.AssetPath(str(path))
+    except (Tf.ErrorException, UnicodeEncodeError):
+        return False
+    return ":SDF_FORMAT_ARGS:" not in str(path)
+
+
+def path_in_layer(asset_relative: str) -> str:
+    """A path relative to the asset folder, as the files in layers/ must spell it."""
+    return f"../{asset_relative}"
+
+
+def path_in_asset(layer_relative: str) -> str:
+    """The inverse of ``path_in_layer``."""
+    return posixpath.normpath(posixpath.join("layers", layer_relative))
+
+
+def _default_prim(layer: Path) -> str:
+    """Default prim of a layer file, "" if there is no such file or it cannot be read."""
+    if not layer.is_file():
+        return ""
+    try:
+        opened = Sdf.Layer.OpenAsAnonymous(str(layer), metadataOnly=True)
+    except Tf.ErrorException:
+        return ""
+    return str(opened.defaultPrim) if opened else ""

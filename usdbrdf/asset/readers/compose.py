@@ -1,0 +1,84 @@
+"""Opening the stage as a given task of the pipeline may see it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd
+
+from usdbrdf.asset.header import Provenance, new_layer, read_header
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.errors import InputRefused
+
+_MAX_LENGTH = 300
+
+
+def in_one_line(error: object) -> str:
+    """The text of an error of USD, which often spans lines and repeats itself, on one line.
+
+    Of an exception what its errors say, without the places in USD's own source.
+    """
+    told = (
+        [each.commentary for each in error.args]
+        if isinstance(error, Tf.ErrorException)
+        else [error]
+    )
+    text = "; ".join(" ".join(str(part).split()).rstrip(".; ") for part in told)
+    return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
+
+
+def open_weaker(asset: Asset, role: str) -> Usd.Stage:
+    """The stage that the stage ``role`` builds upon: only the layers weaker than its own.
+
+    Never edits.usda: what an artist overrides must not flow back into the measurement.
+    """
+    return _sublayered(asset, ROLES[: ROLES.index(role)])
+
+
+def open_measured(asset: Asset) -> Usd.Stage:
+    """All layers that the tool wrote, without the artist's."""
+    return _sublayered(asset, ROLES)
+
+
+def open_edited(asset: Asset) -> Usd.Stage:
+    """The asset as everybody else opens it: the root layer, with the artist's opinions."""
+    return open_stage(asset.root_layer)
+
+
+def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
+    """A stage that composes without errors, from the files as they are now."""
+    subject = layer if isinstance(layer, Path) else layer.subLayerPaths[0]
+    try:
+        stage = Usd.Stage.Open(str(layer) if isinstance(layer, Path) else layer)
+        for used in stage.GetUsedLayers():
+            # Another stage of this process may hold a layer from before it was written anew; one
+            # that its sublayers left meanwhile is gone.
+            if not used.expired and not used.anonymous:
+                used.Reload()
+        problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
+    except Tf.ErrorException as error:
+        raise InputRefused(
+            f"{subject}: USD cannot open it: {in_one_line(error)}. Correct that file, or take an "
+            "earlier copy of it. [stage.open]"
+        ) from error
+    if problems:
+        raise InputRefused(
+            f"{subject}: the stage does not compose: {problems[0]}. Correct that layer, or bring "
+            "back the file that it names. [stage.open]"
+        )
+    return stage
+
+
+def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
+    layers = [asset.layer(role) for role in roles]
+    for layer in layers:
+        if not layer.is_file():
+            raise InputRefused(
+                f"{layer}: the layer is missing. Run the stage that writes it first. "
+                "[stage.missing]"
+            )
+    header = read_header(layers[0])
+    root = new_layer(header, Provenance(role="view", version="1"))
+    root.subLayerPaths = [str(layer) for layer in reversed(layers)]
+    return open_stage(root)

@@ -1,0 +1,180 @@
+"""The labelled meshes of a stage -> one triangle soup in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pxr import Usd, UsdGeom, Vt
+
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.normals import corner_normals
+from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.mesh import Triangulation, triangulate
+from usdbrdf.model.scene import Scene, SceneObject
+
+_TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Mesh:
+    points: Float
+    triangles: Int
+    corner_normals: Float
+    corner_uv: Float | None
+
+
+def scene_from_stage(stage: Usd.Stage) -> Scene:
+    """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
+
+    Meshes without normals of their own get them by the crease angle that ingest was given.
+    """
+    prims = [prim for prim in stage.Traverse() if is_object(prim)]
+    if not prims:
+        raise InputRefused(
+            f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
+            "Run ingest again. [stage.objects]"
+        )
+    crease_angle_deg = _crease_angle_deg(stage)
+    meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
+    num_faces = [len(mesh.triangles) for mesh in meshes]
+    first_face = np.cumsum([0, *num_faces])
+    first_point = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    objects = tuple(
+        SceneObject(
+            prim_path=str(prim.GetPath()),
+            identifier=str(prim.GetAttribute("usdBrdf:identifier").Get() or prim.GetName()),
+            label=str(prim.GetAttribute("usdBrdf:label").Get()),
+            class_name=str(prim.GetAttribute("usdBrdf:class").Get() or ""),
+            first_face=int(first_face[i]),
+            num_faces=num_faces[i],
+        )
+        for i, prim in enumerate(prims)
+    )
+    shifted = [mesh.triangles + first_point[i] for i, mesh in enumerate(meshes)]
+    return Scene(
+        objects=objects,
+        points=np.concatenate([mesh.points for mesh in meshes]),
+        triangles=np.concatenate(shifted).astype(np.int32),
+        corner_normals=np.concatenate([mesh.corner_normals for mesh in meshes]),
+        face_object=np.repeat(np.arange(len(meshes), dtype=np.int32), num_faces),
+        corner_uv=_joined_uv(prims, meshes),
+    )
+
+
+def is_object(prim: Usd.Prim) -> bool:
+    """True for a mesh that ingest labelled."""
+    label = prim.GetAttribute("usdBrdf:label")
+    return bool(label and label.HasAuthoredValue() and prim.IsA(UsdGeom.Mesh))
+
+
+def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
+    """(T, 3, 2) texture coordinates that the texturing stage authored; None before it ran.
+
+    An input file's own primvars:st does not count: only ours go with our textures.
+    """
+    ours = mesh.GetPrim().GetAttribute("usdBrdf:texturing:texelSize")
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    if not (ours and ours.HasAuthoredValue() and primvar):
+        return None
+    values = np.asarray(primvar.ComputeFlattened(_TIME), np.float32)
+    return np.ascontiguousarray(values[fans.corners])
+
+
+def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
+    """(T, 3, 2) texture coordinates that an input file's mesh came with, for the corners of the
+    object's triangles as ``scene_from_stage`` orders them; None where it has none to use."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    given = primvar.ComputeFlattened(_TIME) if primvar and primvar.HasAuthoredValue() else None
+    if not isinstance(given, Vt.Vec2fArray | Vt.Vec2dArray | Vt.Vec2hArray):
+        return None
+    values = np.asarray(given, np.float32)
+    element = triangulation_of(mesh).element_of_corner(primvar.GetInterpolation())
+    if element.max(initial=-1) >= len(values):
+        return None
+    uv = values[element]
+    return np.ascontiguousarray(uv[:, [0, 2, 1]] if _is_mirrored(mesh) else uv)
+
+
+def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
+    """The mesh as triangles, counter-clockwise seen from outside, in its own frame."""
+    holes = mesh.GetHoleIndicesAttr().Get(_TIME)
+    return triangulate(
+        np.asarray(mesh.GetFaceVertexCountsAttr().Get(_TIME), np.int32),
+        np.asarray(mesh.GetFaceVertexIndicesAttr().Get(_TIME), np.int32),
+        left_handed=mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded,
+        holes=np.asarray(holes, np.int32) if holes else None,
+    )
+
+
+def _crease_angle_deg(stage: Usd.Stage) -> float:
+    """As the scan's layer records it; the default of ingest where no layer does."""
+    for layer in stage.GetLayerStack():
+        parameters = layer.customLayerData.get("usdbrdf", {}).get("parameters", {})
+        if "crease_angle_deg" in parameters:
+            return float(parameters["crease_angle_deg"])
+    return IngestOptions().crease_angle_deg
+
+
+def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
+    fans = triangulation_of(mesh)
+    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
+    meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
+    local = np.asarray(mesh.GetPointsAttr().Get(_TIME), np.float64).reshape(-1, 3)
+    world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
+    points = np.ascontiguousarray(world, np.float32)
+    triangles, uv = fans.triangles, read_corner_uv(mesh, fans)
+    normals = authored_normals(mesh, fans)
+    if _is_mirrored(mesh):
+        triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
+        uv = None if uv is None else np.ascontiguousarray(uv[:, [0, 2, 1]])
+        normals = None if normals is None else normals[:, [0, 2, 1]]
+    if normals is None:
+        in_world = corner_normals(points, triangles, crease_angle_deg)
+    else:
+        in_world = _unit(normals @ np.linalg.inv(world_from_local[:3, :3]))
+    return _Mesh(points=points, triangles=triangles, corner_normals=in_world, corner_uv=uv)
+
+
+def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
+    return bool(np.linalg.det(np.array(mesh.ComputeLocalToWorldTransform(_TIME))[:3, :3]) < 0)
+
+
+def authored_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.float64] | None:
+    """(T, 3, 3) authored normals in the mesh's frame; None where there are none to use."""
+    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")  # stronger than the attribute
+    if primvar and primvar.HasAuthoredValue():
+        values, interpolation = primvar.ComputeFlattened(_TIME), primvar.GetInterpolation()
+    else:
+        values = mesh.GetNormalsAttr().Get(_TIME)
+        interpolation = mesh.GetNormalsInterpolation()
+    if not values:
+        return None
+    normals = np.asarray(values, np.float64).reshape(-1, 3)
+    element_of_corner = fans.element_of_corner(interpolation)
+    if element_of_corner.size and element_of_corner.max() >= len(normals):
+        return None  # too few of them: the file is wrong about its normals, not about its shape
+    chosen = normals[element_of_corner]
+    usable = np.isfinite(chosen).all() and (np.linalg.norm(chosen, axis=-1) > 1e-12).all()
+    return chosen if usable else None
+
+
+def _unit(vectors: npt.NDArray[np.float64]) -> Float:
+    unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.ascontiguousarray(unit, np.float32)
+
+
+def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
+    present = [mesh.corner_uv for mesh in meshes if mesh.corner_uv is not None]
+    if not present:
+        return None
+    if len(present) < len(meshes):
+        missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
+        raise InputRefused(
+            f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
+            "Run the stage texture again. [stage.st]"
+        )
+    return np.concatenate(present)

@@ -1,0 +1,164 @@
+"""Adapters: modules that turn a capture in some format into a Scan.
+
+An adapter has ``NAME``, ``DESCRIPTION``, ``matches(path) -> bool`` and
+``read(path, options) -> Scan``. Packages announce theirs as entry points of the group
+``usdbrdf.adapters``; ours are announced in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import Distribution, EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
+from usdbrdf.job.progress import say
+from usdbrdf.model.capture import Scan
+
+GROUP = "usdbrdf.adapters"
+
+_OURS = {
+    "transforms": "usdbrdf.capture.transforms",
+    "scanner-app": "usdbrdf.capture.scanner_app",
+}
+
+
+class AdapterModule(Protocol):
+    """What a module must offer to be an adapter."""
+
+    NAME: str
+    DESCRIPTION: str
+
+    def matches(self, path: Path) -> bool:
+        """Whether this looks like a capture of the format; a glance, nothing is parsed."""
+        ...
+
+    def read(self, path: Path, options: IngestOptions) -> Scan:
+        """The capture, checked; raises the errors of ``usdbrdf.errors`` and no others."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapter:
+    """An announced adapter; ``module`` is None and ``problem`` says why if it is broken.
+
+    package  distribution and version that announce it; "" for ours
+    """
+
+    name: str
+    description: str
+    origin: str
+    module: AdapterModule | None
+    problem: str = ""
+    package: str = ""
+
+
+def list_adapters(*, plugins: bool = True) -> tuple[Adapter, ...]:
+    """Our adapters, then those of other packages by name (none of these if not ``plugins``).
+
+    Broken ones are part of the list; they are reported once and never used.
+    """
+    found = [_loaded(EntryPoint(name, module, GROUP)) for name, module in _OURS.items()]
+    if plugins:
+        # Installed, we are among the announced ourselves; our names cannot be taken over.
+        foreign = {p for p in entry_points(group=GROUP) if p.name not in _OURS}
+        found += [_loaded(p) for p in sorted(foreign, key=lambda p: (p.name, p.value))]
+    return tuple(found)
+
+
+def read_scan(
+    path: Path, options: IngestOptions, adapter: str | None = None, *, plugins: bool = True
+) -> Scan:
+    """Read a capture with the named adapter, or with the first that recognises it."""
+    return read_with(choose_adapter(path, adapter, plugins=plugins), path, options)
+
+
+def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True) -> Adapter:
+    """The named adapter, or the first that recognises the capture."""
+    adapters = list_adapters(plugins=plugins)
+    if name is not None:
+        return _named(name, adapters)
+    if not path.exists():
+        raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
+    return _recognising(path, adapters)
+
+
+def _loaded(point: EntryPoint) -> Adapter:
+    try:
+        module: Any = import_module(point.value) if point.name in _OURS else point.load()
+        missing = [
+            name
+            for name, kind in (("NAME", str), ("DESCRIPTION", str))
+            if not isinstance(getattr(module, name, None), kind)
+        ] + [name for name in ("matches", "read") if not callable(getattr(module, name, None))]
+        problem = f"it has no {', '.join(missing)}" if missing else ""
+    # Foreign code runs here and may raise anything, SystemExit included.
+    except (Exception, SystemExit) as error:
+        if point.name in _OURS:
+            raise
+        module, problem = None, f"{type(error).__name__}: {error}"
+    if problem:
+        say(
+            f"warning: adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]"
+        )
+        return Adapter(
+            name=point.name, description="", origin=point.value, module=None, problem=problem
+        )
+    return Adapter(
+        name=point.name,
+        description=module.DESCRIPTION,
+        origin=point.value,
+        module=cast(AdapterModule, module),
+        package="" if point.name in _OURS or point.dist is None else _name_of(point.dist),
+    )
+
+
+def _name_of(package: Distribution) -> str:
+    return f"{package.metadata['Name']} {package.version}"
+
+
+def _named(name: str, adapters: tuple[Adapter, ...]) -> Adapter:
+    for adapter in adapters:
+        if adapter.name == name:
+            if adapter.module is None:
+                raise UsageError(f"adapter {name!r} is broken: {adapter.problem}. [adapter.load]")
+            return adapter
+    known = ", ".join(a.name for a in adapters if a.module is not None)
+    raise UsageError(f"adapter {name!r} is not installed. Use one of {known}. [adapter.unknown]")
+
+
+def _recognising(path: Path, adapters: tuple[Adapter, ...]) -> Adapter:
+    for adapter in adapters:
+        if adapter.module is None:
+            continue
+        try:
+            if adapter.module.matches(path):
+                return adapter
+        except Exception as error:
+            if adapter.name in _OURS:
+                raise
+            say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
+    known = "; ".join(f"{a.name}: {a.description}" for a in adapters if a.module is not None)
+    raise InputRefused(
+        f"{path}: not a capture that any adapter recognises ({known}). Name the folder that holds "
+        "the capture, or choose with --adapter. [adapter.none]"
+    )
+
+
+def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
+    """What a chosen adapter makes of a capture."""
+    assert adapter.module is not None
+    try:
+        return adapter.module.read(path, options)
+    except UsdBrdfError:
+        raise
+    except Exception as error:
+        if adapter.name in _OURS:
+            raise
+        raise InputRefused(
+            f"{path}: adapter {adapter.name!r} ({adapter.origin}) failed: {error!r}. Report it to "
+            "its authors. [adapter.read]"
+        ) from error

@@ -1,0 +1,163 @@
+"""The export folder of the iOS app "3d Scanner App": photographs, ARKit poses, and a mesh.
+
+``frame_*.json`` holds a row-major camera-to-world matrix in ARKit's (OpenGL's) axes, in the frame
+of the mesh, y up, metres, and intrinsics whose pixel centres are whole numbers. Most poses have no
+photograph. Pixels are sRGB, 8 bit, so nothing that comes of them is radiometric.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.capture.findings import Findings, FrameRecord
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.parts import (
+    as_photographs,
+    geometry_from_file,
+    radiance_encoding,
+    scan_from_parts,
+)
+from usdbrdf.capture.transforms import path_in_capture
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.documents import read_json
+from usdbrdf.files.images import image_size
+from usdbrdf.model.capture import Scan
+
+NAME = "scanner-app"
+
+DESCRIPTION = 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)'
+
+# The app's own names, the one with the whole surface first.
+_MESHES = ("export.obj", "textured_output.obj", "export.ply", "export_refined.obj")
+
+_FRAME = re.compile(r"frame_\d+\.json")
+
+
+def matches(path: Path) -> bool:
+    """A folder with frame_00000.json and the like."""
+    return path.is_dir() and any(_FRAME.fullmatch(p.name) for p in path.glob("frame_*.json"))
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    """Read and check the capture."""
+    folder = path.resolve()
+    findings = Findings()
+    encoding = radiance_encoding(options, photographs=True)
+    records = as_photographs(_records(folder, options, findings), findings, folder)
+    return scan_from_parts(
+        records,
+        lambda: geometry_from_file(
+            options.mesh or _mesh(folder, options),
+            options.objects,
+            options,
+            findings,
+            capture_root=folder,
+            meters_per_unit=options.meters_per_unit or 1.0,
+        ),
+        options,
+        findings,
+        name=folder.name,
+        adapter=NAME,
+        source=folder,
+        encoding=encoding,
+        radiometric=False,
+        meters_per_unit=1.0,
+        up_axis="Y",
+    )
+
+
+def _records(folder: Path, options: IngestOptions, findings: Findings) -> list[FrameRecord]:
+    documents = sorted(p for p in folder.glob("frame_*.json") if _FRAME.fullmatch(p.name))
+    records = []
+    for document in documents:
+        photograph = path_in_capture(folder, document.with_suffix(".jpg").name, options)
+        if not photograph.is_file():
+            findings.count("poses_without_photograph", 1)
+            continue
+        pose = read_json(document, nonfinite_below=("cameraPoseARFrame",))
+        record = _record(pose, document, photograph, findings)
+        if record is not None:
+            records.append(record)
+    if not records and not findings.dropped:
+        raise InputRefused(
+            f"{folder}: {len(documents)} poses, but no photograph beside them (frame_*.jpg). "
+            "Export with images. [capture.frames]"
+        )
+    if findings.counts.get("frames_without_exposure"):
+        findings.warn(
+            f"{folder.name}: {findings.counts['frames_without_exposure']} frames state no "
+            "exposureDuration, so all count as exposed alike. [capture.exposure]"
+        )
+        records = [replace(record, exposure_time=1.0) for record in records]
+    return records
+
+
+def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> FrameRecord | None:
+    name = photograph.name
+    if not isinstance(document, dict):
+        raise InputRefused(f"{path}: not a pose of this app. Export again. [capture.format]")
+    pose = _numbers(document, "cameraPoseARFrame", 16)
+    if pose is None:
+        findings.drop(name, "it has no cameraPoseARFrame of 16 finite numbers", "capture.pose")
+        return None
+    camera = _numbers(document, "intrinsics", 9)
+    if camera is None or not (camera[0] > 0 and camera[4] > 0):
+        raise InputRefused(
+            f"{path}: no intrinsics of 9 numbers with focal lengths. Export again. [capture.camera]"
+        )
+    try:
+        resolution = _resolution(document, camera, photograph)
+    except ImageRefused as error:
+        findings.drop(name, f"the image cannot be read ({error})", "capture.image")
+        return None
+    exposure = document.get("exposureDuration")
+    known = isinstance(exposure, int | float) and exposure > 0
+    if not known:
+        findings.count("frames_without_exposure", 1)
+    return FrameRecord(
+        name=name,
+        image_path=photograph,
+        world_from_camera=np.array(pose).reshape(4, 4),
+        # The first pixel's centre is (0, 0) there and (0.5, 0.5) here.
+        intrinsics=(camera[0], camera[4], camera[2] + 0.5, camera[5] + 0.5),
+        resolution=resolution,
+        exposure_time=float(exposure) if known and exposure is not None else 1.0,
+    )
+
+
+def _resolution(
+    document: Mapping[str, Any], camera: list[float], photograph: Path
+) -> tuple[int, int]:
+    """Size of the image that the intrinsics belong to, which the OpenGL projection tells."""
+    projection = _numbers(document, "projectionMatrix", 16)
+    if projection is not None and projection[0] > 0 and projection[5] > 0:
+        return round(2 * camera[0] / projection[0]), round(2 * camera[4] / projection[5])
+    width, height, _ = image_size(photograph)
+    return width, height
+
+
+def _numbers(document: Mapping[str, Any], key: str, count: int) -> list[float] | None:
+    values = document.get(key)
+    if not isinstance(values, list) or len(values) != count:
+        return None
+    if any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
+        return None
+    return [float(v) for v in values] if np.isfinite(values).all() else None
+
+
+def _mesh(folder: Path, options: IngestOptions) -> Path:
+    others = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".ply", ".obj"))
+    for name in (*_MESHES, *others):
+        path = path_in_capture(folder, name, options)
+        if path.is_file():
+            return path
+    raise InputRefused(
+        f"{folder}: no mesh ({', '.join(_MESHES)}). Export the mesh into this folder, or name one "
+        "with --mesh. [mesh.missing]"
+    )

@@ -1,0 +1,286 @@
+"""nerfstudio's transforms.json with a mesh: poses are OpenGL camera-to-world, as USD's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.capture.checks import refuse_photographs
+from usdbrdf.capture.findings import Findings, FrameRecord
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.parts import (
+    as_photographs,
+    geometry_from_file,
+    radiance_encoding,
+    scan_from_parts,
+)
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.documents import read_json
+from usdbrdf.files.images import image_size
+from usdbrdf.files.paths import contained
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+
+
+def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
+    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
+    if candidate and "\0" not in candidate:
+        for folder in options.allow_outside:
+            path = (root / candidate).resolve()
+            if path.is_relative_to(folder.resolve()):
+                return path
+    return contained(root, candidate)
+
+
+NAME = "transforms"
+
+DESCRIPTION = "folder with transforms.json (nerfstudio), scene-linear images and a mesh"
+
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+# Tried where a name has no suffix, as in the NeRF authors' synthetic scenes.
+_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg")
+
+
+def matches(path: Path) -> bool:
+    """A folder with transforms.json, or such a document itself."""
+    return (path / "transforms.json").is_file() or (path.suffix == ".json" and path.is_file())
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    """Read and check the capture."""
+    path = path.resolve()
+    source = path / "transforms.json" if path.is_dir() else path
+    capture = _Capture(source=source, document=_document(source), options=options)
+    findings = Findings()
+    records = _records(capture, findings)
+    photographs = refuse_photographs(
+        [r.image_path for r in records], assume_srgb=options.assume_srgb
+    )
+    encoding = radiance_encoding(options, photographs=photographs)
+    if photographs:
+        records = as_photographs(records, findings, source)
+    else:
+        _warn_of_missing_exposure(capture, records, findings)
+    return scan_from_parts(
+        records,
+        lambda: geometry_from_file(
+            options.mesh or _beside(capture, "mesh", "mesh.ply"),
+            _objects(capture),
+            options,
+            findings,
+            capture_root=source.parent,
+            meters_per_unit=options.meters_per_unit or 1.0,
+        ),
+        options,
+        findings,
+        name=source.parent.name,
+        adapter=NAME,
+        source=source,
+        encoding=encoding,
+        radiometric=not photographs,
+        meters_per_unit=1.0,
+        up_axis="Z",
+    )
+
+
+def frame_records(
+    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+) -> list[FrameRecord]:
+    """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
+
+    Those without pose or file are in ``findings``; poses are not yet known to be rigid. Without
+    ``images`` no file is asked for where the document itself states width and height.
+    """
+    source = source.resolve()
+    capture = _Capture(source=source, document=_document(source), options=options, images=images)
+    return _records(capture, findings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Capture:
+    """The document, its path, and what the user said."""
+
+    source: Path
+    document: Mapping[str, Any]
+    options: IngestOptions
+    images: bool = True
+
+    def refuse(self, text: str, rule: str) -> InputRefused:
+        return InputRefused(f"{self.source}: {text} [{rule}]")
+
+    def number(self, frame: Mapping[str, Any], key: str) -> float | None:
+        """A number of the frame, else of the document, else None."""
+        value = frame.get(key, self.document.get(key))
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.refuse(f"{key} is {value!r}, not a number. Correct it.", "capture.format")
+        return float(value)
+
+    def positive(self, frame: Mapping[str, Any], key: str) -> float | None:
+        value = self.number(frame, key)
+        if value is not None and not value > 0:
+            raise self.refuse(f"{key} is {value:g}, not above 0. Correct it.", "capture.format")
+        return value
+
+
+def _document(source: Path) -> Mapping[str, Any]:
+    # A camera that could not be placed costs its frame, not the capture.
+    document = read_json(source, nonfinite_below=("transform_matrix",))
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputRefused(
+            f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
+            "capture's own document. [capture.format]"
+        )
+    return document  # type: ignore[no-any-return]
+
+
+def _records(capture: _Capture, findings: Findings) -> list[FrameRecord]:
+    return [r for f in capture.document["frames"] if (r := _record(capture, f, findings))]
+
+
+def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
+    """One frame, or None where its pose or its file is missing."""
+    name = frame.get("file_path")
+    if not isinstance(name, str):
+        findings.drop("(unnamed)", "it has no file_path", "capture.file")
+        return None
+    _refuse_distortion(capture, frame, name)
+    width, height = capture.positive(frame, "w"), capture.positive(frame, "h")
+    stated = width is not None and height is not None
+    needed = capture.images or not stated
+    path = _image_path(capture, name) if needed else capture.source.parent / name
+    if needed and not path.is_file():
+        findings.drop(name, "the image file does not exist", "capture.file")
+        return None
+    pose = _pose(frame.get("transform_matrix"))
+    if pose is None:
+        findings.drop(name, "it has no transform_matrix of 4 x 4 finite numbers", "capture.pose")
+        return None
+    if width is None or height is None:
+        try:
+            width, height, _ = image_size(path)
+        except ImageRefused as error:
+            findings.drop(name, f"the image cannot be read ({error})", "capture.image")
+            return None
+    return FrameRecord(
+        name=name,
+        image_path=path,
+        world_from_camera=_undo_applied_transform(capture, pose),
+        intrinsics=_intrinsics(capture, frame, name, width, height),
+        resolution=(int(width), int(height)),
+        exposure_time=capture.positive(frame, "exposure_time") or 1.0,
+        saturation_radiance=capture.positive(frame, "saturation_radiance") or math.inf,
+        noise_floor_radiance=capture.number(frame, "noise_floor_radiance") or 0.0,
+    )
+
+
+def _image_path(capture: _Capture, name: str) -> Path:
+    path = path_in_capture(capture.source.parent, name, capture.options)
+    if not path.suffix and not path.exists():
+        candidates = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
+        return next((candidate for candidate in candidates if candidate.is_file()), path)
+    return path
+
+
+def _pose(matrix: object) -> Double | None:
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError):
+        return None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0.0, 0, 0, 1]])
+    return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
+
+
+def _intrinsics(
+    capture: _Capture, frame: Mapping[str, Any], name: str, width: float, height: float
+) -> tuple[float, float, float, float]:
+    fx, fy = capture.positive(frame, "fl_x"), capture.positive(frame, "fl_y")
+    across, up = (
+        capture.positive(frame, "camera_angle_x"),
+        capture.positive(frame, "camera_angle_y"),
+    )
+    if fx is None and across is not None:
+        fx = width / (2 * math.tan(across / 2))
+    if fy is None and up is not None:
+        fy = height / (2 * math.tan(up / 2))
+    if fx is None or not fx > 0:
+        raise capture.refuse(
+            f"the frame {name!r} has neither fl_x nor a camera_angle_x below 180 degrees. State "
+            "the focal length in pixels.",
+            "capture.camera",
+        )
+    cx, cy = capture.number(frame, "cx"), capture.number(frame, "cy")
+    return fx, fy or fx, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _refuse_distortion(capture: _Capture, frame: Mapping[str, Any], name: str) -> None:
+    model = frame.get("camera_model", capture.document.get("camera_model", "PINHOLE"))
+    if model not in _PINHOLES:
+        raise capture.refuse(
+            f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_PINHOLES)}). "
+            "Undistort the images to a pinhole camera first.",
+            "capture.camera",
+        )
+    bent = [key for key in _DISTORTION if capture.number(frame, key)]
+    if bent:
+        raise capture.refuse(
+            f"the frame {name!r} has lens distortion ({', '.join(bent)} not 0). Undistort the "
+            "images to a pinhole camera first, for instance with COLMAP's image_undistorter.",
+            "capture.camera",
+        )
+
+
+def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
+    """Back from nerfstudio's world to the one that the mesh was made in."""
+    scale = capture.positive({}, "applied_scale") or 1.0
+    undone = pose.copy()
+    undone[:3, 3] /= scale
+    applied = capture.document.get("applied_transform")
+    if applied is None:
+        return undone
+    matrix = _pose(applied)
+    if matrix is None or np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 1e-3:
+        raise capture.refuse(
+            "applied_transform is not a rigid 3 x 4 matrix. Correct or remove it.", "capture.pose"
+        )
+    return np.asarray(np.linalg.inv(matrix) @ undone, np.float64)
+
+
+def _beside(capture: _Capture, key: str, usual: str) -> Path:
+    """The file that the document names under ``key``, else the usual one beside it."""
+    name = capture.document.get(key, usual)
+    if not isinstance(name, str):
+        raise capture.refuse(f"{key} is not a file name. Correct it.", "capture.format")
+    return path_in_capture(capture.source.parent, name, capture.options)
+
+
+def _objects(capture: _Capture) -> Path | None:
+    if capture.options.objects is not None:
+        return capture.options.objects
+    path = _beside(capture, "objects", "objects.json")
+    return path if "objects" in capture.document or path.is_file() else None
+
+
+def _warn_of_missing_exposure(
+    capture: _Capture, records: list[FrameRecord], findings: Findings
+) -> None:
+    unknown = sum(math.isinf(r.saturation_radiance) for r in records)
+    if unknown:
+        findings.warn(
+            f"{capture.source.name}: {unknown} of {len(records)} frames state no "
+            "saturation_radiance, so clipped pixels pass for radiance. [capture.saturation]"
+        )
+    masks = sum("mask_path" in frame for frame in capture.document["frames"])
+    if masks:
+        findings.warn(f"{capture.source.name}: {masks} mask_path are not used. [capture.mask]")

@@ -1,0 +1,59 @@
+"""Names as captured -> USD identifiers that are also safe as file names everywhere."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import unicodedata
+from collections.abc import Sequence
+
+_MAX_LENGTH = 64
+
+# Device names that Windows refuses as a file's stem, whatever the extension.
+_RESERVED = frozenset(
+    ["aux", "con", "nul", "prn", *(f"{d}{i}" for d in ("com", "lpt") for i in range(10))]
+)
+
+
+def unique_identifiers(labels: Sequence[str]) -> list[str]:
+    """One identifier per label: ASCII, legal in USD, unique even where case does not count.
+
+    A label that is its own identifier keeps it; of labels that reduce to the same identifier the
+    first keeps it and the others get a suffix, a hash of the label and of how often it occurred
+    before, so that the names depend on the labels alone.
+    """
+    wanted = [identifier_from(label) for label in labels]
+    exact_first = sorted(range(len(labels)), key=lambda i: wanted[i] != labels[i])
+    names = [""] * len(labels)
+    taken: set[str] = set()
+    for i in exact_first:
+        name, occurrence = wanted[i], list(labels[:i]).count(labels[i])
+        while name.lower() in taken:
+            name = f"{wanted[i][: _MAX_LENGTH - 9]}_{_digest(f'{occurrence}:{labels[i]}')}"
+            occurrence += 1
+        taken.add(name.lower())
+        names[i] = name
+    return names
+
+
+def identifier_from(label: str, *, fallback: str = "object") -> str:
+    """ASCII identifier nearest to a label: accents dropped, everything else foreign becomes "_"."""
+    name = label
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", label):
+        plain = unicodedata.normalize("NFKD", label).encode("ascii", "ignore").decode("ascii")
+        name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")
+    if not name:
+        return fallback
+    if name[0].isdigit() or name.lower() in _RESERVED:
+        name = f"_{name}"
+    return name[:_MAX_LENGTH]
+
+
+def readable_label(label: str) -> str:
+    """The label as USD can store it: control characters and lone surrogates become U+FFFD."""
+    encodable = label.encode("utf-8", "replace").decode("utf-8")
+    return "".join("\ufffd" if unicodedata.category(c) == "Cc" else c for c in encodable)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:8]

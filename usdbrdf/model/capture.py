@@ -1,0 +1,67 @@
+"""What a capture is: the frozen values that the adapters hand to the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.mesh import ObjectLabel, ScanMesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """N photographs with pinhole cameras, all of scene-linear radiance once read.
+
+    image_paths           N absolute paths
+    world_from_camera     (N, 4, 4) float64, rigid, scene units; OpenGL axes (x right, y up, looks
+                          down -z)
+    intrinsics            (N, 4) float64: fx, fy, cx, cy in pixels; the first pixel's centre is
+                          (0.5, 0.5)
+    resolution            (N, 2) int32: width, height
+    exposure_time         (N,) float64, seconds (1 where unknown)
+    saturation_radiance   (N,) float64: a channel >= 0.998 of it is clipped
+    noise_floor_radiance  (N,) float64: a channel below it is noise
+    encoding              colour space of the stored images, in OpenColorIO's names:
+                          "lin_rec709_scene", "lin_ap1_scene" or "srgb_rec709_scene"
+    radiometric           False where the images are low dynamic range photographs
+    """
+
+    image_paths: tuple[Path, ...]
+    world_from_camera: Double
+    intrinsics: Double
+    resolution: Int
+    exposure_time: Double
+    saturation_radiance: Double
+    noise_floor_radiance: Double
+    encoding: str = "lin_rec709_scene"
+    radiometric: bool = True
+
+    def __len__(self) -> int:
+        return len(self.image_paths)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan:
+    """A capture, checked: what ``ingest`` writes into the stage.
+
+    meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses.
+    usd_geometry   the USD file that holds the meshes, if the geometry came as USD; then
+                   ``object_prims`` gives, per object, the mesh's path below that file's default
+                   prim
+    warnings       sentences that were printed, kept for the record
+    counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
+    """
+
+    name: str
+    adapter: str
+    source: Path
+    mesh: ScanMesh
+    objects: tuple[ObjectLabel, ...]
+    frames: Frames
+    meters_per_unit: float = 1.0
+    up_axis: str = "Z"
+    usd_geometry: Path | None = None
+    object_prims: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    counts: dict[str, int] = field(default_factory=dict)

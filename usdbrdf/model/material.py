@@ -1,0 +1,156 @@
+"""Surfaces with their materials, as a path tracer is given them: nothing of the file formats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.model.arrays import Double, Float, Int
+
+UNKNOWN_DIFFUSE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """A diffuse term, a specular lobe and emission; each a map over uv, 1 x 1 where constant.
+
+    The rows of a map run from v = 1 down to v = 0, as they lie in image files.
+
+    diffuse    (H, W, 3) float32, reflectance of the diffuse term
+    f0         (H, W, 3) float32, specular reflectance at normal incidence; white at the edge
+    roughness  (H, W, 1) float32, as UsdPreviewSurface's: its square is the alpha of GGX
+    emission   (H, W, 3) float32, radiance that leaves the front of the surface
+    wrap       what the maps are beyond uv of 0 to 1: "clamp", "repeat" or "mirror"
+    base, metallic   (H, W, 3) and (H, W, 1) float32, of what diffuse and f0 of a metal were mixed;
+               None where there is no metal
+    """
+
+    diffuse: Float
+    f0: Float
+    roughness: Float
+    emission: Float
+    wrap: str = "clamp"
+    base: Float | None = None
+    metallic: Float | None = None
+
+    @property
+    def emits(self) -> bool:
+        return bool((self.emission > 0).any())
+
+    @property
+    def unlit(self) -> Material:
+        """The same without emission. What reflects nothing either, as an emitter whose reflectance
+        nobody could measure, becomes grey: black would be a claim, and a visible one."""
+        unknown = not self.diffuse.any()
+        diffuse = constant_map(UNKNOWN_DIFFUSE) if unknown else self.diffuse
+        return replace(self, diffuse=diffuse, emission=constant_map(0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """A triangle mesh of one material.
+
+    name            prim path, or file name
+    points          (V, 3) float64 metres
+    triangles       (F, 3) int32, counter-clockwise seen from the front
+    corner_normals  (F, 3, 3) float32 unit vectors
+    corner_uv       (F, 3, 2) float32, v up; None where the material has no maps
+    corner_colour   (F, 3, 3) float32 to be multiplied on the diffuse map; None where it has none
+    corner_f0       (F, 3, 3) float32 in place of the map of f0; None where that holds
+    two_sided       False if the back is black
+    """
+
+    name: str
+    points: Double
+    triangles: Int
+    corner_normals: Float
+    corner_uv: Float | None = None
+    corner_colour: Float | None = None
+    corner_f0: Float | None = None
+    material: Material
+    two_sided: bool = True
+
+    @property
+    def bounds(self) -> Double:
+        """(2, 3): least and greatest corner of the triangles."""
+        used = self.points[self.triangles].reshape(-1, 3)
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    def moved(self, world_from_here: Double) -> Surface:
+        """The surface under an affine map (4, 4) of column vectors; a mirroring one keeps the
+        front in front."""
+        linear = world_from_here[:3, :3]
+        points = self.points @ linear.T + world_from_here[:3, 3]
+        turned: dict[str, Any] = {
+            name: getattr(self, name)
+            for name in ("triangles", "corner_normals", "corner_uv", "corner_colour", "corner_f0")
+        }
+        turned["corner_normals"] = _unit(self.corner_normals @ np.linalg.inv(linear))
+        if np.linalg.det(linear) < 0:
+            turned = {
+                name: None if values is None else np.ascontiguousarray(values[:, [0, 2, 1]])
+                for name, values in turned.items()
+            }
+        return replace(self, points=points, **turned)
+
+
+def constant_map(*value: float) -> Float:
+    """A 1 x 1 map; one value alone stands for all of three channels."""
+    channels = value * 3 if len(value) == 1 else value
+    return np.array(channels, np.float32).reshape(1, 1, -1)
+
+
+def zoomed(image: Float, height: int, width: int) -> Float:
+    """The map at another resolution, nearest texel."""
+    rows = np.arange(height) * image.shape[0] // height
+    columns = np.arange(width) * image.shape[1] // width
+    return np.asarray(image[rows][:, columns])
+
+
+def normal_reflectance(ior: float) -> np.float32:
+    """Specular reflectance of a dielectric at normal incidence, against air."""
+    return np.float32(((1 - ior) / (1 + ior)) ** 2)
+
+
+def preview_material(
+    *,
+    diffuse: Float,
+    metallic: Float,
+    roughness: Float,
+    emission: Float,
+    ior: float = 1.5,
+    specular: Float | None = None,
+) -> Material:
+    """The material of UsdPreviewSurface's inputs (its specification, "Core Nodes").
+
+    Metallic workflow: F0 = mix(((1 - ior) / (1 + ior))^2, diffuse, metallic), and metal has no
+    diffuse term. Specular workflow, where ``specular`` (H, W, 3) is given: F0 is that colour.
+    """
+    if specular is not None:
+        return Material(diffuse=diffuse, f0=specular, roughness=roughness, emission=emission)
+    dielectric = normal_reflectance(ior)
+    if not metallic.any():  # the usual case, and the diffuse map may be large
+        return Material(
+            diffuse=diffuse,
+            f0=constant_map(float(dielectric)),
+            roughness=roughness,
+            emission=emission,
+        )
+    height, width = np.maximum(diffuse.shape[:2], metallic.shape[:2])
+    diffuse, metallic = zoomed(diffuse, height, width), zoomed(metallic, height, width)
+    return Material(
+        diffuse=np.asarray(diffuse * (1 - metallic), np.float32),
+        f0=np.asarray(dielectric + metallic * (diffuse - dielectric), np.float32),
+        roughness=roughness,
+        emission=emission,
+        base=diffuse,
+        metallic=metallic,
+    )
+
+
+def _unit(vectors: npt.NDArray[Any]) -> Float:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-30), np.float32)

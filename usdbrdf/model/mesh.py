@@ -1,0 +1,144 @@
+"""Triangle meshes as they were captured, and polygons as triangles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import UsdGeom
+
+from usdbrdf.model.arrays import Double, Float, Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectLabel:
+    """One object of the segmentation: a USD identifier, the name as captured, its class."""
+
+    identifier: str
+    label: str
+    class_name: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanMesh:
+    """All triangles of the scan in one soup, in scene units.
+
+    points          (V, 3) float32
+    triangles       (F, 3) int32, counter-clockwise seen from outside
+    corner_normals  (F, 3, 3) float32, unit shading normals
+    face_object     (F,) int32, index into Scan.objects
+    """
+
+    points: Float
+    triangles: Int
+    corner_normals: Float
+    face_object: Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Triangulation:
+    """T triangles of P polygons with C corners in all.
+
+    triangles  (T, 3) int32, point indices, counter-clockwise seen from outside
+    corners    (T, 3) int32, index of each triangle corner among the C polygon corners
+    polygon    (T,) int32, the polygon that each triangle came from
+    """
+
+    triangles: Int
+    corners: Int
+    polygon: Int
+
+    def element_of_corner(self, interpolation: str) -> Int:
+        """(T, 3) int32: which value of a primvar of this interpolation each corner has."""
+        by_interpolation: dict[str, Int] = {
+            UsdGeom.Tokens.faceVarying: self.corners,
+            UsdGeom.Tokens.vertex: self.triangles,
+            UsdGeom.Tokens.varying: self.triangles,
+            UsdGeom.Tokens.uniform: np.repeat(self.polygon[:, None], 3, axis=1),
+            UsdGeom.Tokens.constant: np.zeros_like(self.triangles),
+        }
+        return by_interpolation[interpolation]
+
+
+def triangulate(
+    counts: Int, indices: Int, *, left_handed: bool = False, holes: Int | None = None
+) -> Triangulation:
+    """Fans from each polygon's first corner; polygons that are holes or have no area disappear.
+
+    counts   (P,) corners per polygon
+    indices  (C,) point of each corner
+    """
+    counts = np.asarray(counts, np.int64)
+    fans = np.maximum(counts - 2, 0)
+    if holes is not None and len(holes):
+        fans[np.asarray(holes)] = 0
+    polygon = np.repeat(np.arange(len(counts)), fans)
+    in_fan = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)
+    first = (np.cumsum(counts) - counts)[polygon]
+    corners = np.stack([first, first + in_fan + 1, first + in_fan + 2], axis=-1)
+    if left_handed:
+        corners = corners[:, [0, 2, 1]]
+    return Triangulation(
+        triangles=np.asarray(indices, np.int32)[corners].reshape(-1, 3),
+        corners=corners.astype(np.int32),
+        polygon=polygon.astype(np.int32),
+    )
+
+
+def welded_ids(points: Float) -> Int:
+    """(V,) int32: vertices with bit-equal positions (V, 3) float32 get the same number.
+
+    Numbers run from 0 without gaps, in the order of x, then y, then z. Minus zero equals zero.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int32)
+    position = np.asarray(points, np.float32) + np.float32(0)  # -0.0 becomes 0.0
+    order = np.lexsort((position[:, 2], position[:, 1], position[:, 0]))
+    in_order = position[order]
+    differs = np.zeros(len(points), np.int32)
+    differs[1:] = (in_order[1:] != in_order[:-1]).any(axis=1)
+    ids = np.zeros(len(points), np.int32)
+    ids[order] = np.cumsum(differs, dtype=np.int32)
+    return ids
+
+
+_AT_A_TIME = 1 << 18
+
+
+def face_normals(points: Float, triangles: Int) -> Double:
+    """(F, 3) float64 unit normals, counter-clockwise; zero where a triangle has no area."""
+    return face_normals_and_angles(points, triangles)[0]
+
+
+def doubled_areas(points: Float, triangles: Int) -> Double:
+    """(F,) float64, twice the triangles' areas, in the points' unit squared; some triangles at a
+    time, which takes little memory."""
+    doubled = np.empty(len(triangles))
+    for start in range(0, len(triangles), _AT_A_TIME):
+        part = slice(start, start + _AT_A_TIME)
+        doubled[part] = np.linalg.norm(across_triangles(points, triangles[part]), axis=1)
+    return doubled
+
+
+def across_triangles(points: Float, triangles: Int) -> Double:
+    """(F, 3) float64 along the triangles' normals, as long as twice their areas."""
+    first, second, third = (points[triangles[:, k]].astype(np.float64) for k in range(3))
+    across: Double = np.cross(second - first, third - first)
+    return across
+
+
+def face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:
+    """Unit face normals (F, 3) and corner angles (F, 3) in radians; zeros without area."""
+    corner = points.astype(np.float64)[triangles]
+    edge = np.roll(corner, -1, axis=1) - corner  # from each corner to the next
+    length = np.linalg.norm(edge, axis=2, keepdims=True)
+    # Unit edges first: the product of two tiny edges would underflow, that of unit ones cannot.
+    edge = np.divide(edge, length, out=np.zeros_like(edge), where=length > 0)
+    across = np.cross(edge, -np.roll(edge, 1, axis=1))
+    sine = np.linalg.norm(across, axis=2)
+    cosine = -(edge * np.roll(edge, 1, axis=1)).sum(axis=2)
+    best = np.take_along_axis(across, sine.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    size = np.linalg.norm(best, axis=1, keepdims=True)
+    has_area = size > 1e-12
+    normal = np.divide(best, size, out=np.zeros_like(best), where=has_area)
+    return normal, np.where(has_area, np.arctan2(sine, cosine), 0.0)

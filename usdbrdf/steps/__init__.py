@@ -1,1 +1,0 @@
-"""The four steps of the method, each from the composed stage to one layer of its own."""

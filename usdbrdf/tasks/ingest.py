@@ -1,0 +1,121 @@
+"""Step 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.asset.header import StageHeader
+from usdbrdf.asset.layers.capture_camera import relative_path
+from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pending_layer, write_root
+from usdbrdf.asset.layers.scan_layer import write_scan_layer
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.capture.adapters import choose_adapter, read_with
+from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.parts import USD_SUFFIXES
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.tasks.step import Step, hash_of_files
+from usdbrdf.untrusted.usd_paths import layers_of_usd
+
+
+def ingest(
+    capture: Path,
+    asset: Asset,
+    options: IngestOptions,
+    adapter: str | None = None,
+    *,
+    plugins: bool = True,
+) -> StageResult:
+    """Read and check a capture and write it as the weakest layer of ``asset``.
+
+    Raises InputRefused for a capture that cannot be used; nothing is published then.
+    """
+    parameters: dict[str, Any] = {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in asdict(options).items()
+        if key not in ("mesh", "objects", "allow_outside")
+    }
+    inputs = _inputs(capture, options, asset.folder)
+    chosen = choose_adapter(capture, adapter, plugins=plugins)
+    if chosen.package:
+        # Our own adapters change with the version of the code, which every stamp holds.
+        parameters["adapter_package"] = chosen.package
+    step = Step(
+        asset=asset,
+        name="ingest",
+        role="scan",
+        parameters={
+            "adapter": adapter or "recognised",
+            "places": _places(capture, options, asset),
+            **parameters,
+        },
+        inputs=inputs,
+    )
+
+    def work(run: StageRun) -> dict[str, Any]:
+        scan = read_with(chosen, capture, options)
+        for warning in scan.warnings:
+            say(f"warning: {warning}")
+        header = StageHeader.of_scan(asset.name, scan)
+        check_root(asset, header)
+        write_scan_layer(
+            run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, step.provenance
+        )
+        write_root(run.output_once(asset.root_layer.name), asset, header)
+        write_edits(run.output_once(asset.edits_layer.name), asset, header)
+        for role in ROLES[1:]:
+            name = f"layers/{asset.layer(role).name}"
+            write_pending_layer(run.output_once(name), role, header)
+        return {
+            "adapter": scan.adapter,
+            "frames": len(scan.frames),
+            "objects": len(scan.objects),
+            "triangles": len(scan.mesh.triangles),
+            "radiometric": scan.frames.radiometric,
+            "counts": scan.counts,
+            "warnings": list(scan.warnings),
+        }
+
+    return step.run(work)
+
+
+def _places(capture: Path, options: IngestOptions, asset: Asset) -> dict[str, str]:
+    """Where the inputs lie, seen from scan.usdc, which names photographs and USD geometry by such
+    paths: what is moved must be read anew."""
+    layers = asset.layer("scan").parent
+    places = {"capture": capture, "mesh": options.mesh}
+    places |= {f"outside-{i}": folder for i, folder in enumerate(options.allow_outside)}
+    return {
+        name: relative_path(place.resolve(), layers)
+        for name, place in places.items()
+        if place is not None
+    }
+
+
+def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str]:
+    """Hashes of all that ingest may read: the capture's folder and those that its documents may
+    point into, without the asset if that lies in one, and files named by options."""
+    folder = (capture if capture.is_dir() else capture.parent).resolve()
+    if not capture.exists():
+        raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
+    inputs = {"capture": _hash_of_folder(folder, asset)}
+    for i, outside in enumerate(options.allow_outside):
+        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset)
+    mesh, objects = options.mesh, options.objects
+    if mesh is not None and mesh.is_file():
+        # What a USD mesh refers to may lie beside it, out of the capture.
+        usd = mesh.suffix.lower() in USD_SUFFIXES
+        layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
+        inputs["mesh"] = hash_of_files(layers)
+    if objects is not None and objects.is_file():
+        inputs["objects"] = hash_of_files([objects])
+    return inputs
+
+
+def _hash_of_folder(folder: Path, asset: Path) -> str:
+    own = asset.resolve()
+    files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
+    return hash_of_files(sorted(files), folder)

@@ -1,0 +1,103 @@
+"""The non-diffuse lobe f_nd of the paper (eq. 3-6), and how to sample it.
+
+    f_nd = G D F
+    D = alpha^2 / (pi (1 + (alpha^2 - 1) (n.h)^2)^2),        alpha = max(0.001, phi)
+    G = G1(n.w, y) G1(n.wo, y),                              y = (phi/2 + 1/2)^2
+        G1(x, y) = 1 / (x + sqrt(x^2 + y^2 - x^2 y^2))
+    F = F0 + (1 - F0) (1 - w.h)^5,                           F0 = 0.08 psi
+
+G1 already contains the microfacet denominator: G = G_smith / (4 n.w n.wo). F is affine in psi, so
+f_nd(phi, psi) = base(phi) + psi * slope(phi); psi = 0 still leaves the grazing part, ``base``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from usdbrdf.kernel import kernel
+from usdbrdf.model.arrays import Double
+
+F0_OF_PSI = 0.08
+
+MIN_ALPHA = 0.001
+
+
+@kernel
+def alpha_of_phi(phi: float) -> float:
+    """Width of the normal distribution: max(0.001, phi)."""
+    return max(MIN_ALPHA, phi)
+
+
+@kernel
+def distribution(sin2_h: float, alpha: float) -> float:
+    """D from sin^2 of the angle between normal and half vector.
+
+    1 + (alpha^2 - 1) cos^2 = sin^2 + alpha^2 cos^2: written so, a mirror's D keeps its digits.
+    """
+    a2 = alpha * alpha
+    below = sin2_h + a2 * (1.0 - sin2_h)
+    return a2 / (np.pi * below * below)
+
+
+@kernel
+def masking(x: float, phi: float) -> float:
+    """G1(x, y) with y = (phi/2 + 1/2)^2."""
+    y = (0.5 * phi + 0.5) ** 2
+    return float(1.0 / (x + np.sqrt(x * x + y * y - x * x * y * y)))
+
+
+@kernel
+def grazing(cos_wh: float) -> float:
+    """Schlick's (1 - w.h)^5."""
+    m = min(1.0, max(0.0, 1.0 - cos_wh))
+    return m * m * m * m * m
+
+
+@kernel
+def lobe(n: Double, w: Double, wo: Double, phi: float) -> tuple[float, float]:
+    """(base, slope) of f_nd = base + psi * slope for unit vectors n, w, wo; (0, 0) below the
+    horizon of n."""
+    nw = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+    no = n[0] * wo[0] + n[1] * wo[1] + n[2] * wo[2]
+    if nw <= 0 or no <= 0:
+        return 0.0, 0.0
+    sin2_h, cos_wh = half_vector(n, w, wo)
+    dg = distribution(sin2_h, alpha_of_phi(phi)) * masking(nw, phi) * masking(no, phi)
+    x = grazing(cos_wh)
+    return dg * x, F0_OF_PSI * dg * (1.0 - x)
+
+
+@kernel
+def half_vector(n: Double, w: Double, wo: Double) -> tuple[float, float]:
+    """(sin^2 of the angle between n and h, cosine between w and h), h = (w + wo) / |w + wo|."""
+    hx = w[0] + wo[0]
+    hy = w[1] + wo[1]
+    hz = w[2] + wo[2]
+    length = np.sqrt(hx * hx + hy * hy + hz * hz)
+    if length < 1e-12:
+        return 1.0, 0.0
+    hx, hy, hz = hx / length, hy / length, hz / length
+    cx = n[1] * hz - n[2] * hy
+    cy = n[2] * hx - n[0] * hz
+    cz = n[0] * hy - n[1] * hx
+    cos_wh = w[0] * hx + w[1] * hy + w[2] * hz
+    return min(1.0, cx * cx + cy * cy + cz * cz), cos_wh
+
+
+@kernel
+def sample_half_vector(u1: float, u2: float, alpha: float) -> tuple[float, float, float]:
+    """Half vector about +z with density D(h) cos: inverse of D's distribution function."""
+    tan2 = alpha * alpha * u1 / max(1.0 - u1, 1e-12)
+    cosine = 1.0 / np.sqrt(1.0 + tan2)
+    sine = np.sqrt(max(0.0, 1.0 - cosine * cosine))
+    angle = 2 * np.pi * u2
+    return sine * np.cos(angle), sine * np.sin(angle), cosine
+
+
+@kernel
+def reflected_density(sin2_h: float, cos_wh: float, alpha: float) -> float:
+    """Density over solid angle of w, reflected about a half vector of ``sample_half_vector``:
+    D(h) (n.h) / (4 w.h)."""
+    if cos_wh <= 0:
+        return 0.0
+    return float(distribution(sin2_h, alpha) * np.sqrt(max(0.0, 1.0 - sin2_h)) / (4.0 * cos_wh))

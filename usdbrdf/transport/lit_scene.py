@@ -1,0 +1,111 @@
+"""The scene with its light, a frame of it, and the surface points under its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.camera import camera_rays
+from usdbrdf.model.scene import Scene
+from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.lights import Lights
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.surface_texture import SurfaceTexture
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePoints:
+    """What R rays meet: face (R,) int32 (-1: nothing), position, shading normal turned to where the
+    ray came from (a camera), and direction there, each (R, 3) float32, the latter two unit."""
+
+    face: Int
+    u: Float
+    v: Float
+    position: Float
+    normal: Float
+    to_camera: Float
+
+    def take(self, index: npt.NDArray[np.int64]) -> SurfacePoints:
+        """Some of the points."""
+        return SurfacePoints(**{name: values[index] for name, values in vars(self).items()})
+
+    @staticmethod
+    def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
+        """Points after points."""
+        names = vars(parts[0])
+        return SurfacePoints(
+            **{name: np.concatenate([vars(part)[name] for part in parts]) for name in names}
+        )
+
+
+def visible_points(
+    rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
+) -> SurfacePoints:
+    """The surface under pixel coordinates (R, 2)."""
+    return points_of_rays(rays, scene, *camera_rays(world_from_camera, intrinsics, pixels))
+
+
+def points_of_rays(
+    rays: RayScene, scene: Scene, origins: Float, directions: Float
+) -> SurfacePoints:
+    """The surface that rays (R, 3) meet first, seen from where they come."""
+    hits = rays.closest(origins, directions)
+    face = np.maximum(hits.face, 0)
+    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+    normal = np.einsum("rc,rcd->rd", weights, scene.corner_normals[face])
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    towards = np.einsum("rd,rd->r", normal, directions) > 0
+    position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
+    return SurfacePoints(
+        face=hits.face,
+        u=hits.u,
+        v=hits.v,
+        position=position.astype(np.float32),
+        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
+        to_camera=-directions,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LitScene:
+    """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
+    emission mask, and the scene's size in metres."""
+
+    scene: Scene
+    rays: RayScene
+    radiance: SurfaceTexture
+    lights: Lights
+    emission: SurfaceTexture
+    environment: Environment
+    size: float
+
+    def owner(self, face: Int) -> Int:
+        """The object of each face (R,), -1 where the face is -1."""
+        return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One frame as the fit sees it: radiance (H, W, 3), valid (H, W), pose and pinhole."""
+
+    radiance: Float
+    valid: Bool
+    world_from_camera: Double
+    intrinsics: Double
+
+
+def sub_pixel_points(
+    lit: LitScene, view: View, pixels: Double, index: int, offsets: Double
+) -> tuple[Bool, SurfacePoints]:
+    """Surface points at ``offsets`` (K, 2) in pixels from each of the pixel coordinates (P, 2).
+
+    Returns which pixels have all K on object ``index``, (P,) bool, and their points in order.
+    """
+    inside = (pixels[:, None] + offsets).reshape(-1, 2)
+    points = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, inside)
+    whole = (lit.owner(points.face) == index).reshape(-1, len(offsets)).all(axis=1)
+    return whole, points.take(np.flatnonzero(np.repeat(whole, len(offsets))))

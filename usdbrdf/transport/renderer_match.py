@@ -1,0 +1,241 @@
+"""What to write into a UsdPreviewSurface so that renderers show what the fitted lobe reflects.
+
+Renderers read roughness and reflectance as another lobe than the one that was fitted (``lobe``):
+they mask by Smith's term of the same alpha, and take what is reflected away from the diffuse term.
+With the fitted numbers in it, Cycles reflects 20 to 40 % more and diffuses 4 to 10 % less.
+
+So, over a grid of phi and F0 = 0.08 psi, the reflectance F0' and a factor k on the diffuse colour
+are found that bring two renderers, Cycles and Hydra Storm, closest to the fit: F0' by least squares
+over the relative errors of the lobe's directional albedo, views weighed as under uniform light, by
+the cosine; k so that Cycles, which traces light on, reflects as much of uniform light as the fit in
+all, for a diffuse colour of 0.5: an error of 1 % grows to 4 % in a bright room. alpha stays: all
+have the same D, and so highlights keep their width.
+
+    Cycles   D G F, G Smith's height-correlated, F of a dielectric, scattering between facets
+             (C. Kulla, A. Conty 2017); diffuse (1 - A), A the lobe's directional albedo
+    Storm    D G F / (4 n.w n.wo + 0.001), G Schlick's with k = alpha / 2, F Schlick's; diffuse
+             (1 - F(w.h)). Its D, too large by 0.001 / alpha^2, is left out: no reflectance mends
+             that of a near mirror.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from usdbrdf.model.arrays import Double
+from usdbrdf.transport.brdf import F0_OF_PSI, MIN_ALPHA
+
+# Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
+_VIEWS, _SLOPES, _AZIMUTHS, _COSINES, _CANDIDATES = 24, 120, 32, 128, 400
+
+# The diffuse colour for which the sum of both terms is kept.
+_TYPICAL = 0.5
+
+_PHI = np.linspace(0, 1, 25) ** 2
+
+# Beyond psi = 1, for what an artist may choose: F0 up to 0.32, ior up to 3.6.
+_F0 = F0_OF_PSI * np.linspace(0, 2, 21) ** 2
+
+
+class Shown(NamedTuple):
+    """Reflectance F0' at normal incidence, and the factor on the diffuse colour; arrays (N,)."""
+
+    f0: Double
+    diffuse: Double
+
+
+def shown_lobe(phi: npt.ArrayLike, psi: npt.ArrayLike) -> Shown:
+    """What renderers must be given, with alpha = max(0.001, phi), for phi and psi (N,) or numbers.
+
+    Bilinear in the table; psi may reach 4, beyond which the table's end holds.
+    """
+    table = _table()
+    f0 = F0_OF_PSI * np.asarray(psi, np.float64)
+    return Shown(*(_bilinear(values, np.asarray(phi, np.float64), f0) for values in table))
+
+
+def measured_lobe(phi: float, shown_f0: float) -> tuple[float, float]:
+    """(psi, factor on the diffuse colour) of what renderers are given: ``shown_lobe`` inverted.
+
+    An F0' below that of psi = 0 is psi = 0; one beyond the table is its end.
+    """
+    along = _bilinear(_table().f0, np.full(len(_F0), phi), _F0)
+    f0 = float(np.interp(shown_f0, along, _F0))
+    return f0 / F0_OF_PSI, float(_bilinear(_table().diffuse, np.asarray(phi), np.asarray(f0)))
+
+
+@cache
+def _table() -> Shown:
+    rows = [_matched(float(phi)) for phi in _PHI]
+    return Shown(np.array([row.f0 for row in rows]), np.array([row.diffuse for row in rows]))
+
+
+def _bilinear(values: Double, phi: Double, f0: Double) -> Double:
+    weights = []
+    for knots, x in ((_PHI, phi), (_F0, f0)):
+        place = np.interp(x, knots, np.arange(len(knots)))
+        low = np.minimum(place.astype(np.intp), len(knots) - 2)
+        weights.append((low, place - low))
+    (i, u), (j, v) = weights
+    low_phi = (1 - v) * values[i, j] + v * values[i, j + 1]
+    high_phi = (1 - v) * values[i + 1, j] + v * values[i + 1, j + 1]
+    return np.asarray((1 - u) * low_phi + u * high_phi)
+
+
+def _matched(phi: float) -> Shown:
+    """F0' and k for one phi and all F0 of the table."""
+    fitted = fitted_albedo(phi, _F0)
+    candidates = np.linspace(1e-3, np.sqrt(_F0[-1]), _CANDIDATES) ** 2
+    renderers = (cycles_albedo, storm_albedo)
+    shown = [renderer(phi, candidates) for renderer in renderers]
+    error = sum(
+        ((s.lobe[:, None, :] / fitted[:, :, None] - 1) ** 2).mean(axis=0) for s in shown
+    )  # (F0, candidates)
+    f0 = _least(np.asarray(error), np.sqrt(candidates)) ** 2
+    lobe, kept = (part.mean(axis=0) for part in cycles_albedo(phi, f0))
+    diffuse = (_TYPICAL + fitted.mean(axis=0) - lobe) / (_TYPICAL * kept)
+    return Shown(f0, np.asarray(diffuse))
+
+
+def _least(error: Double, x: Double) -> Double:
+    """Where the rows of ``error`` (N, C) over even x (C,) are least, by a parabola."""
+    at = np.clip(error.argmin(axis=1), 1, len(x) - 2)
+    low, mid, high = (np.take_along_axis(error, at[:, None] + k, 1)[:, 0] for k in (-1, 0, 1))
+    shift = 0.5 * (low - high) / np.maximum(low - 2 * mid + high, 1e-300)
+    return np.asarray(x[at] + np.clip(shift, -1, 1) * (x[1] - x[0]))
+
+
+class Albedo(NamedTuple):
+    """Over directions to the viewer (V,) and reflectances (N,): directional albedo (V, N) of the
+    lobe, and the share (V, N) of the diffuse term that is left."""
+
+    lobe: Double
+    diffuse: Double
+
+
+def view_cosines() -> Double:
+    """(V,) cosines that weigh alike under uniform light."""
+    return np.asarray(np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS))
+
+
+def fitted_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Double:
+    """(V, N) directional albedo of the fitted lobe for reflectances F0 (N,)."""
+    lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
+    y = (0.5 * phi + 0.5) ** 2
+    g = _g1(lobe.cos_out, y) * _g1(lobe.cos_in, y)  # holds 1 / (4 cos cos)
+    return np.asarray(_over_cosines(lobe, g) @ _schlick(f0))
+
+
+def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:
+    """Of the lobe of Blender's Principled BSDF, which scatters between the facets too."""
+    alpha = max(MIN_ALPHA, phi)
+
+    def single(at: Double | None) -> Double:
+        lobe = _half_vectors(alpha, at)
+        g = 1 / (1 + _lambda(lobe.cos_out, alpha) + _lambda(lobe.cos_in, alpha))
+        return _over_cosines(lobe, g / (4 * lobe.cos_out * lobe.cos_in))
+
+    weights = single(cosines)
+    white, reflected = weights.sum(axis=1)[:, None], weights @ _dielectric(f0, _wh())
+    white_mean = single(None).sum(axis=1).mean()
+    fresnel_mean = _dielectric(f0, view_cosines()).mean(axis=0)
+    between = fresnel_mean * white_mean / (1 - fresnel_mean * (1 - white_mean))
+    lobe = reflected * (1 + between * (1 - white) / white)
+    return Albedo(lobe, 1 - lobe)
+
+
+def storm_albedo(
+    phi: float, f0: Double, cosines: Double | None = None, *, mirror_error: bool = False
+) -> Albedo:
+    """Of Hydra Storm's UsdPreviewSurface under direct light; ``mirror_error``: with the excess of
+    its D."""
+    alpha = max(MIN_ALPHA, phi)
+    lobe = _half_vectors(alpha, cosines)
+    k = alpha / 2
+    g = 1 / (4 * lobe.cos_out * lobe.cos_in + 0.001)
+    for x in (lobe.cos_out, lobe.cos_in):
+        g = g * x / (x * (1 - k) + k)
+    excess = 1 + 0.001 / alpha**2 if mirror_error else 1.0
+    # The diffuse term's light comes from everywhere: cosine-distributed about the normal.
+    half = _half_vectors(1.0, cosines)
+    everywhere = _over_cosines(half, half.cos_in * 0 + 1 / np.pi / _ggx(half.cos_half, 1.0))
+    kept = everywhere @ (1 - _schlick(f0)) / everywhere.sum(axis=1)[:, None]
+    return Albedo(excess * (_over_cosines(lobe, g) @ _schlick(f0)), kept)
+
+
+class _HalfVectors(NamedTuple):
+    """Half vectors h about the normal for each view: cosines of both directions and of w.h, and
+    D cos_in dw, the weight of what is left of an integrand; all (V, S, A) or to be broadcast."""
+
+    cos_out: Double
+    cos_in: Double
+    cos_half: Double
+    cos_wh: Double
+    weight: Double
+
+
+def _half_vectors(alpha: float, cosines: Double | None = None) -> _HalfVectors:
+    """tan(t) = alpha s with log s even; dw = 4 (w.h) dh, dh = sin^2 t cos t dlog(s) dazimuth."""
+    cos_out = (view_cosines() if cosines is None else cosines)[:, None, None]
+    log_s = np.linspace(np.log(1e-3), np.log(1e3 / alpha), _SLOPES)
+    t = np.arctan(alpha * np.exp(log_s))[None, :, None]
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+    cos_half, sin_half = np.cos(t), np.sin(t)
+    cos_wh = np.sqrt(1 - cos_out**2) * sin_half * np.cos(azimuth) + cos_out * cos_half
+    cos_in = 2 * cos_wh * cos_half - cos_out
+    step = (log_s[1] - log_s[0]) * 2 * np.pi / _AZIMUTHS
+    weight = 4 * cos_wh * sin_half**2 * cos_half * step * _ggx(cos_half, alpha) * cos_in
+    front = (cos_wh > 0) & (cos_in > 0)
+    return _HalfVectors(
+        cos_out,
+        np.where(front, cos_in, 1.0),
+        cos_half,
+        np.where(front, cos_wh, 1.0),
+        np.where(front, weight, 0.0),
+    )
+
+
+def _over_cosines(lobe: _HalfVectors, rest: Double) -> Double:
+    """(V, C) integral of D ``rest`` cos_in over directions, apart for each cosine of w.h."""
+    value = np.broadcast_to(lobe.weight * rest, lobe.weight.shape)
+    index = np.minimum((lobe.cos_wh * _COSINES).astype(np.intp), _COSINES - 1)
+    return np.array(
+        [np.bincount(i.ravel(), v.ravel(), _COSINES) for i, v in zip(index, value, strict=True)]
+    )
+
+
+def _wh() -> Double:
+    return np.asarray((np.arange(_COSINES) + 0.5) / _COSINES)
+
+
+def _schlick(f0: Double) -> Double:
+    """(C, N)"""
+    edge = (1 - _wh()[:, None]) ** 5
+    return np.asarray(f0 + (1 - f0) * edge)
+
+
+def _dielectric(f0: Double, cosine: Double) -> Double:
+    """(C, N) Fresnel's equations for the index of refraction that has F0."""
+    ior = (1 + np.sqrt(f0)) / (1 - np.sqrt(f0))
+    c = cosine[:, None]
+    g = np.sqrt(ior**2 - 1 + c**2)
+    return np.asarray(
+        0.5 * ((g - c) / (g + c)) ** 2 * (1 + ((c * (g + c) - 1) / (c * (g - c) + 1)) ** 2)
+    )
+
+
+def _ggx(cos_half: Double, alpha: float) -> Double:
+    below = 1 - cos_half**2 + (alpha * cos_half) ** 2
+    return np.asarray(alpha**2 / (np.pi * below**2))
+
+
+def _g1(x: Double, y: float) -> Double:
+    return np.asarray(1 / (x + np.sqrt(x**2 + y**2 - x**2 * y**2)))
+
+
+def _lambda(x: Double, alpha: float) -> Double:
+    return np.asarray(0.5 * (np.sqrt(1 + alpha**2 * (1 / x**2 - 1)) - 1))
