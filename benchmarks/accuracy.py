@@ -38,7 +38,7 @@ from usdbrdf.evaluation.truth import (
 )
 from usdbrdf.files.frames import read_frame
 from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
-from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
@@ -105,10 +105,8 @@ def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, flo
         pixels = read_frame(frames, i)
         pose, lens = frames.world_from_camera[i], frames.intrinsics[i]
         surfaces = first_surfaces(rays, scene.face_object, pose, lens, frames.resolution[i])
-        kind, radiance = samples_from_frame(
-            texels, texels.object_index(), surfaces, np.nan_to_num(pixels.radiance), pixels.valid,
-            pixels.clipped, pose, lens,
-        )  # fmt: skip
+        picture = Picture(np.nan_to_num(pixels.radiance), pixels.valid, pixels.clipped, pose, lens)
+        kind, radiance = samples_from_frame(texels, texels.object_index(), surfaces, picture)
         for t in np.flatnonzero((kind == SAMPLE) & (place >= 0)):
             store[place[t]].append(radiance[t])
     exact = np.array([np.median(samples, axis=0) for samples in store])

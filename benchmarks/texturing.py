@@ -17,6 +17,7 @@ OMP_WAIT_POLICY=PASSIVE is in the environment.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import sys
@@ -33,12 +34,19 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.model.capture import Frames
 from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.texturing import psquare
-from usdbrdf.texturing.observe import Observation, radiance_from_frames
-from usdbrdf.texturing.samples import MIN_COSINE, SAMPLE, first_surfaces, samples_of_texels
+from usdbrdf.texturing.exposures import Probes
+from usdbrdf.texturing.observe import Observation, samples_from_frames
+from usdbrdf.texturing.samples import (
+    MIN_COSINE,
+    SAMPLE,
+    Picture,
+    first_surfaces,
+    samples_from_frame,
+)
 from usdbrdf.texturing.texel_blocks import blocks_of_texels
 from usdbrdf.transport.rays import RayScene
 
@@ -68,9 +76,9 @@ def measure(asset: Path, most: int | None) -> dict[str, Any]:
     atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
     count = min(most or len(frames), len(frames))
     rays = RayScene(atlas.scene.points, atlas.scene.triangles)
-    streamed(atlas, rays, frames, Observation.empty(len(atlas.texels)), 2)  # compiles
+    streamed(atlas, rays, frames, nothing(atlas, frames), 2)  # compiles
 
-    observed = Observation.empty(len(atlas.texels))
+    observed = nothing(atlas, frames)
     early, wall = streamed(atlas, rays, frames, observed, count)
     median = psquare.quantile(observed.quantiles, QUANTILE)
     late, _ = streamed(atlas, rays, frames, observed, count)
@@ -112,15 +120,20 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
+def nothing(atlas: Atlas, frames: Frames) -> Observation:
+    """The state before the first frame."""
+    count = len(atlas.texels)
+    return Observation.empty(slice(0, count), Probes.empty(count, len(frames)))
+
+
 def streamed(
     atlas: Atlas, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
-    steps = radiance_from_frames(atlas.texels, atlas.scene, rays, frames, observed, QUANTILE)
+    images = read_frames(frames, range(count))
     cpu, wall = time.process_time(), time.perf_counter()
-    for done in steps:
-        if done == count - 1:
-            break
+    for some in samples_from_frames(atlas.texels, atlas.scene, rays, frames, images):
+        observed.add(some, QUANTILE)
     return time.process_time() - cpu, time.perf_counter() - wall
 
 
@@ -138,7 +151,7 @@ def by_parts(
 
     texels, owner = atlas.texels, atlas.texels.object_index()
     blocks = blocks_of_texels(texels, slice(0, len(texels)))
-    observed = Observation.empty(len(texels))
+    observed = nothing(atlas, frames)
     samples = []
     for i in range(count):
         pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
@@ -147,9 +160,13 @@ def by_parts(
         face_object = atlas.scene.face_object
         surfaces = timed("occlusion", first_surfaces, rays, face_object, pose, lens, size)
         kind, radiance = timed(
-            "sample", samples_of_texels, texels, which, owner, surfaces, pixels.radiance,
-            pixels.valid, pixels.clipped, pose, lens,
-        )  # fmt: skip
+            "sample",
+            functools.partial(samples_from_frame, which=which),
+            texels,
+            owner,
+            surfaces,
+            Picture(pixels.radiance, pixels.valid, pixels.clipped, pose, lens),
+        )
         taken = which[kind == SAMPLE], radiance[kind == SAMPLE]
         timed("psquare", psquare.update, observed.quantiles, *taken, QUANTILE)
         samples.append(taken)

@@ -171,12 +171,12 @@ def test_the_order_of_the_markers_never_breaks():
         texel = np.arange(50 if i < 150 else 25, dtype=np.int32)
         update(state, texel, row[: len(texel)], 0.5)
         assert (np.diff(state.heights[: len(texel), :, : min(i + 1, 5)], axis=2) >= 0).all()
-    np.testing.assert_array_equal(state.count, np.where(np.arange(50) < 25, 300, 150))
+    np.testing.assert_array_equal(state.samples, np.where(np.arange(50) < 25, 300, 150))
     np.testing.assert_array_equal(state.heights[:25, :, 0], samples.min(axis=0)[:25])
     np.testing.assert_array_equal(state.heights[:25, :, 4], samples.max(axis=0)[:25])
     inner = np.concatenate([np.ones((50, 3, 1)), state.positions], axis=2)
     assert (np.diff(inner, axis=2) >= 1).all()
-    assert (state.positions[..., 2] < state.count[:, None]).all()
+    assert (state.positions[..., 2] < state.samples[:, None]).all()
 
 
 def test_channels_and_texels_do_not_mix():
@@ -200,7 +200,7 @@ def test_a_texel_without_samples_is_nan():
 
 def test_the_state_does_not_grow_with_the_frames():
     def per_texel(state: QuantileState) -> float:
-        return sum(values.nbytes for values in vars(state).values()) / len(state.count)
+        return sum(values.nbytes for values in state) / len(state.samples)
 
     rng = np.random.default_rng(12345)
     few = _fed(rng.random((3, 100, 3)), 0.5)

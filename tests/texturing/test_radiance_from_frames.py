@@ -12,11 +12,13 @@ import pytest
 
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, look_at, ring_of_poses, room_mesh
+from usdbrdf.files.frames import read_frames
 from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.capture import Frames
-from usdbrdf.texturing.observe import Observation, radiance_from_frames, spread_order
+from usdbrdf.texturing.exposures import Probes
+from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 
@@ -71,21 +73,35 @@ def _part(corners: np.ndarray) -> Part:
     )
 
 
-def _observe(world: World, frames: Frames, observed: Observation, start: int = 0) -> list[int]:
-    return list(
-        radiance_from_frames(world.texels, world.scene, world.rays, frames, observed, 0.5, start)
-    )
+def _empty(world: World, part: slice | None = None) -> Observation:
+    count = len(world.texels)
+    return Observation.empty(part or slice(0, count), Probes.empty(count, 12, part))
+
+
+def _observe(
+    world: World,
+    frames: Frames,
+    observed: Observation,
+    start: int = 0,
+    part: slice | None = None,
+) -> list[int]:
+    images = read_frames(frames, range(start, len(frames)))
+    done = []
+    for some in samples_from_frames(world.texels, world.scene, world.rays, frames, images, part):
+        observed.add(some, 0.5)
+        done.append(some.frame)
+    return done
 
 
 def test_every_object_gets_the_radiance_it_was_drawn_with(room: Room):
     world = room.world
-    observed = Observation.empty(len(world.texels))
+    observed = _empty(world)
     assert _observe(world, room.frames, observed) == list(range(12))
     found = quantile(observed.quantiles, 0.5)
     owner = world.texels.object_index()
     lamp = owner == room.names.index("lamp")
     for index, name in enumerate(room.names):
-        seen = (owner == index) & (observed.quantiles.count > 0)
+        seen = (owner == index) & (observed.quantiles.samples > 0)
         if name == "lamp":
             assert not seen.any()
             continue
@@ -102,13 +118,14 @@ def test_every_object_gets_the_radiance_it_was_drawn_with(room: Room):
 
 
 def test_going_on_from_a_saved_state_changes_no_bit(room: Room):
-    whole = Observation.empty(len(room.world.texels))
+    whole = _empty(room.world)
     _observe(room.world, room.frames, whole)
     head = replace(room.frames, image_paths=room.frames.image_paths[:5])
-    first = Observation.empty(len(room.world.texels))
+    first = _empty(room.world)
     assert _observe(room.world, head, first) == list(range(5))
     saved = {name: values.copy() for name, values in first.arrays().items()}
-    second = Observation.from_arrays(saved)
+    second = _empty(room.world)
+    second.restore(saved)
     assert _observe(room.world, room.frames, second, start=5) == list(range(5, 12))
     for name, values in whole.arrays().items():
         np.testing.assert_array_equal(second.arrays()[name], values)
@@ -116,23 +133,23 @@ def test_going_on_from_a_saved_state_changes_no_bit(room: Room):
 
 def test_texels_in_groups_get_what_they_get_together(room: Room):
     world, count = room.world, len(room.world.texels)
-    whole = Observation.empty(count)
+    whole = _empty(world)
     _observe(world, room.frames, whole)
     for part in (slice(0, 333), slice(333, count // 2), slice(count // 2, count)):
-        own = Observation.empty(part.stop - part.start)
-        steps = radiance_from_frames(
-            world.texels, world.scene, world.rays, room.frames, own, 0.5, part=part
-        )
-        assert len(list(steps)) == 12
+        own = _empty(world, part)
+        assert len(_observe(world, room.frames, own, part=part)) == 12
+        every = whole.probes.every
+        probed = slice(-(-part.start // every), -(-part.stop // every))
         for name, values in whole.arrays().items():
-            np.testing.assert_array_equal(own.arrays()[name], values[part])
+            expected = values[probed if name == "probes" else part]
+            np.testing.assert_array_equal(own.arrays()[name], expected)
 
 
 def test_the_number_of_threads_changes_no_bit(room: Room):
-    many = Observation.empty(len(room.world.texels))
+    many = _empty(room.world)
     _observe(room.world, room.frames, many)
     threads = numba.get_num_threads()
-    one = Observation.empty(len(room.world.texels))
+    one = _empty(room.world)
     try:
         numba.set_num_threads(1)
         _observe(room.world, room.frames, one)

@@ -116,7 +116,7 @@ def test_one_good_sample_beside_bad_ones_keeps_its_error():
 
 
 def test_what_is_kept_of_a_texel_is_in_single_precision():
-    found = vars(_found(np.ones((3, 5, 3)), np.full(3, 0.1)))
+    found = _found(np.ones((3, 5, 3)), np.full(3, 0.1))._asdict()
     assert {name: values.dtype for name, values in found.items()} == dict.fromkeys(
         ("mean", "variance", "footprint"), np.dtype(np.float32)
     )

@@ -10,7 +10,14 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import look_at
-from usdbrdf.texturing.samples import CLIPPED, NOTHING, SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.texturing.samples import (
+    CLIPPED,
+    NOTHING,
+    SAMPLE,
+    Picture,
+    first_surfaces,
+    samples_from_frame,
+)
 
 WIDTH, HEIGHT = 80, 60
 LENS = np.array([80.0, 80.0, 40.0, 30.0])
@@ -39,17 +46,14 @@ def _shoot(
         world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
     )
     nowhere = np.zeros((HEIGHT, WIDTH), bool)
-    kind, radiance = samples_from_frame(
-        world.texels,
-        world.texels.object_index(),
-        surfaces,
+    picture = Picture(
         image.astype(np.float32),
         ~nowhere if valid is None else valid,
         nowhere if clipped is None else clipped,
         pose,
         LENS,
     )
-    return Shot(kind, radiance)
+    return Shot(*samples_from_frame(world.texels, world.texels.object_index(), surfaces, picture))
 
 
 def _pixel_of(pose: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,10 +190,9 @@ def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
     upper = surfaces.point[..., 2] > 0.1
     image = np.where(upper[..., None], 9.0, 1.0) * np.ones(3)
     everywhere = np.ones((HEIGHT, WIDTH), bool)
-    kind, radiance = samples_from_frame(
-        one.texels, np.zeros(len(one.texels), np.int32), surfaces, image.astype(np.float32),
-        everywhere, ~everywhere, pose, LENS,
-    )  # fmt: skip
+    picture = Picture(image.astype(np.float32), everywhere, ~everywhere, pose, LENS)
+    owner = np.zeros(len(one.texels), np.int32)
+    kind, radiance = samples_from_frame(one.texels, owner, surfaces, picture)
     seen = kind == SAMPLE
     high = one.texels.position[:, 2] > 0.1
     assert seen[high].sum() > 400

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +18,9 @@ PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 
 # A half float stores 3.2 as 3.19922: a clipped channel is one close to the saturation.
 _CLIPPED_SHARE = 0.998
+
+# Threads that decode, and frames in memory besides the one that is used.
+_READERS, _AHEAD = 2, 3
 
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
@@ -86,6 +92,22 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         unknown=unknown,
         num_clamped=int(ringing.sum()),
     )
+
+
+def read_frames(frames: Frames, order: Sequence[int]) -> Iterator[tuple[int, FramePixels]]:
+    """Number and pixels of the frames of ``order``, the next ones decoded while one is used."""
+    with ThreadPoolExecutor(max_workers=_READERS) as readers:
+        coming = deque((i, readers.submit(read_frame, frames, i)) for i in order[:_AHEAD])
+        try:
+            for ahead in range(_AHEAD, len(order) + _AHEAD):
+                i, pixels = coming.popleft()
+                found = pixels.result()
+                if ahead < len(order):
+                    coming.append((order[ahead], readers.submit(read_frame, frames, order[ahead])))
+                yield i, found
+        finally:
+            for _, job in coming:
+                job.cancel()
 
 
 def _in_any_channel(true: Bool) -> Bool:

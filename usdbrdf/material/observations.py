@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.texels import Texels
-from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
+from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
 from usdbrdf.transport.lit_scene import LitScene, View, visible_points
 from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.warps import patch_shifts
@@ -216,13 +216,14 @@ class Follower:
         if row is None or not len(self._index):
             return
         height, width = view.valid.shape
+        camera = view.world_from_camera, view.intrinsics
         surfaces = first_surfaces(
-            self._lit.rays, self._lit.scene.face_object, view.world_from_camera, view.intrinsics,
+            self._lit.rays, self._lit.scene.face_object, *camera,
             np.array([width, height], np.int32),
         )  # fmt: skip
         kind, radiance = samples_from_frame(
-            self._texels, self._owner, surfaces, view.radiance, view.valid, clipped,
-            view.world_from_camera, view.intrinsics, beside_glare=True,
+            self._texels, self._owner, surfaces,
+            Picture(view.radiance, view.valid, clipped, *camera), beside_glare=True,
         )  # fmt: skip
         seen = np.flatnonzero(kind == SAMPLE)
         self._seen[row, seen] = True

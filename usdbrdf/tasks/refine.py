@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.frames import read_frames
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -18,13 +19,12 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Texels
 from usdbrdf.tasks.albedo_map import albedo_map
 from usdbrdf.tasks.atlas import Atlas, TexelMap
-from usdbrdf.tasks.in_passes import in_passes
 from usdbrdf.tasks.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.tasks.texture import CLIPPED, FILLED
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
-from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, smallest_groups
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
@@ -136,9 +136,9 @@ def _without_lobes(
 
     def means(part: slice) -> dict[str, Float]:
         observed = _observe(run, atlas, lit, frames, lobes, level, samples, seed, part)
-        return dict(vars(robust_mean(observed)))
+        return robust_mean(observed)._asdict()
 
-    return RobustMean(**in_passes(run, "means", groups, len(atlas.texels), means))
+    return RobustMean(**in_passes(groups, means, run, "means"))
 
 
 def _bytes_of(lit: LitScene) -> int:
@@ -167,10 +167,11 @@ def _observe(
         start, observed = saved[0] + 1, MeanState(**saved[1])
     # The mean starts from its first samples, which must not all show one highlight.
     order = spread_order(len(frames))[start:]
-    shown = samples_from_frames(texels, atlas.scene, lit.rays, frames, order, part)
+    images = read_frames(frames, order)
+    shown = samples_from_frames(texels, atlas.scene, lit.rays, frames, images, part)
     bar = progress(shown, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
-        taken = _taken(some.texel, samples[some.texel], some.frame, seed)
+        taken = subsample_mask(some.texel, samples[some.texel], some.frame, seed)
         texel, radiance = some.texel[taken], some.radiance[taken]
         pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
         specular = np.empty_like(radiance)
@@ -198,7 +199,7 @@ def _deviation(unit: Float, covered: Float, noise_floor: float) -> Float:
     return np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
 
 
-def _taken(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
+def subsample_mask(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
     """Which of the texels (M,), which so many frames show as ``samples`` (M,) says, are taken from
     this frame: what becomes of a texel depends on nothing but its number."""
     taken: Bool = samples <= _MOST_SAMPLES

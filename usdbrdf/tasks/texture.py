@@ -16,6 +16,7 @@ from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.scene import given_corner_uv, scene_from_stage
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.frames import read_frames
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import atlas_side, unwrap
 from usdbrdf.job.progress import progress, say
@@ -25,12 +26,12 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.tasks.atlas import MapWriter, TexelMap
-from usdbrdf.tasks.in_passes import in_passes
 from usdbrdf.tasks.preview import overview
 from usdbrdf.tasks.step import Step, hash_of_files, weaker_layers
+from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
-from usdbrdf.texturing.observe import Observation, radiance_from_frames
-from usdbrdf.texturing.passes import Measured, groups_of_texels, measured_arrays
+from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
+from usdbrdf.texturing.passes import groups_of_texels, in_passes
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 from usdbrdf.transport.rays import RayScene
 
@@ -93,8 +94,11 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         scene = replace(scene, corner_uv=charts["corner_uv"])
         texels = texels_from_atlas(scene, charts["resolution"])
         say(f"texture: {len(texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames")
-        found = _found(texels, _measure(run, texels, scene, rays, frames, options))
+        measured = _measure(run, texels, scene, rays, frames, options)
+        contradicting = contradicting_frames(frames, measured.probes)
+        found = _found(texels, measured)
         summary = _write(run, step, scene, texels, found, size, options.quantile)
+        summary["contradicting_frames"] = contradicting
         view = overview(scene, rays, frames)
         view.write(run.output("previews/lit.png"), texels, found.maps["lit"].values)
         return summary
@@ -128,9 +132,9 @@ def _measure(
 
     def measured(part: slice) -> dict[str, npt.NDArray[Any]]:
         observed = _observe(run, texels, scene, rays, frames, options.quantile, part)
-        return measured_arrays(observed, options.quantile)
+        return observed.measured(options.quantile)
 
-    return Measured(**in_passes(run, "texels", groups, len(texels), measured))
+    return Measured(**in_passes(groups, measured, run, "texels"))
 
 
 def _observe(
@@ -144,13 +148,16 @@ def _observe(
 ) -> Observation:
     """Some texels in all frames, going on from the last saved state of an interrupted run."""
     name = f"frames-{part.start}-{part.stop}"
-    saved = run.latest(name)
-    start, observed = 0, Observation.empty(part.stop - part.start)
+    observed = Observation.empty(part, Probes.empty(len(texels), len(frames), part))
+    start, saved = 0, run.latest(name)
     if saved is not None:
-        start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
-    steps = radiance_from_frames(texels, scene, rays, frames, observed, quantile, start, part=part)
-    for done in progress(steps, total=len(frames) - start, label="texture", unit="frames"):
-        run.save_latest_in_time(name, done, observed.arrays)
+        start = saved[0] + 1
+        observed.restore(saved[1])
+    images = read_frames(frames, range(start, len(frames)))
+    shown = samples_from_frames(texels, scene, rays, frames, images, part)
+    for some in progress(shown, total=len(frames) - start, label="texture", unit="frames"):
+        observed.add(some, quantile)
+        run.save_latest_in_time(name, some.frame, observed.arrays)
     return observed
 
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
-from usdbrdf.texturing.samples import project
+from usdbrdf.texturing.samples import Projection, project
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
 _RING = np.pi / 4 * np.arange(8)
@@ -27,11 +27,8 @@ def footprints(texels: Texels, which: Int, world_from_camera: Double, intrinsics
     """A pixel's steps right and down on the surface at some texels, as a covariance in texels:
     (M, 3), xx, xy, yy. Texels that the camera sees from the front."""
     found = np.zeros((len(which), 3), np.float32)
-    _footprints(
-        which, texels.position, texels.step_x, texels.step_y,
-        np.linalg.inv(world_from_camera).astype(np.float64, copy=False),
-        np.asarray(intrinsics, np.float64), found,
-    )  # fmt: skip
+    camera = Projection.of(world_from_camera, intrinsics)
+    _footprints(which, texels.position, texels.step_x, texels.step_y, camera, found)
     return found
 
 
@@ -71,14 +68,14 @@ def _chart_of_pixels(texels: Texels) -> Int:
 
 @parallel_kernel
 def _footprints(
-    which: Int, position: Float, step_x: Float, step_y: Float, m: Double, k: Double, out: Float
+    which: Int, position: Float, step_x: Float, step_y: Float, camera: Projection, out: Float
 ) -> None:
     for i in prange(len(which)):
         t = which[i]
         p, sx, sy = position[t], step_x[t], step_y[t]
-        u, v, _ = project(p, sx, sy, 0.0, 0.0, k, m)
-        ux, vx, right = project(p, sx, sy, 1.0, 0.0, k, m)
-        uy, vy, below = project(p, sx, sy, 0.0, 1.0, k, m)
+        u, v, _ = project(p, sx, sy, 0.0, 0.0, camera)
+        ux, vx, right = project(p, sx, sy, 1.0, 0.0, camera)
+        uy, vy, below = project(p, sx, sy, 0.0, 1.0, camera)
         # Pixels per texel, and its inverse.
         a, b, c, d = ux - u, uy - u, vx - v, vy - v
         determinant = a * d - b * c

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from usdbrdf.files.frames import FramePixels, read_frame
-from usdbrdf.model.arrays import Float, Int
+from usdbrdf.files.frames import FramePixels
+from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing import psquare
+from usdbrdf.texturing.exposures import Probes
 from usdbrdf.texturing.psquare import QuantileState
-from usdbrdf.texturing.samples import CLIPPED, MIN_COSINE, SAMPLE, first_surfaces, samples_of_texels
+from usdbrdf.texturing.samples import (
+    CLIPPED,
+    MIN_COSINE,
+    SAMPLE,
+    Picture,
+    first_surfaces,
+    samples_from_frame,
+)
 from usdbrdf.texturing.texel_blocks import blocks_of_texels
 from usdbrdf.transport.rays import RayScene
-
-# Threads that decode, and frames in memory besides the one that is projected.
-_READERS, _AHEAD = 2, 3
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -32,79 +33,97 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 @dataclass(frozen=True, kw_only=True)
 class FrameSamples:
     """What one frame shows: texels with a sample (M,) int32 and their radiance (M, 3) float32;
-    texels that it saw saturated, clipped (K,) int32."""
+    texels that it saw saturated, clipped (K,) int32, and the radiance that saturates it."""
 
     frame: int
     texel: Int
     radiance: Float
     clipped: Int
+    saturation: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What all frames say of T texels: radiance in W/(m^2 sr), NaN where no frame measured it.
+
+    median       (T, 3) float32, the quantile that was asked for
+    mean         (T, 3) float32, 0 where no frame measured it
+    spread       (T, 3) float32, see ``psquare.spread``
+    count        (T,) int32, samples
+    clipped      (T,) int32, frames in which the texel was visible but saturated
+    lower_bound  (T,) float32, the largest radiance at which it still saturated
+    probes       (P, N) float32, some texels' samples in each frame, see ``Probes``
+    """
+
+    median: Float
+    mean: Float
+    spread: Float
+    count: Int
+    clipped: Int
+    lower_bound: Float
+    probes: Float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What the frames so far say of T texels, updated in place.
+    """What the frames so far say of the texels from number ``first`` on, updated in place.
 
     quantiles    of the valid samples
-    clipped      (T,) int32, how often the texel was visible but saturated
-    lower_bound  (T,) float32, the largest radiance at which it still saturated
+    clipped, lower_bound, probes  as in ``Measured``
     """
 
+    first: int
     quantiles: QuantileState
     clipped: Int
     lower_bound: Float
+    probes: Probes
 
     @classmethod
-    def empty(cls, num_texels: int) -> Observation:
+    def empty(cls, part: slice, probes: Probes) -> Observation:
+        """Of the texels of ``part``, no frame."""
+        count = part.stop - part.start
         return cls(
-            quantiles=QuantileState.empty(num_texels),
-            clipped=np.zeros(num_texels, np.int32),
-            lower_bound=np.zeros(num_texels, np.float32),
+            first=part.start,
+            quantiles=QuantileState.empty(count),
+            clipped=np.zeros(count, np.int32),
+            lower_bound=np.zeros(count, np.float32),
+            probes=probes,
         )
 
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, npt.NDArray[Any]]) -> Observation:
-        names = ("heights", "positions", "count", "mean")
-        return cls(
-            quantiles=QuantileState(**{name: arrays[name] for name in names}),
-            clipped=arrays["clipped"],
-            lower_bound=arrays["lower_bound"],
-        )
+    def add(self, seen: FrameSamples, quantile: float) -> None:
+        """One frame more."""
+        psquare.update(self.quantiles, seen.texel - np.int32(self.first), seen.radiance, quantile)
+        saturated = seen.clipped - np.int32(self.first)
+        self.clipped[saturated] += 1
+        limit = np.float32(seen.saturation)
+        self.lower_bound[saturated] = np.maximum(self.lower_bound[saturated], limit)
+        self.probes.add(seen.frame, seen.texel, seen.radiance)
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> dict[str, Array]:
+        """All of its state."""
         return {
-            "heights": self.quantiles.heights,
-            "positions": self.quantiles.positions,
-            "count": self.quantiles.count,
-            "mean": self.quantiles.mean,
+            **self.quantiles._asdict(),
             "clipped": self.clipped,
             "lower_bound": self.lower_bound,
+            "probes": self.probes.logarithm,
         }
 
+    def restore(self, arrays: Mapping[str, Array]) -> None:
+        """The state that ``arrays`` once returned."""
+        for name, values in self.arrays().items():
+            values[...] = arrays[name]
 
-def radiance_from_frames(
-    texels: Texels,
-    scene: Scene,
-    rays: RayScene,
-    frames: Frames,
-    observed: Observation,
-    quantile: float,
-    start: int = 0,
-    part: slice | None = None,
-) -> Iterator[int]:
-    """Add frames start.. to ``observed``, in order; yields each frame's index once it is in.
-
-    part  the texels that ``observed`` is of; None: all
-    """
-    first = np.int32(part.start if part else 0)
-    for sampled in samples_from_frames(
-        texels, scene, rays, frames, range(start, len(frames)), part
-    ):
-        psquare.update(observed.quantiles, sampled.texel - first, sampled.radiance, quantile)
-        saturated = sampled.clipped - first
-        observed.clipped[saturated] += 1
-        limit = np.float32(frames.saturation_radiance[sampled.frame])
-        observed.lower_bound[saturated] = np.maximum(observed.lower_bound[saturated], limit)
-        yield sampled.frame
+    def measured(self, quantile: float) -> dict[str, Array]:
+        """The arrays of ``Measured``."""
+        return {
+            "median": psquare.quantile(self.quantiles, quantile),
+            "mean": self.quantiles.mean,
+            "spread": psquare.spread(self.quantiles, quantile),
+            "count": self.quantiles.samples,
+            "clipped": self.clipped,
+            "lower_bound": self.lower_bound,
+            "probes": self.probes.logarithm,
+        }
 
 
 def samples_from_frames(
@@ -112,27 +131,27 @@ def samples_from_frames(
     scene: Scene,
     rays: RayScene,
     frames: Frames,
-    order: Sequence[int],
+    images: Iterable[tuple[int, FramePixels]],
     part: slice | None = None,
 ) -> Iterator[FrameSamples]:
-    """What the frames of ``order`` show of the texels of ``part`` (None: all), one by one.
+    """What frames show of the texels of ``part`` (None: all), one by one.
 
-    The next frames are read and decoded while one is projected.
+    images  numbers and pixels of the frames, see ``read_frames``
     """
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
-    for i, pixels in zip(order, _read_ahead(frames, order), strict=True):
-        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
-        which = blocks.texels_in_view(pose, lens, size, MIN_COSINE)
-        kind, radiance = samples_of_texels(
-            texels, which, owner, first_surfaces(rays, scene.face_object, pose, lens, size),
-            pixels.radiance, pixels.valid, pixels.clipped, pose, lens,
-        )  # fmt: skip
+    for i, pixels in images:
+        camera = frames.world_from_camera[i], frames.intrinsics[i]
+        which = blocks.texels_in_view(*camera, frames.resolution[i], MIN_COSINE)
+        surfaces = first_surfaces(rays, scene.face_object, *camera, frames.resolution[i])
+        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped, *camera)
+        kind, radiance = samples_from_frame(texels, owner, surfaces, picture, which=which)
         yield FrameSamples(
             frame=i,
             texel=which[kind == SAMPLE],
             radiance=radiance[kind == SAMPLE],
             clipped=which[kind == CLIPPED],
+            saturation=float(frames.saturation_radiance[i]),
         )
 
 
@@ -143,18 +162,3 @@ def spread_order(count: int) -> list[int]:
     while math.gcd(step, count) > 1:
         step += 1
     return [step * k % count for k in range(count)]
-
-
-def _read_ahead(frames: Frames, order: Sequence[int]) -> Iterator[FramePixels]:
-    """The pixels of the frames of ``order``, some in memory before they are asked for."""
-    with ThreadPoolExecutor(max_workers=_READERS) as readers:
-        coming = deque(readers.submit(read_frame, frames, i) for i in order[:_AHEAD])
-        try:
-            for ahead in range(_AHEAD, len(order) + _AHEAD):
-                pixels = coming.popleft().result()
-                if ahead < len(order):
-                    coming.append(readers.submit(read_frame, frames, order[ahead]))
-                yield pixels
-        finally:
-            for job in coming:
-                job.cancel()

@@ -3,8 +3,8 @@ frames. What a texel gets does not depend on its group."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,12 +12,12 @@ import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
-from usdbrdf.model.arrays import Array, Float, Int
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import StageRun
+from usdbrdf.model.arrays import Array
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.texturing import psquare
-from usdbrdf.texturing.observe import Observation
 
 # Without --memory this share of the machine's.
 _SHARE = 0.75
@@ -47,52 +47,30 @@ class BytesPerTexel(NamedTuple):
 OF_TEXTURING = BytesPerTexel(grouped=180, result=48, after=200)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measured:
-    """What all frames say of T texels: radiance in W/(m^2 sr), NaN where no frame measured it.
-
-    median       (T, 3) float32, the quantile that was asked for
-    mean         (T, 3) float32, 0 where no frame measured it
-    spread       (T, 3) float32, see ``psquare.spread``
-    count        (T,) int32, samples
-    clipped      (T,) int32, frames in which the texel was visible but saturated
-    lower_bound  (T,) float32, the largest radiance at which it still saturated
-    """
-
-    median: Float
-    mean: Float
-    spread: Float
-    count: Int
-    clipped: Int
-    lower_bound: Float
-
-
-def measured_arrays(observed: Observation, quantile: float) -> dict[str, Array]:
-    """The arrays of ``Measured``, of the texels that were observed."""
-    return {
-        "median": psquare.quantile(observed.quantiles, quantile),
-        "mean": observed.quantiles.mean,
-        "spread": psquare.spread(observed.quantiles, quantile),
-        "count": observed.quantiles.count,
-        "clipped": observed.clipped,
-        "lower_bound": observed.lower_bound,
-    }
+def in_passes(
+    groups: Sequence[slice],
+    observe: Callable[[slice], Mapping[str, Array]],
+    run: StageRun,
+    name: str,
+) -> dict[str, Array]:
+    """Arrays of all texels, of which one pass observes each of the ``groups``; of several passes
+    those that are done are kept under ``name`` for a run that goes on."""
+    if len(groups) == 1:
+        return dict(observe(groups[0]))
+    say(f"{run.name}: {len(groups)} passes over the frames, for lack of memory")
+    return by_parts(
+        groups,
+        lambda part: run.checkpoint(f"{name}-{part.start}-{part.stop}", partial(observe, part)),
+    )
 
 
 def by_parts(
-    parts: Iterable[slice], count: int, arrays_of: Callable[[slice], Mapping[str, Array]]
+    parts: Iterable[slice], arrays_of: Callable[[slice], Mapping[str, Array]]
 ) -> dict[str, Array]:
-    """Arrays of ``count`` rows, from the ``arrays_of`` parts that make up all rows."""
-    whole: dict[str, Array] = {}
-    for part in parts:
-        for name, values in arrays_of(part).items():
-            if len(values) == count:  # the only part
-                whole[name] = values
-                continue
-            if name not in whole:
-                whole[name] = np.empty((count, *values.shape[1:]), values.dtype)
-            whole[name][part] = values
-    return whole
+    """Arrays of all rows, from the ``arrays_of`` consecutive parts of them."""
+    found = [dict(arrays_of(part)) for part in parts]
+    # One by one, so that no more than one of them is there twice.
+    return {name: np.concatenate([some.pop(name) for some in found]) for name in list(found[0])}
 
 
 def groups_of_texels(

@@ -7,7 +7,7 @@ channel: minimum, p/2, p, (1+p)/2, maximum; so the median's state also yields th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,20 +17,19 @@ from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Float, Int
 
 
-@dataclass(frozen=True, kw_only=True)
-class QuantileState:
+class QuantileState(NamedTuple):
     """What is kept of all samples so far: 112 bytes per texel, however many frames there were.
 
     heights    (T, 3, 5) float32, the markers' values, ascending
     positions  (T, 3, 3) int32, ranks (from 1) of the three inner markers; the outer two are at
-               1 and ``count``
-    count      (T,) int32, samples so far
+               1 and ``samples``
+    samples    (T,) int32, samples so far
     mean       (T, 3) float32, running mean
     """
 
     heights: Float
     positions: Int
-    count: Int
+    samples: Int
     mean: Float
 
     @classmethod
@@ -38,19 +37,9 @@ class QuantileState:
         return cls(
             heights=np.zeros((num_texels, 3, 5), np.float32),
             positions=np.zeros((num_texels, 3, 3), np.int32),
-            count=np.zeros(num_texels, np.int32),
+            samples=np.zeros(num_texels, np.int32),
             mean=np.zeros((num_texels, 3), np.float32),
         )
-
-
-def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
-    """Add one sample to each of the listed texels, in place.
-
-    texel   (M,) int32, each texel at most once
-    values  (M, 3) float32, finite
-    p       the quantile, in (0, 1)
-    """
-    _update(state.heights, state.positions, state.count, state.mean, texel, values, p)
 
 
 def quantile(state: QuantileState, p: float) -> Float:
@@ -58,21 +47,24 @@ def quantile(state: QuantileState, p: float) -> Float:
 
     Up to five samples it is the exact one (linear between ranks).
     """
-    return _read(state.heights, state.count, p, 2)
+    return _read(state, p, 2)
 
 
 def spread(state: QuantileState, p: float) -> Float:
     """Distance of the (1+p)/2 and the p/2 quantile, (T, 3) float32: for the median the
     interquartile range. NaN where a texel has no sample."""
-    return _read(state.heights, state.count, (1 + p) / 2, 3) - _read(
-        state.heights, state.count, p / 2, 1
-    )
+    return _read(state, (1 + p) / 2, 3) - _read(state, p / 2, 1)
 
 
 @parallel_kernel
-def _update(
-    heights: Float, positions: Int, count: Int, mean: Float, texel: Int, values: Float, p: float
-) -> None:
+def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
+    """Add one sample to each of the listed texels, in place.
+
+    texel   (M,) int32, each texel at most once
+    values  (M, 3) float32, finite
+    p       the quantile, in (0, 1)
+    """
+    heights, positions, count, mean = state
     fractions = np.array([p / 2, p, (1 + p) / 2])
     for m in prange(len(texel)):
         t = texel[m]
@@ -130,17 +122,18 @@ def _add(q: Float, inner: Int, n: int, x: float, fractions: npt.NDArray[np.float
 
 
 @kernel
-def _read(heights: Float, count: Int, p: float, marker: int) -> Float:
+def _read(state: QuantileState, p: float, marker: int) -> Float:
+    count = state.samples
     out = np.full((len(count), 3), np.nan, np.float32)
     for t in range(len(count)):
         n = count[t]
         for c in range(3):
             if n > 5:
-                out[t, c] = heights[t, c, marker]
+                out[t, c] = state.heights[t, c, marker]
             elif n > 0:
                 rank = p * (n - 1)
                 low = int(rank)
                 high = min(low + 1, n - 1)
-                q = heights[t, c]
+                q = state.heights[t, c]
                 out[t, c] = q[low] + (rank - low) * (q[high] - q[low])
     return out

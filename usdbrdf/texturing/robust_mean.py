@@ -12,15 +12,13 @@ the samples weighted by their precision: how blurred it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
-from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.texturing.passes import by_parts
 
 # Samples that are added at a time.
@@ -36,12 +34,11 @@ _LEFT = 0.05
 _AT_A_TIME = 1 << 18
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeanState:
+class MeanState(NamedTuple):
     """What is kept of all samples so far: 132 bytes per texel, however many frames there were.
 
     waiting    (T, 5, 4) float32, radiance and standard deviation of samples not yet added
-    count      (T,) int32, samples so far
+    samples    (T,) int32, samples so far
     mean       (T, 3) float32; weight (T, 3) float32, sums of the samples' robust weights
     scatter    (T, 2) float32, over the channels: squares of what each sample pulls at the mean, and
                weights of those that lie within their errors
@@ -50,7 +47,7 @@ class MeanState:
     """
 
     waiting: Float
-    count: Int
+    samples: Int
     mean: Float
     weight: Float
     scatter: Float
@@ -64,7 +61,7 @@ class MeanState:
 
         return cls(
             waiting=zeros(_BATCH, 4),
-            count=np.zeros(num_texels, np.int32),
+            samples=np.zeros(num_texels, np.int32),
             mean=zeros(3),
             weight=zeros(3),
             scatter=zeros(2),
@@ -72,12 +69,11 @@ class MeanState:
             footprint=zeros(3),
         )
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        return dict(vars(self))
+    def arrays(self) -> dict[str, Array]:
+        return self._asdict()
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobustMean:
+class RobustMean(NamedTuple):
     """mean (T, 3), NaN where a texel has no sample; variance (T,), the mean over the channels, of a
     single sample what was said of it; footprint (T, 3): covariance xx, xy, yy."""
 
@@ -86,6 +82,7 @@ class RobustMean:
     footprint: Float
 
 
+@parallel_kernel
 def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
     """Add one sample to each of the listed texels, in place.
 
@@ -94,72 +91,56 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
     deviation  (M,) float32, standard deviation of their errors, between 1e-15 and 1e15
     footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
     """
-    _update(
-        state.waiting, state.count, state.mean, state.weight, state.scatter, state.precision,
-        state.footprint, texel, values, deviation, footprint,
-    )  # fmt: skip
+    waiting, samples, mean, weight, scatter, precision, covered = state
+    for m in prange(len(texel)):
+        t = texel[m]
+        slot = samples[t] % _BATCH
+        for c in range(3):
+            waiting[t, slot, c] = values[m, c]
+        waiting[t, slot, 3] = deviation[m]
+        samples[t] += 1
+        own = 1 / float(deviation[m]) ** 2
+        precision[t] += own
+        for k in range(3):
+            covered[t, k] += own * footprint[m, k]
+        if slot == _BATCH - 1:
+            _add(waiting[t], mean[t], weight[t], scatter[t])
 
 
 def robust_mean(state: MeanState) -> RobustMean:
     """Of all samples so far; ``state`` stays as it is."""
-    count, arrays = len(state.count), state.arrays()
+    count = len(state.samples)
     parts = [slice(start, start + _AT_A_TIME) for start in range(0, max(count, 1), _AT_A_TIME)]
+    arrays = state.arrays()
 
     def means(part: slice) -> dict[str, Float]:
         return _means(MeanState(**{name: values[part] for name, values in arrays.items()}))
 
-    return RobustMean(**by_parts(parts, count, means))
+    return RobustMean(**by_parts(parts, means))
 
 
 def _means(state: MeanState) -> dict[str, Float]:
-    mean, weight, scatter = state.mean.copy(), state.weight.copy(), state.scatter.copy()
-    _add_rest(state.waiting, state.count, mean, weight, scatter)
+    whole = state._replace(
+        mean=state.mean.copy(), weight=state.weight.copy(), scatter=state.scatter.copy()
+    )
+    _add_rest(whole)
     # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
-    pull, inlying = scatter.T.astype(np.float64) / 3
-    count = np.maximum(state.count, 1)
+    pull, inlying = whole.scatter.T.astype(np.float64) / 3
+    count = np.maximum(state.samples, 1)
     variance = pull / np.maximum(np.maximum(inlying, state.precision / count), 1e-30) ** 2
     return {
-        "mean": np.where(state.count[:, None] > 0, mean, np.nan),
+        "mean": np.where(state.samples[:, None] > 0, whole.mean, np.nan),
         "variance": variance.astype(np.float32),
         "footprint": state.footprint / np.maximum(state.precision, 1e-30)[:, None],
     }
 
 
 @parallel_kernel
-def _update(
-    waiting: Float,
-    count: Int,
-    mean: Float,
-    weight: Float,
-    scatter: Float,
-    precision: Float,
-    footprint: Float,
-    texel: Int,
-    values: Float,
-    deviation: Float,
-    covered: Float,
-) -> None:
-    for m in prange(len(texel)):
-        t = texel[m]
-        slot = count[t] % _BATCH
-        for c in range(3):
-            waiting[t, slot, c] = values[m, c]
-        waiting[t, slot, 3] = deviation[m]
-        count[t] += 1
-        own = 1 / float(deviation[m]) ** 2
-        precision[t] += own
-        for k in range(3):
-            footprint[t, k] += own * covered[m, k]
-        if slot == _BATCH - 1:
-            _add(waiting[t], mean[t], weight[t], scatter[t])
-
-
-@parallel_kernel
-def _add_rest(waiting: Float, count: Int, mean: Float, weight: Float, scatter: Float) -> None:
-    for t in prange(len(count)):
-        rest = count[t] % _BATCH
+def _add_rest(state: MeanState) -> None:
+    for t in prange(len(state.samples)):
+        rest = state.samples[t] % _BATCH
         if rest:
-            _add(waiting[t, :rest], mean[t], weight[t], scatter[t])
+            _add(state.waiting[t, :rest], state.mean[t], state.weight[t], state.scatter[t])
 
 
 @kernel
@@ -171,26 +152,26 @@ def _add(samples: Float, mean: Float, weight: Float, scatter: Float) -> None:
         for _ in range(_STEPS):
             total, sum_of_weights = known * before, known
             for j in range(len(samples)):
-                own = _trust(samples[j], c, centre) / float(samples[j, 3]) ** 2
+                own = huber_weight(samples[j], c, centre) / float(samples[j, 3]) ** 2
                 total += own * samples[j, c]
                 sum_of_weights += own
             centre = total / sum_of_weights
         mean[c], weight[c] = centre, sum_of_weights
         for j in range(len(samples)):
-            trust, own = _trust(samples[j], c, centre), 1 / float(samples[j, 3]) ** 2
+            share, own = huber_weight(samples[j], c, centre), 1 / float(samples[j, 3]) ** 2
             # The mean follows each of its samples; what is left of one tells of its error, unless
             # there is hardly any other.
-            left = 1 - trust * own / sum_of_weights
+            left = 1 - share * own / sum_of_weights
             if left > _LEFT:
-                scatter[0] += (trust * own * (samples[j, c] - centre)) ** 2 / left
+                scatter[0] += (share * own * (samples[j, c] - centre)) ** 2 / left
             else:
                 scatter[0] += own
-            if trust == 1:
+            if share == 1:
                 scatter[1] += own
 
 
 @kernel
-def _trust(sample: Float, c: int, centre: float) -> float:
+def huber_weight(sample: Float, c: int, centre: float) -> float:
     """Huber's weight of channel c, 1 within its error."""
     off = abs(float(sample[c]) - centre) / float(sample[3])
     return min(1.0, _OUTLYING / max(off, 1e-12))

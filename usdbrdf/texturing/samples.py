@@ -9,7 +9,7 @@ Beside a lamp it takes none: no lens and no filter keeps all of a lamp's light t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,13 +34,60 @@ _GLARE_CONTRAST = 3.0
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstSurfaces:
+class FirstSurfaces(NamedTuple):
     """What each pixel of one frame sees: object (H, W) int32 (-1: nothing) and the point
     (H, W, 3) float32 in the world."""
 
     object: Int
     point: Float
+
+
+class Picture(NamedTuple):
+    """One frame: radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4)
+    float64; intrinsics fx, fy, cx, cy in pixels, (4,) float64."""
+
+    radiance: Float
+    valid: Bool
+    clipped: Bool
+    world_from_camera: Double
+    intrinsics: Double
+
+
+class Projection(NamedTuple):
+    """The camera as kernels take it: eye (3,), camera_from_world (4, 4), intrinsics (4,)."""
+
+    eye: Double
+    camera_from_world: Double
+    intrinsics: Double
+
+    @classmethod
+    def of(cls, world_from_camera: Double, intrinsics: Double) -> Projection:
+        return cls(
+            world_from_camera[:3, 3].copy(),
+            np.linalg.inv(world_from_camera).astype(np.float64, copy=False),
+            np.asarray(intrinsics, np.float64),
+        )
+
+
+class _Image(NamedTuple):
+    """What the pixels of one frame see, and how brightly something nearby glares, (H, W)."""
+
+    object: Int
+    point: Float
+    radiance: Float
+    valid: Bool
+    clipped: Bool
+    glare: Float
+
+
+class _Surface(NamedTuple):
+    """The texels' positions, normals and steps, each (T, 3), and objects, (T,)."""
+
+    position: Float
+    normal: Float
+    step_x: Float
+    step_y: Float
+    object: Int
 
 
 def first_surfaces(
@@ -52,70 +99,39 @@ def first_surfaces(
 ) -> FirstSurfaces:
     """The first hits of the rays through all pixels' centres."""
     face, point = visible_faces(rays, world_from_camera, intrinsics, resolution)
-    seen = face_object[face]
-    seen[face < 0] = -1
-    return FirstSurfaces(object=seen, point=point)
+    shown = face_object[face]
+    shown[face < 0] = -1
+    return FirstSurfaces(shown, point)
 
 
 def samples_from_frame(
     texels: Texels,
     texel_object: Int,
     surfaces: FirstSurfaces,
-    radiance: Float,
-    valid: Bool,
-    clipped: Bool,
-    world_from_camera: Double,
-    intrinsics: Double,
+    picture: Picture,
+    *,
+    which: Int | None = None,
     beside_glare: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
-    """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, and saturated all over its footprint),
-    (T,) int8, and the radiance of the samples, (T, 3) float32.
+    """Of the texels ``which`` (M,) int32 (None: all): NOTHING, SAMPLE, or CLIPPED (visible, and
+    saturated all over its footprint), (M,) int8, and the samples' radiance, (M, 3) float32.
 
-    radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
-    intrinsics fx, fy, cx, cy. beside_glare: take samples there too, for whom highlights matter.
+    texel_object  (T,) int32
+    beside_glare  take samples there too, for whom highlights matter
     """
-    return samples_of_texels(
-        texels, np.arange(len(texels), dtype=np.int32), texel_object, surfaces, radiance, valid,
-        clipped, world_from_camera, intrinsics, beside_glare,
-    )  # fmt: skip
-
-
-def samples_of_texels(
-    texels: Texels,
-    which: Int,
-    texel_object: Int,
-    surfaces: FirstSurfaces,
-    radiance: Float,
-    valid: Bool,
-    clipped: Bool,
-    world_from_camera: Double,
-    intrinsics: Double,
-    beside_glare: bool = False,
-) -> tuple[npt.NDArray[np.int8], Float]:
-    """The same for some texels, ``which`` (M,) int32: (M,) int8 and (M, 3) float32."""
-    camera_from_world = np.linalg.inv(world_from_camera).astype(np.float64, copy=False)
-    if beside_glare:
-        glare = np.zeros(valid.shape, np.float32)
-    else:
-        glare = brightest_glare(radiance, valid, clipped)
+    _, valid, clipped, *camera = picture
+    if which is None:
+        which = np.arange(len(texels), dtype=np.int32)
+    glare = np.zeros(valid.shape, np.float32) if beside_glare else brightest_glare(*picture[:3])
     kind = np.zeros(len(which), np.int8)
     values = np.zeros((len(which), 3), np.float32)
     _sample(
         which,
-        texels.position,
-        texels.geometric_normal,
-        texels.step_x,
-        texels.step_y,
-        texel_object,
-        surfaces.object,
-        surfaces.point,
-        radiance,
-        valid,
-        clipped,
-        camera_from_world,
-        world_from_camera[:3, 3].copy(),
-        np.asarray(intrinsics, np.float64),
-        glare,
+        _Surface(
+            texels.position, texels.geometric_normal, texels.step_x, texels.step_y, texel_object
+        ),
+        _Image(*surfaces, picture.radiance, valid, clipped, glare),
+        Projection.of(*camera),
         kind,
         values,
     )
@@ -124,9 +140,10 @@ def samples_of_texels(
 
 @kernel
 def project(
-    p: Float, sx: Float, sy: Float, dx: float, dy: float, k: Double, m: Double
+    p: Float, sx: Float, sy: Float, dx: float, dy: float, camera: Projection
 ) -> tuple[float, float, float]:
     """Pixel of the point p + dx sx + dy sy and its depth in front of the camera."""
+    m, k = camera.camera_from_world, camera.intrinsics
     x = p[0] + dx * sx[0] + dy * sy[0]
     y = p[1] + dx * sx[1] + dy * sy[1]
     z = p[2] + dx * sx[2] + dy * sy[2]
@@ -141,138 +158,89 @@ def project(
 @parallel_kernel
 def _sample(
     which: Int,
-    position: Float,
-    normal: Float,
-    step_x: Float,
-    step_y: Float,
-    texel_object: Int,
-    seen_object: Int,
-    seen_point: Float,
-    radiance: Float,
-    valid: Bool,
-    clipped: Bool,
-    camera_from_world: Double,
-    eye: Double,
-    intrinsics: Double,
-    glare: Float,
+    surface: _Surface,
+    image: _Image,
+    camera: Projection,
     kind: npt.NDArray[np.int8],
     values: Float,
 ) -> None:
-    height, width = valid.shape
     for m in prange(len(which)):
-        t = which[m]
-        p = position[t]
-        n = normal[t]
-        wx = eye[0] - p[0]
-        wy = eye[1] - p[1]
-        wz = eye[2] - p[2]
-        distance = np.sqrt(wx * wx + wy * wy + wz * wz)
-        if n[0] * wx + n[1] * wy + n[2] * wz < MIN_COSINE * distance:
-            continue
-        sx = step_x[t]
-        sy = step_y[t]
-        u, v, depth = project(p, sx, sy, 0.0, 0.0, intrinsics, camera_from_world)
-        column = int(np.floor(u))
-        row = int(np.floor(v))
-        if depth < 0 or column < 1 or row < 1 or column > width - 2 or row > height - 2:
-            continue
-        pixel_size = depth / intrinsics[0]
-        ux, vx, _ = project(p, sx, sy, 1.0, 0.0, intrinsics, camera_from_world)
-        uy, vy, _ = project(p, sx, sy, 0.0, 1.0, intrinsics, camera_from_world)
-        span_x = np.sqrt((ux - u) ** 2 + (vx - v) ** 2)
-        span_y = np.sqrt((uy - u) ** 2 + (vy - v) ** 2)
-        taps_x = min(_MAX_TAPS, max(1, int(np.ceil(span_x))))
-        taps_y = min(_MAX_TAPS, max(1, int(np.ceil(span_y))))
-        # How far from the centre bilinear reading of the footprint's taps reaches, in pixels.
-        off_x, off_y = 0.5 - 0.5 / taps_x, 0.5 - 0.5 / taps_y
-        wide = off_x * abs(ux - u) + off_y * abs(uy - u)
-        high = off_x * abs(vx - v) + off_y * abs(vy - v)
-        reach = max(1, int(np.ceil(max(wide, high) + 0.5)))
-        if not _shows_surface(
-            row, column, reach, p, n, texel_object[t], pixel_size, seen_object, seen_point
-        ):
-            continue
-        red, green, blue = 0.0, 0.0, 0.0
-        num_valid = 0
-        num_clipped = 0
-        for a in range(taps_x):
-            for b in range(taps_y):
-                dx = (a + 0.5) / taps_x - 0.5
-                dy = (b + 0.5) / taps_y - 0.5
-                su, sv, _ = project(p, sx, sy, dx, dy, intrinsics, camera_from_world)
-                good, saturated, red, green, blue = _bilinear(
-                    su, sv, radiance, valid, clipped, red, green, blue
-                )
-                num_valid += good
-                num_clipped += saturated
-        # Partly saturated is no bound: a lamp's neighbour catches some of its light.
-        if num_valid == 4 * taps_x * taps_y:
-            brightest = max(red, green, blue)
-            if glare[row, column] * (taps_x * taps_y) > _GLARE_CONTRAST * brightest:
-                continue
-            kind[m] = SAMPLE
-            values[m, 0] = red / (taps_x * taps_y)
-            values[m, 1] = green / (taps_x * taps_y)
-            values[m, 2] = blue / (taps_x * taps_y)
-        elif num_clipped == 4 * taps_x * taps_y:
-            kind[m] = CLIPPED
+        kind[m] = _sample_of(which[m], surface, image, camera, values[m])
+
+
+@kernel
+def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, value: Float) -> int:
+    """What the frame shows of texel t; its radiance goes to ``value`` (3,)."""
+    height, width = image.valid.shape
+    p, n, eye = surface.position[t], surface.normal[t], camera.eye
+    wx, wy, wz = eye[0] - p[0], eye[1] - p[1], eye[2] - p[2]
+    distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if n[0] * wx + n[1] * wy + n[2] * wz < MIN_COSINE * distance:
+        return NOTHING
+    sx, sy = surface.step_x[t], surface.step_y[t]
+    u, v, depth = project(p, sx, sy, 0.0, 0.0, camera)
+    column = int(np.floor(u))
+    row = int(np.floor(v))
+    if depth < 0 or column < 1 or row < 1 or column > width - 2 or row > height - 2:
+        return NOTHING
+    ux, vx, _ = project(p, sx, sy, 1.0, 0.0, camera)
+    uy, vy, _ = project(p, sx, sy, 0.0, 1.0, camera)
+    taps_x = min(_MAX_TAPS, max(1, int(np.ceil(np.sqrt((ux - u) ** 2 + (vx - v) ** 2)))))
+    taps_y = min(_MAX_TAPS, max(1, int(np.ceil(np.sqrt((uy - u) ** 2 + (vy - v) ** 2)))))
+    # How far from the centre bilinear reading of the footprint's taps reaches, in pixels.
+    off_x, off_y = 0.5 - 0.5 / taps_x, 0.5 - 0.5 / taps_y
+    wide = off_x * abs(ux - u) + off_y * abs(uy - u)
+    high = off_x * abs(vx - v) + off_y * abs(vy - v)
+    reach = max(1, int(np.ceil(max(wide, high) + 0.5)))
+    if not _shows_surface(
+        row, column, reach, p, n, surface.object[t], depth / camera.intrinsics[0], image
+    ):
+        return NOTHING
+    taps = taps_x * taps_y
+    red, green, blue = 0.0, 0.0, 0.0
+    num_valid, num_clipped = 0, 0
+    for tap in range(taps):
+        dx = (tap // taps_y + 0.5) / taps_x - 0.5
+        dy = (tap % taps_y + 0.5) / taps_y - 0.5
+        su, sv, _ = project(p, sx, sy, dx, dy, camera)
+        x = min(max(su - 0.5, 0.0), width - 1.001)
+        y = min(max(sv - 0.5, 0.0), height - 1.001)
+        i, j = int(x), int(y)
+        fx, fy = x - i, y - j
+        for corner in range(4):
+            a, b = corner % 2, corner // 2
+            w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
+            num_valid += image.valid[j + b, i + a]
+            num_clipped += image.clipped[j + b, i + a]
+            red += w * image.radiance[j + b, i + a, 0]
+            green += w * image.radiance[j + b, i + a, 1]
+            blue += w * image.radiance[j + b, i + a, 2]
+    # Partly saturated is no bound: a lamp's neighbour catches some of its light.
+    if num_clipped == 4 * taps:
+        return CLIPPED
+    if num_valid < 4 * taps or (
+        image.glare[row, column] * taps > _GLARE_CONTRAST * max(red, green, blue)
+    ):
+        return NOTHING
+    value[0], value[1], value[2] = red / taps, green / taps, blue / taps
+    return SAMPLE
 
 
 @kernel
 def _shows_surface(
-    row: int,
-    column: int,
-    reach: int,
-    p: Float,
-    n: Float,
-    own: int,
-    pixel_size: float,
-    seen_object: Int,
-    seen_point: Float,
-) -> bool:
+    row: int, column: int, reach: int, p: Float, n: Float, own: int, pixel_size: float,
+    image: _Image,
+) -> bool:  # fmt: skip
     """Do all pixels within ``reach`` show object ``own``, a pixel's size off its plane at most?"""
-    height, width = seen_object.shape
+    height, width = image.object.shape
     if row < reach or column < reach or row + reach >= height or column + reach >= width:
         return False
     for j in range(row - reach, row + reach + 1):
         for i in range(column - reach, column + reach + 1):
-            if seen_object[j, i] != own:
+            if image.object[j, i] != own:
                 return False
-            s = seen_point[j, i]
+            s = image.point[j, i]
             off = (s[0] - p[0]) * n[0] + (s[1] - p[1]) * n[1] + (s[2] - p[2]) * n[2]
             if abs(off) > pixel_size:
                 return False
     return True
-
-
-@kernel
-def _bilinear(
-    u: float,
-    v: float,
-    radiance: Float,
-    valid: Bool,
-    clipped: Bool,
-    red: float,
-    green: float,
-    blue: float,
-) -> tuple[int, int, float, float, float]:
-    """How many of the four pixels around (u, v) are valid, and clipped; and the image there added
-    to red, green and blue."""
-    height, width = valid.shape
-    x = min(max(u - 0.5, 0.0), width - 1.001)
-    y = min(max(v - 0.5, 0.0), height - 1.001)
-    i = int(x)
-    j = int(y)
-    fx = x - i
-    fy = y - j
-    num_valid = 0
-    num_clipped = 0
-    for b in range(2):
-        for a in range(2):
-            w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
-            num_valid += valid[j + b, i + a]
-            num_clipped += clipped[j + b, i + a]
-            red += w * radiance[j + b, i + a, 0]
-            green += w * radiance[j + b, i + a, 1]
-            blue += w * radiance[j + b, i + a, 2]
-    return num_valid, num_clipped, red, green, blue

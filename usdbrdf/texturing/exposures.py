@@ -1,0 +1,151 @@
+"""Do the frames agree how bright the same surfaces are?
+
+A frame whose exposure was not divided out, or which is not linear, shows everything brighter or
+darker than the others do, by about one factor. With x the logarithm of a sample, g its frame's
+gain and r its texel's radiance, x = g + r + error: least squares with Huber's weights, in which
+highlights lose theirs, and from which the radiances are eliminated. What all gains have in common
+cannot be known; their median is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.progress import say
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.capture import Frames
+
+# Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
+_MOST_TEXELS, _MOST_SAMPLES = 4096, 1 << 21
+
+# Half a stop counts, if it stands out of the scatter of the frame's own samples by this factor, and
+# if so many of them are of texels that other frames show.
+_HALF_STOP, _STANDING_OUT, _FEWEST = math.log(2) / 2, 2.0, 24
+
+# If more of the frames than this contradict the others, none can be believed.
+_MOST_CONTRADICTING = 0.2
+
+# Samples further off than this, in logarithms, lose weight; and steps of the reweighting.
+_OUTLYING, _STEPS = 0.1, 12
+
+# What draws a gain to 0 that nothing else decides, in samples.
+_TIE = 1e-3
+
+
+class Probes(NamedTuple):
+    """Samples of every so many texels, in all frames.
+
+    every      the texels are those whose number this divides
+    first      the first of their numbers, by ``every``
+    logarithm  (P, N) float32, of the mean of R, G and B; NaN where the frame has no sample
+    """
+
+    every: int
+    first: int
+    logarithm: Float
+
+    @classmethod
+    def empty(cls, num_texels: int, num_frames: int, part: slice | None = None) -> Probes:
+        """Of the texels of ``part`` (None: all) of so many, no sample."""
+        most = min(_MOST_TEXELS, max(1, _MOST_SAMPLES // num_frames))
+        every = -(-num_texels // most)
+        start, stop = (part.start, part.stop) if part else (0, num_texels)
+        first, end = -(-start // every), -(-stop // every)
+        return cls(every, first, np.full((end - first, num_frames), np.nan, np.float32))
+
+    def add(self, frame: int, texel: Int, radiance: Float) -> None:
+        """Keep what is needed of one frame's samples: texel (M,), radiance (M, 3)."""
+        own = np.flatnonzero(texel % self.every == 0)
+        level = radiance[own].mean(axis=1)
+        own, level = own[level > 0], level[level > 0]
+        self.logarithm[texel[own] // self.every - self.first, frame] = np.log(level)
+
+
+class Gains(NamedTuple):
+    """Of N frames: logarithm of the gain, scatter (as a standard deviation) of the frame's samples
+    around it, and number of its samples that other frames can be held against, each (N,)."""
+
+    logarithm: Double
+    scatter: Double
+    samples: Double
+
+
+def gains_of_frames(logarithm: Float) -> Gains:
+    """How much brighter each frame shows the same texels than the others do.
+
+    logarithm  (P, N) as in ``Probes``
+    """
+    known: Bool = np.isfinite(logarithm)
+    known &= (known.sum(axis=1) > 1)[:, None]
+    weight = known.astype(np.float64)
+    value = np.where(known, logarithm, 0).astype(np.float64)
+    gain = np.zeros(value.shape[1])
+    off = value
+    for _ in range(_STEPS):
+        total = np.maximum(weight.sum(axis=1), 1e-12)
+        own = weight.sum(axis=0) + _TIE
+
+        def without_radiance(
+            gain: Double, weight: Double = weight, total: Double = total, own: Double = own
+        ) -> Double:
+            return np.asarray(own * gain - weight.T @ ((weight @ gain) / total))
+
+        said = (weight * value).sum(axis=0)
+        said -= weight.T @ ((weight * value).sum(axis=1) / total)
+        equations = LinearOperator((len(gain), len(gain)), matvec=without_radiance)
+        gain, _ = cg(equations, said, x0=gain, maxiter=200)
+        off = value - gain
+        off -= ((weight * off).sum(axis=1) / total)[:, None]
+        weight = known * np.minimum(1, _OUTLYING / np.maximum(np.abs(off), 1e-9))
+    count = known.sum(axis=0).astype(np.float64)
+    off = np.where(known, np.abs(off), np.nan)
+    off[0] = np.where(count > 0, off[0], 0)  # a column of NaN has no median
+    scatter = 1.4826 * np.nanmedian(off, axis=0)
+    enough = count >= _FEWEST
+    if enough.any():
+        gain -= np.median(gain[enough])
+    return Gains(gain, scatter, count)
+
+
+def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
+    """Image and gain of the frames that show the same texels brighter or darker than the others do,
+    by half a stop or more; the user is told.
+
+    Raises InputRefused where more than a fifth do and the images are said to be radiance.
+    """
+    gains = gains_of_frames(logarithm)
+    compared = gains.samples >= _FEWEST
+    size = np.abs(gains.logarithm)
+    off = compared & (size > _HALF_STOP) & (size > _STANDING_OUT * gains.scatter)
+    found = {
+        frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2)
+        for i in np.flatnonzero(off)
+    }
+    if not found:
+        return {}
+    names = [f"{name} ({gain:.2f} x)" for name, gain in found.items()]
+    what = (
+        f"{len(found)} of {int(compared.sum())} frames show the same surfaces brighter or darker "
+        f"than the other frames do, {_listed(names)}"
+    )
+    cause = (
+        "Likely their exposure_time was not divided out of the pixels, or the images are not linear"
+    )
+    if frames.radiometric and len(found) > _MOST_CONTRADICTING * compared.sum():
+        raise InputRefused(
+            f"{what} (limits: half a stop, {_MOST_CONTRADICTING:.0%} of the frames). {cause}. "
+            "Export radiance in one unit for all frames. [texturing.exposure]"
+        )
+    say(f"warning: {what}. {cause}. Correct them or leave them out. [texturing.exposure]")
+    return found
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
