@@ -110,9 +110,13 @@ def test_missing_exposures_count_as_equal(tmp_path):
     assert any("exposureDuration" in warning for warning in scan.warnings)
 
 
-def test_a_photograph_of_another_size_is_dropped(tmp_path):
+@pytest.mark.parametrize(("shape", "usable"), [((48, 64, 3), 12), ((48, 48, 3), 11)])
+def test_a_photograph_of_another_size_has_its_camera_scaled_or_is_dropped(tmp_path, shape, usable):
     export, _ = make_export(tmp_path)
-    _write_jpeg(export / "frame_00004.jpg", np.zeros((48, 64, 3)) + 100)
+    _write_jpeg(export / "frame_00004.jpg", np.zeros(shape) + 100)
     scan = read_scan(export, IngestOptions())
-    assert len(scan.frames) == 11
-    assert any("64 x 48" in warning and "2 times" in warning for warning in scan.warnings)
+    assert len(scan.frames) == usable
+    said = f"{shape[1]} x {shape[0]} pixels, but the intrinsics are for 32 x 24"
+    assert any(said in warning for warning in scan.warnings)
+    if usable == 12:
+        np.testing.assert_allclose(scan.frames.intrinsics[2], [38.4, 38.4, 32, 24])

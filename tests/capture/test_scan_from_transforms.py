@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.scenes import edited, make_capture
+from tests.scenes import edited, make_capture, rescale_images
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsageError
@@ -62,6 +62,31 @@ def test_intrinsics_of_a_frame_come_before_those_of_all(capture):
     scan = read_scan(capture.folder, IngestOptions())
     assert scan.frames.intrinsics[4].tolist() == [21, 22, 15, 11]
     np.testing.assert_allclose(scan.frames.intrinsics[5], capture.intrinsics)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_images_scaled_by_one_number_have_their_intrinsics_scaled(capture, factor):
+    rescale_images(capture, factor)
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.frames.resolution.tolist() == [[32 * factor, 24 * factor]] * 12
+    np.testing.assert_allclose(scan.frames.intrinsics[3], factor * capture.intrinsics)
+    (warning,) = scan.warnings
+    assert f"{32 * factor:.0f} x {24 * factor:.0f} pixels" in warning
+    assert "12 of 12 frames" in warning
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+@pytest.mark.parametrize("state", ["cx, cy", "angle"])
+def test_images_of_another_size_are_noticed_where_no_size_is_stated(capture, factor, state):
+    with edited(capture.manifest) as document:
+        for key in ("w", "h", *(("cx", "cy") if state == "angle" else ())):
+            del document[key]
+        if state == "angle":
+            document["camera_angle_x"] = 2 * math.atan(0.5 * 32 / document["fl_x"])
+    assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
+    rescale_images(capture, factor)
+    with pytest.raises(InputRefused, match=r"of about 32 pixels.* state the w and h.*size\]$"):
+        read_scan(capture.folder, IngestOptions())
 
 
 def test_applied_transform_and_scale_are_undone(capture):

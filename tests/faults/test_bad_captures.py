@@ -6,6 +6,7 @@ Each row edits a capture that is good without it.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.images import read_exr
 
-Recipe = Callable[[MadeCapture], None]
+Recipe = Callable[[MadeCapture], Any]
 
 
 def _mesh(change: Callable[[np.ndarray, np.ndarray, np.ndarray], Any]) -> Recipe:
@@ -204,10 +205,42 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         ["all 12 frames", "no HDR headroom", "shorter exposures"],
     ),
     "all black": (_images(range(12), np.zeros_like), "capture.black", ["black", "Remove"]),
-    "half size": (
-        _images(range(12), lambda image: image[::2, ::2]),
+    "half width": (
+        _images(range(12), lambda image: image[:, ::2]),
         "capture.size",
-        ["16 x 12", "32 x 24", "0.5 times", "intrinsics"],
+        ["16 x 24", "32 x 24", "intrinsics", "state the w and h"],
+    ),
+    "cropped images": (
+        _images(range(12), lambda image: image[4:, :30]),
+        "capture.size",
+        ["30 x 20", "32 x 24", "intrinsics"],
+    ),
+    "size beyond all images": (_manifest(lambda d: d.update(w=1e10)), "capture.format", ["1e+10"]),
+    "absurd size": (_manifest(lambda d: d.update(w=1e300)), "capture.format", ["w is beyond"]),
+    "less than a pixel": (_manifest(lambda d: d.update(h=0.5)), "capture.format", ["h is 0.5"]),
+    "absurd lens": (
+        _manifest(lambda d: d.update(fl_x=1e12)),
+        "capture.camera",
+        ["frames/0000.exr", "1e+12", "32 x 24"],
+    ),
+    "absurd poses": (
+        _poses(lambda m: m * [[1, 1, 1, 1e200], [1] * 4, [1] * 4, [1] * 4]),
+        "capture.pose",
+        ["transforms.json", "finite"],
+    ),
+    "singular applied_transform": (
+        _manifest(lambda d: d.update(applied_transform=np.diag([1, 1, 1, 0]).tolist())),
+        "capture.pose",
+        ["applied_transform", "Correct or remove"],
+    ),
+    "lone surrogate": (_frame(0, file_path="frames/\ud800.exr"), "paths.outside", ["resolved"]),
+    "names that are not utf-8": (
+        lambda c: [
+            os.rename(c.image(0), os.fsencode(c.folder) + b"/frames/\xff.exr"),
+            _frame(0, file_path="frames/\udcff.exr")(c),
+        ],
+        "capture.name",
+        [r"'frames/\udcff.exr'", "UTF-8", "Rename"],
     ),
     "too few frames": (
         _manifest(lambda d: d.update(frames=d["frames"][:7])),
@@ -274,6 +307,11 @@ DROPPED: dict[str, tuple[Recipe, str, list[str]]] = {
         lambda c: c.image(5).unlink(),
         "capture.file",
         ["frames/0005.exr", "does not exist"],
+    ),
+    "a name of 5,000 characters": (
+        _frame(5, file_path="frames/" + "x" * 5000),
+        "capture.file",
+        ["frames/xxx", "xxx...'", "does not exist"],
     ),
     "truncated image": (
         _truncate(range(2, 3), 0.6),

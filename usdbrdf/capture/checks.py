@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from usdbrdf.capture.findings import Findings, FrameRecord
 from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
-from usdbrdf.files.images import image_size
+from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.camera import camera_rays
@@ -20,18 +20,43 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
 
+PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+
 # A frame with less than this share of pixels that are not clipped, or not black, says nothing.
 _MIN_USEFUL_SHARE = 0.001
 
-PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+# Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
+_MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
 
+# Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
+# of the image.
+LARGEST_OF_POSE = 1e9
+_FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
 
-@dataclass(frozen=True)
-class _Refusal:
-    """Why a frame is left out: a clause, and the rule."""
+_MIN_BASELINE = 1e-3  # of the scene's diagonal
 
-    reason: str
-    rule: str
+_MIN_HIT_SHARE = 0.2
+
+# Frames that are probed with rays, and rays along each side of them.
+_PROBED_FRAMES, _PROBED_SIDE = 64, 8
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+# Mix-ups of conventions that are tried where the poses do not fit the mesh.
+_CONVENTIONS: dict[str, Callable[[Double], Double]] = {
+    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
+    "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
+    "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
+        lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
+    ),
+    "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
+    "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
+    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
+}
 
 
 def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
@@ -57,122 +82,6 @@ def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
     return True
 
 
-def check_frames(
-    frames: Frames, names: Sequence[str], findings: Findings, *, max_nonfinite: float
-) -> list[int]:
-    """Indices of the frames that can be used; the others are noted in ``findings``.
-
-    names          N names for messages
-    max_nonfinite  share of unknown pixels above which a frame is dropped
-    """
-    usable: list[int] = []
-    seen: dict[str, str] = {}
-    numbers = progress(range(len(frames)), total=len(frames), label="images", unit="frames")
-    for i in numbers:
-        refusal = _refusal(frames, i, seen, names[i], findings, max_nonfinite)
-        if refusal is None:
-            usable.append(i)
-        else:
-            findings.drop(names[i], refusal.reason, refusal.rule)
-    return usable
-
-
-def _refusal(
-    frames: Frames,
-    i: int,
-    seen: dict[str, str],
-    name: str,
-    findings: Findings,
-    max_nonfinite: float,
-) -> _Refusal | None:
-    path = frames.image_paths[i]
-    try:
-        width, height, _ = image_size(path)
-        stated = (int(frames.resolution[i, 0]), int(frames.resolution[i, 1]))
-        if (width, height) != stated:
-            return _Refusal(_wrong_size((width, height), stated), "capture.size")
-        pixels = read_frame(frames, i)
-    except ImageRefused as error:
-        return _Refusal(_clause(error, path), "capture.image")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if digest in seen:
-        return _Refusal(f"the same image as {seen[digest]!r}", "capture.duplicate")
-    refusal = _useless(pixels, max_nonfinite)
-    if refusal is None:
-        seen[digest] = name
-        findings.count("pixels_unknown", int(pixels.unknown.sum()))
-        findings.count("pixels_negative_clamped", pixels.num_clamped)
-        findings.count("pixels_clipped", int(pixels.clipped.sum()))
-    return refusal
-
-
-def _useless(pixels: FramePixels, max_nonfinite: float) -> _Refusal | None:
-    unknown = float(pixels.unknown.mean())
-    if unknown > max_nonfinite:
-        return _Refusal(
-            f"{unknown:.0%} of the pixels are NaN, infinite or negative (limit "
-            f"{max_nonfinite:.0%})",
-            "capture.nonfinite",
-        )
-    known = ~pixels.unknown
-    if float((known & ~pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
-        return _Refusal("all of its pixels are saturated", "capture.saturated")
-    # With a noise floor of 0 a black pixel is not dark, but it is no light either.
-    lit = known & (np.nan_to_num(pixels.radiance).max(axis=2) > 0) & ~pixels.dark
-    if float((lit | pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
-        return _Refusal("black: no pixel rises above the noise floor", "capture.black")
-    return None
-
-
-def _wrong_size(found: tuple[int, int], stated: tuple[int, int]) -> str:
-    text = f"{found[0]} x {found[1]} pixels, but the intrinsics are for {stated[0]} x {stated[1]}"
-    across, down = found[0] / stated[0], found[1] / stated[1]
-    if abs(across - down) < 1e-3 * across:
-        text += f" (the image is {across:.4g} times that)"
-    return text
-
-
-def _clause(error: ImageRefused, path: Path) -> str:
-    """The reader's sentence without path and rule, which the summary adds."""
-    text = str(error).removeprefix(f"{path}: ")
-    return text.rsplit(" [", 1)[0].rstrip(".")
-
-
-_MAX_DEVIATION = 1e-3  # of R^T R from the identity
-
-_ROUNDING = 1e-5  # what float32 and printed digits explain
-
-_MIN_BASELINE = 1e-3  # of the scene's diagonal
-
-_MIN_HIT_SHARE = 0.2
-
-_PROBED_FRAMES = 64
-
-_PROBED_SIDE = 8  # rays per side of a probed frame
-
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-
-_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-
-
-def _inverse(pose: Double) -> Double:
-    return np.asarray(np.linalg.inv(pose), np.float64)
-
-
-_CONVENTIONS: dict[str, Callable[[Double], Double]] = {
-    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
-    "camera-from-world matrices (invert them)": _inverse,
-    "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
-        lambda m: _inverse(m) @ _FLIP
-    ),
-    "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
-    "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
-    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
-}
-
-
 def rigid_records(
     records: Sequence[FrameRecord],
     findings: Findings,
@@ -180,7 +89,7 @@ def rigid_records(
     *,
     pose_scale: float | None,
 ) -> list[FrameRecord]:
-    """Records with poses made exactly rigid; frames without a finite pose are dropped.
+    """Records with poses made exactly rigid; frames without a sensible camera are dropped.
 
     Almost rigid ones are snapped; scaled, sheared and mirrored ones are refused, because each of
     them is a convention that holds for the whole capture.
@@ -189,25 +98,49 @@ def rigid_records(
     worst = 0.0
     for record in records:
         pose = record.world_from_camera
-        if not np.isfinite(pose).all() or np.abs(pose[3] - [0, 0, 0, 1]).max() > _MAX_DEVIATION:
+        if not is_camera_matrix(pose):
             findings.drop(
                 record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
             )
-            continue
-        axes = pose[:3, :3] / (pose_scale or 1.0)
-        deviation = _refuse_not_rigid(axes, record.name, source, pose_scale)
-        worst = max(worst, deviation)
-        rigid = np.eye(4)
-        left, _, right = np.linalg.svd(axes)
-        rigid[:3, :3] = left @ right
-        rigid[:3, 3] = pose[:3, 3]
-        kept.append(replace(record, world_from_camera=rigid))
+        elif not _is_lens(record):
+            lens = ", ".join(f"{number:g}" for number in record.intrinsics)
+            size = " x ".join(map(str, record.resolution))
+            findings.drop(
+                record.name, f"fx, fy, cx, cy = {lens} make no lens for {size} pixels",
+                "capture.camera",
+            )  # fmt: skip
+        else:
+            axes = pose[:3, :3] / (pose_scale or 1.0)
+            worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
+            rigid = pose.copy()
+            left, _, right = np.linalg.svd(axes)
+            rigid[:3, :3], rigid[3] = left @ right, (0, 0, 0, 1)
+            kept.append(replace(record, world_from_camera=rigid))
     if worst > _ROUNDING:
         findings.warn(
             f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
             "made rigid. [capture.pose]"
         )
     return kept
+
+
+def is_camera_matrix(pose: Double) -> bool:
+    """Whether a 4 x 4 matrix is finite, of sensible numbers, and has the last row 0 0 0 1."""
+    return bool(
+        (np.abs(pose) <= LARGEST_OF_POSE).all()
+        and np.abs(pose[3] - [0, 0, 0, 1]).max() <= _MAX_DEVIATION
+    )
+
+
+def _is_lens(record: FrameRecord) -> bool:
+    if min(record.resolution) < 1 or max(record.resolution) > MAX_SIDE:
+        return False
+    focal = np.array(record.intrinsics[:2]) / record.resolution
+    centre = np.array(record.intrinsics[2:]) / record.resolution
+    low, high = _FOCAL_LENGTHS
+    return bool(
+        ((focal >= low) & (focal <= high)).all() and (np.abs(centre) <= _FARTHEST_CENTRE).all()
+    )
 
 
 def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:
@@ -234,6 +167,104 @@ def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float |
             f"unit of the mesh, pass --pose-scale {measured:.6g}. [capture.pose]"
         )
     return deviation
+
+
+def at_image_size(
+    records: Sequence[FrameRecord], findings: Findings, source: Path
+) -> list[FrameRecord]:
+    """Records with the sizes of their images, and intrinsics that belong to these.
+
+    Images that are larger or smaller than their intrinsics say, by one factor in both axes, have
+    the intrinsics scaled; frames with other sizes, or unreadable ones, are dropped.
+    """
+    kept: list[FrameRecord] = []
+    scaled: list[str] = []
+    for record in records:
+        try:
+            width, height, _ = image_size(record.image_path)
+        except ImageRefused as error:
+            findings.drop(record.name, clause_of(error, record.image_path), "capture.image")
+            continue
+        across, down = record.resolution
+        said = f"{width} x {height} pixels, but the intrinsics are for {across} x {down}"
+        # Whoever scales an image rounds its sides to whole pixels.
+        if abs(width * down - height * across) >= across:
+            findings.drop(record.name, said, "capture.size")
+            continue
+        if (width, height) != record.resolution:
+            scaled.append(f"{record.name!r}: {said}")
+            x, y = width / across, height / down
+            fx, fy, cx, cy = record.intrinsics
+            record = replace(
+                record, resolution=(width, height), intrinsics=(fx * x, fy * y, cx * x, cy * y)
+            )
+        kept.append(record)
+    if scaled:
+        findings.warn(
+            f"{source.name}: the intrinsics of {len(scaled)} of {len(records)} frames have been "
+            f"scaled to the size of their images, first {scaled[0]}. Check that the images were "
+            "scaled, not cropped. [capture.size]"
+        )
+    return kept
+
+
+def check_frames(
+    frames: Frames, names: Sequence[str], findings: Findings, *, max_nonfinite: float
+) -> list[int]:
+    """Indices of the frames that can be used; the others are noted in ``findings``.
+
+    names          N names for messages
+    max_nonfinite  share of unknown pixels above which a frame is dropped
+    """
+    usable: list[int] = []
+    name_of: dict[str, str] = {}
+    numbers = progress(range(len(frames)), total=len(frames), label="images", unit="frames")
+    for i in numbers:
+        path = frames.image_paths[i]
+        try:
+            pixels = read_frame(frames, i)
+        except ImageRefused as error:
+            findings.drop(names[i], clause_of(error, path), "capture.image")
+            continue
+        digest = sha256_of(path)
+        if digest in name_of:
+            findings.drop(names[i], f"the same image as {name_of[digest]!r}", "capture.duplicate")
+            continue
+        useless = _why_useless(pixels, max_nonfinite)
+        if useless:
+            findings.drop(names[i], *useless)
+            continue
+        name_of[digest] = names[i]
+        usable.append(i)
+        findings.count("pixels_unknown", int(pixels.unknown.sum()))
+        findings.count("pixels_negative_clamped", pixels.num_clamped)
+        findings.count("pixels_clipped", int(pixels.clipped.sum()))
+    return usable
+
+
+def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] | None:
+    """Why a frame says nothing, and the rule; None if it does say something."""
+    unknown = float(pixels.unknown.mean())
+    if unknown > max_nonfinite:
+        return (
+            f"{unknown:.0%} of the pixels are NaN, infinite or negative (limit "
+            f"{max_nonfinite:.0%})",
+            "capture.nonfinite",
+        )
+    known = ~pixels.unknown
+    if float((known & ~pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
+        return "all of its pixels are saturated", "capture.saturated"
+    # With a noise floor of 0 a black pixel is not dark, but it is no light either.
+    lit = known & (np.nan_to_num(pixels.radiance).max(axis=2) > 0) & ~pixels.dark
+    if float((lit | pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
+        return "black: no pixel rises above the noise floor", "capture.black"
+    return None
+
+
+def clause_of(error: ImageRefused, path: Path) -> str:
+    """The reader's sentence without path and rule, which the summary adds."""
+    text = str(error).removeprefix(f"{path}: ")
+    return text.rsplit(" [", 1)[0].rstrip(".")
 
 
 def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> None:

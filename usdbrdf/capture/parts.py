@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from usdbrdf.capture.checks import (
+    at_image_size,
     check_frames,
     refuse_rays_that_miss,
     refuse_without_parallax,
@@ -31,13 +33,12 @@ from usdbrdf.untrusted.usd_meshes import meshes_from_usd
 
 @dataclass(frozen=True, kw_only=True)
 class ScanGeometry:
-    """Mesh and objects as in ``Scan``, and the file they came from.
+    """Mesh and objects as in ``Scan``.
 
     usd_geometry, object_prims     set if the file is USD and is to be referenced, not copied
     meters_per_unit, up_axis       None where the file does not say
     """
 
-    path: Path
     mesh: ScanMesh
     objects: tuple[ObjectLabel, ...]
     usd_geometry: Path | None = None
@@ -70,7 +71,6 @@ def geometry_from_usd(
     for sentence in found.warnings:
         findings.warn(sentence)
     return ScanGeometry(
-        path=path,
         mesh=found.mesh,
         objects=tuple(
             ObjectLabel(identifier=identifier, label=label)
@@ -133,7 +133,6 @@ def geometry_from_file(
         findings.count(name, number)
     face_object, objects = objects_with_faces(clean.face_object, split.labels)
     return ScanGeometry(
-        path=mesh_path,
         mesh=ScanMesh(
             points=clean.points,
             triangles=clean.triangles,
@@ -166,9 +165,10 @@ def scan_from_parts(
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
+    _refuse_unusable_names(records, source)
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
+    rigid = at_image_size(rigid, findings, source)
     findings.refuse_too_few_frames(source, total)
-    _refuse_same_image_twice(rigid, source)
     geometry = read_geometry()
     frames = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
     refuse_without_parallax(frames, geometry.mesh, source)
@@ -198,16 +198,10 @@ def scan_from_parts(
 def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
     """The frames with these indices, in this order."""
     rows = np.asarray(indices, np.int64)
-    return replace(
-        frames,
-        image_paths=tuple(frames.image_paths[i] for i in rows),
-        world_from_camera=frames.world_from_camera[rows],
-        intrinsics=frames.intrinsics[rows],
-        resolution=frames.resolution[rows],
-        exposure_time=frames.exposure_time[rows],
-        saturation_radiance=frames.saturation_radiance[rows],
-        noise_floor_radiance=frames.noise_floor_radiance[rows],
-    )
+    columns: dict[str, Any] = {
+        k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
+    }
+    return replace(frames, image_paths=tuple(frames.image_paths[i] for i in rows), **columns)
 
 
 def as_photographs(
@@ -241,12 +235,20 @@ def radiance_encoding(options: IngestOptions, *, photographs: bool) -> str:
     return encoding
 
 
-def _refuse_same_image_twice(records: Sequence[FrameRecord], source: Path) -> None:
-    seen: set[Path] = set()
+def _refuse_unusable_names(records: Sequence[FrameRecord], source: Path) -> None:
+    """USD names images in UTF-8, and each once."""
+    known: set[Path] = set()
     for record in records:
-        if record.image_path in seen:
+        try:
+            str(record.image_path).encode()
+        except UnicodeEncodeError:
+            raise InputRefused(
+                f"{source}: the path of the frame {record.name!r} is not UTF-8, which USD asks "
+                "for. Rename the file or its folder. [capture.name]"
+            ) from None
+        if record.image_path in known:
             raise InputRefused(
                 f"{source}: the frame {record.name!r} is listed twice. Keep one entry. "
                 "[capture.duplicate]"
             )
-        seen.add(record.image_path)
+        known.add(record.image_path)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.capture.checks import clause_of
 from usdbrdf.capture.findings import Findings, FrameRecord
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import (
@@ -114,7 +115,7 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
     try:
         resolution = _resolution(document, camera, photograph)
     except ImageRefused as error:
-        findings.drop(name, f"the image cannot be read ({error})", "capture.image")
+        findings.drop(name, clause_of(error, photograph), "capture.image")
         return None
     exposure = document.get("exposureDuration")
     known = isinstance(exposure, int | float) and exposure > 0

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from usdbrdf.capture.checks import refuse_photographs
+from usdbrdf.capture.checks import (
+    LARGEST_OF_POSE,
+    at_image_size,
+    clause_of,
+    is_camera_matrix,
+    refuse_photographs,
+)
 from usdbrdf.capture.findings import Findings, FrameRecord
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import (
@@ -21,7 +29,7 @@ from usdbrdf.capture.parts import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.images import image_size
+from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -29,8 +37,8 @@ from usdbrdf.model.capture import Scan
 
 def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
     """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
-    if candidate and "\0" not in candidate:
-        for folder in options.allow_outside:
+    for folder in options.allow_outside if candidate else ():
+        with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
             path = (root / candidate).resolve()
             if path.is_relative_to(folder.resolve()):
                 return path
@@ -44,6 +52,14 @@ DESCRIPTION = "folder with transforms.json (nerfstudio), scene-linear images and
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+# No number in a document means anything beyond this; nor, where it must be positive, below its
+# inverse.
+_LARGEST = 1e15
+
+# Where no size is stated: a principal point this far from the image's centre, or an image this much
+# wider than its angle says, in parts of its size, belongs to an image of another size.
+_OFF_CENTRE = 0.2
 
 # Tried where a name has no suffix, as in the NeRF authors' synthetic scenes.
 _SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg")
@@ -101,7 +117,8 @@ def frame_records(
     """
     source = source.resolve()
     capture = _Capture(source=source, document=_document(source), options=options, images=images)
-    return _records(capture, findings)
+    records = _records(capture, findings)
+    return at_image_size(records, findings, source) if images else records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,13 +140,24 @@ class _Capture:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.refuse(f"{key} is {value!r}, not a number. Correct it.", "capture.format")
+        if abs(value) > _LARGEST:
+            raise self.refuse(f"{key} is beyond {_LARGEST:g}. Correct it.", "capture.format")
         return float(value)
 
     def positive(self, frame: Mapping[str, Any], key: str) -> float | None:
         value = self.number(frame, key)
-        if value is not None and not value > 0:
+        if value is not None and not value >= 1 / _LARGEST:
             raise self.refuse(f"{key} is {value:g}, not above 0. Correct it.", "capture.format")
         return value
+
+    def pixels(self, frame: Mapping[str, Any], key: str) -> int | None:
+        value = self.positive(frame, key)
+        if value is not None and not (value.is_integer() and value <= MAX_SIDE):
+            raise self.refuse(
+                f"{key} is {value:g}, not a whole number of pixels up to {MAX_SIDE}. Correct it.",
+                "capture.format",
+            )
+        return None if value is None else int(value)
 
 
 def _document(source: Path) -> Mapping[str, Any]:
@@ -155,29 +183,35 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
         return None
     _refuse_distortion(capture, frame, name)
-    width, height = capture.positive(frame, "w"), capture.positive(frame, "h")
+    width, height = capture.pixels(frame, "w"), capture.pixels(frame, "h")
     stated = width is not None and height is not None
     needed = capture.images or not stated
     path = _image_path(capture, name) if needed else capture.source.parent / name
-    if needed and not path.is_file():
+    if needed and not os.path.isfile(path):  # Path.is_file() raises where a name is too long
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
     pose = _pose(frame.get("transform_matrix"))
     if pose is None:
-        findings.drop(name, "it has no transform_matrix of 4 x 4 finite numbers", "capture.pose")
+        findings.drop(
+            name, "it has no transform_matrix of 4 x 4 finite and sensible numbers", "capture.pose"
+        )
         return None
     if width is None or height is None:
         try:
             width, height, _ = image_size(path)
         except ImageRefused as error:
-            findings.drop(name, f"the image cannot be read ({error})", "capture.image")
+            findings.drop(name, clause_of(error, path), "capture.image")
+            return None
+        why = _why_of_another_size(capture, frame, width, height)
+        if why:
+            findings.drop(name, why, "capture.size")
             return None
     return FrameRecord(
         name=name,
         image_path=path,
         world_from_camera=_undo_applied_transform(capture, pose),
         intrinsics=_intrinsics(capture, frame, name, width, height),
-        resolution=(int(width), int(height)),
+        resolution=(width, height),
         exposure_time=capture.positive(frame, "exposure_time") or 1.0,
         saturation_radiance=capture.positive(frame, "saturation_radiance") or math.inf,
         noise_floor_radiance=capture.number(frame, "noise_floor_radiance") or 0.0,
@@ -186,9 +220,9 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
 
 def _image_path(capture: _Capture, name: str) -> Path:
     path = path_in_capture(capture.source.parent, name, capture.options)
-    if not path.suffix and not path.exists():
+    if not path.suffix and not os.path.exists(path):
         candidates = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-        return next((candidate for candidate in candidates if candidate.is_file()), path)
+        return next((candidate for candidate in candidates if os.path.isfile(candidate)), path)
     return path
 
 
@@ -199,7 +233,7 @@ def _pose(matrix: object) -> Double | None:
         return None
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
-    return pose if pose.shape == (4, 4) and np.isfinite(pose).all() else None
+    return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
 
 
 def _intrinsics(
@@ -222,6 +256,30 @@ def _intrinsics(
         )
     cx, cy = capture.number(frame, "cx"), capture.number(frame, "cy")
     return fx, fy or fx, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _why_of_another_size(
+    capture: _Capture, frame: Mapping[str, Any], width: int, height: int
+) -> str | None:
+    """Why intrinsics without a stated size do not belong to an image of this one, if so."""
+    image = f"the image is {width} x {height} pixels, but its "
+    for key, size in (("cx", width), ("cy", height)):
+        centre = capture.number(frame, key)
+        if centre is not None and abs(centre - size / 2) > _OFF_CENTRE * size:
+            return (
+                f"{image}{key} is {centre:g}, as of an image of about {2 * centre:.0f} pixels: "
+                "either the images were scaled or the intrinsics"
+            )
+    for key, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
+        focal, across = capture.positive(frame, key), capture.positive(frame, angle)
+        if focal is not None and across is not None:
+            stated = 2 * focal * math.tan(across / 2)
+            if abs(stated - size) > _OFF_CENTRE * size:
+                return (
+                    f"{image}{key} and {angle} are those of an image of about {stated:.0f} pixels: "
+                    "either the images were scaled or the intrinsics"
+                )
+    return None
 
 
 def _refuse_distortion(capture: _Capture, frame: Mapping[str, Any], name: str) -> None:
@@ -250,7 +308,11 @@ def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
     if applied is None:
         return undone
     matrix = _pose(applied)
-    if matrix is None or np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 1e-3:
+    if (
+        matrix is None
+        or not is_camera_matrix(matrix)
+        or np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 1e-3
+    ):
         raise capture.refuse(
             "applied_transform is not a rigid 3 x 4 matrix. Correct or remove it.", "capture.pose"
         )

@@ -95,7 +95,7 @@ def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
         f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
         for name, digest in zip(names, digests, strict=True)
     ]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return hashlib.sha256("".join(lines).encode(errors="surrogateescape")).hexdigest()
 
 
 def _foreign_layers(asset: Asset) -> list[Path]:
