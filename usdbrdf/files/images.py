@@ -31,6 +31,9 @@ MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 
 
 HALF_MAX = 65_504.0
 
+# What halves hold well: a little less than the largest, and all their digits.
+_HALF_FROM, _HALF_UNTIL = 2.0**-14, 60_000.0
+
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
 
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
@@ -124,6 +127,18 @@ def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
             )
         publish(staged, path)
     return clamped
+
+
+def needs_float(values: Float) -> bool:
+    """Whether half floats would clamp any of the values, or round most of those that are not 0.
+
+    Halves end at 65504 and lose digits below 2^-14: radiance in other units lies beyond either.
+    """
+    size = np.abs(values)
+    if float(size.max(initial=0)) > _HALF_UNTIL:
+        return True
+    some = size[size > 0]
+    return bool(some.size and np.count_nonzero(some < _HALF_FROM) * 2 > some.size)
 
 
 def resized(pixels: Float, width: int, height: int) -> Float:

@@ -16,16 +16,13 @@ from usdbrdf.asset.properties import Aov
 from usdbrdf.asset.readers.objects import aov_path
 from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.files.images import needs_float, read_exr, write_exr
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
-
-# Half floats end at 65504. A map that must lose nothing is stored as floats from here on.
-_HALF_UNTIL = 60_000
 
 # Pictures written at a time.
 _WRITERS = min(4, os.cpu_count() or 1)
@@ -90,13 +87,11 @@ def _read_map(stage: Usd.Stage, obj: SceneObject, aov: str) -> Float:
 
 
 class TexelMap(NamedTuple):
-    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``; exact: stored as floats
-    rather than clamped."""
+    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``."""
 
     values: Float
     scale: float
     unit: str
-    exact: bool = False
 
 
 @dataclass
@@ -115,8 +110,7 @@ class MapWriter:
 
         def written(place: Path, chosen: TexelMap) -> int:
             picture = self.texels.image(index, chosen.values)
-            half = not (chosen.exact and float(np.abs(picture).max()) > _HALF_UNTIL)
-            return write_exr(place, picture, half=half)
+            return write_exr(place, picture, half=not needs_float(picture))
 
         # Compressing takes a core each, and flushing to the disk time.
         with ThreadPoolExecutor(_WRITERS) as pool:

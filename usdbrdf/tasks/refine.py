@@ -93,7 +93,7 @@ def refined_maps(
     irradiance = refined_irradiance(run, atlas, lit, diffuse, lobes, lightmap_filter, seed)
     base_color, diffuse = reflected(diffuse, irradiance)
     return {
-        "diffuse": TexelMap(diffuse.astype(np.float32), 1.0, "W/(m^2 sr)", exact=True),
+        "diffuse": TexelMap(diffuse.astype(np.float32), 1.0, "W/(m^2 sr)"),
         "refined_irradiance": TexelMap(irradiance, 1 / np.pi, "W/m^2"),
         "base_color": TexelMap(base_color, 1.0, "1"),
     }

@@ -158,7 +158,7 @@ def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str
     shines = np.where(emissive[:, None], shaded.light.lit, 0)
     writer = MapWriter(run, step.asset, atlas.texels)
     maps = _maps(shaded)
-    emission = TexelMap(shines, 1.0, "W/(m^2 sr)", exact=True)
+    emission = TexelMap(shines, 1.0, "W/(m^2 sr)")
     objects = []
     for i, obj in enumerate(atlas.scene.objects):
         emits = emissive[atlas.texels.of_object(i)].any()

@@ -178,7 +178,7 @@ def _found(texels: Texels, seen: Measured) -> _Found:
     lit, mean = _filled_in(texels, seen, measured, clipped)
     coverage = np.select([measured, clipped], [MEASURED, CLIPPED], FILLED).astype(np.float32)
     maps = {
-        "lit": TexelMap(lit, 1.0, "W/(m^2 sr)", exact=True),
+        "lit": TexelMap(lit, 1.0, "W/(m^2 sr)"),
         "mean": TexelMap(mean, 1.0, "W/(m^2 sr)"),
         "spread": TexelMap(np.nan_to_num(seen.spread), 1.0, "W/(m^2 sr)"),
         "samples": TexelMap(seen.count.astype(np.float32), 1 / 32, "1"),

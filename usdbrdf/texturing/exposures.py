@@ -32,7 +32,7 @@ _HALF_STOP, _STANDING_OUT, _FEWEST = math.log(2) / 2, 2.0, 24
 _MOST_CONTRADICTING = 0.2
 
 # Samples further off than this, in logarithms, lose weight; and steps of the reweighting.
-_OUTLYING, _STEPS = 0.1, 12
+_OUTLYING, _STEPS = 0.1, 8
 
 # What draws a gain to 0 that nothing else decides, in samples.
 _TIE = 1e-3
@@ -99,7 +99,7 @@ def gains_of_frames(logarithm: Float) -> Gains:
         said = (weight * value).sum(axis=0)
         said -= weight.T @ ((weight * value).sum(axis=1) / total)
         equations = LinearOperator((len(gain), len(gain)), matvec=without_radiance)
-        gain, _ = cg(equations, said, x0=gain, maxiter=200)
+        gain, _ = cg(equations, said, x0=gain, rtol=1e-3, maxiter=200)
         off = value - gain
         off -= ((weight * off).sum(axis=1) / total)[:, None]
         weight = known * np.minimum(1, _OUTLYING / np.maximum(np.abs(off), 1e-9))
