@@ -15,7 +15,7 @@ import numpy as np
 from measure import Lit, timed
 
 from usdbrdf.shading.denoise import OIDN, chosen_filter
-from usdbrdf.tasks.trace import denoised_irradiance
+from usdbrdf.shading.irradiance_map import denoised_irradiance
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 

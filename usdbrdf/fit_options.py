@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from usdbrdf.tasks.fit_objects import FitOptions
+from usdbrdf.material.fit_objects import FitOptions
 
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:

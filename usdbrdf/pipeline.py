@@ -31,8 +31,8 @@ from usdbrdf.job.ownership import (
 )
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult
+from usdbrdf.material.fit_objects import FitOptions
 from usdbrdf.tasks.fit import fit
-from usdbrdf.tasks.fit_objects import FitOptions
 from usdbrdf.tasks.ingest import ingest
 from usdbrdf.tasks.shade import ShadeOptions, shade
 from usdbrdf.tasks.texture import TextureOptions, texture

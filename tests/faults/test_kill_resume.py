@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-import usdbrdf.tasks.fit_objects
+import usdbrdf.material.fit_objects
+import usdbrdf.shading.irradiance_map
 import usdbrdf.tasks.texture
-import usdbrdf.tasks.trace
 from tests.scenes import make_capture
 from usdbrdf.cli import main
 from usdbrdf.files import atomic
@@ -29,8 +29,8 @@ from usdbrdf.job.ownership import edited_files
 TILE = 64  # texels
 PROGRAM = f"""
 import sys
-import usdbrdf.tasks.trace
-usdbrdf.tasks.trace._TILE = {TILE}
+import usdbrdf.shading.irradiance_map
+usdbrdf.shading.irradiance_map._TILE = {TILE}
 from usdbrdf.cli import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -91,7 +91,7 @@ def undisturbed(base):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    monkeypatch.setattr(usdbrdf.tasks.trace, "_TILE", TILE)
+    monkeypatch.setattr(usdbrdf.shading.irradiance_map, "_TILE", TILE)
 
 
 @pytest.fixture
@@ -176,9 +176,9 @@ def calls(monkeypatch):
 
     count(usdbrdf.tasks.texture, "unwrap")
     count(usdbrdf.tasks.texture, "radiance_from_frames")
-    count(usdbrdf.tasks.trace, "irradiance_at")
-    count(usdbrdf.tasks.fit_objects, "choose_target_frames")
-    count(usdbrdf.tasks.fit_objects, "fit_object")
+    count(usdbrdf.shading.irradiance_map, "irradiance_at")
+    count(usdbrdf.material.fit_objects, "choose_target_frames")
+    count(usdbrdf.material.fit_objects, "fit_object")
     return counted
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.job.task import StageRun
-from usdbrdf.tasks.atlas import Atlas
-from usdbrdf.tasks.clipped import ClippedLight, estimate_clipped_light
+from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.transport.patch_draws import independent_patches
@@ -58,7 +58,7 @@ def truth(world: World) -> np.ndarray:
 
 
 def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
-    atlas = Atlas(stage=None, scene=world.scene, texels=world.texels)
+    atlas = AssetMaps(stage=None, scene=world.scene, texels=world.texels)
     run = StageRun(folder, "shade", folder / "work")
     return estimate_clipped_light(
         run, atlas, world.rays, lit, ~clipped, clipped, black_environment(), 0

@@ -16,6 +16,7 @@ from scipy import stats
 import usdbrdf
 from tests.scenes import MadeCapture, make_capture, poses_down_and_up
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_aovs, read_shading
@@ -24,16 +25,14 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import task as stage_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import StageRun
+from usdbrdf.material.refine import refined_maps
+from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.camera import pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.tasks import refine, trace
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
-from usdbrdf.tasks.lit import lit_scene
-from usdbrdf.tasks.refine import refined_maps
-from usdbrdf.tasks.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.tasks.texture import MEASURED
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, lit_scene, visible_points
 from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
 from usdbrdf.transport.rays import lift_from_surface
 
@@ -58,7 +57,7 @@ class Room:
     """clean, glossy: the same room with diffuse radiance alone and with lobes, both shaded."""
 
     folder: Path
-    clean: Atlas
+    clean: AssetMaps
     glossy: Asset
 
 
@@ -72,11 +71,11 @@ def _shaded(capture: MadeCapture, folder: Path) -> Asset:
         return asset
 
 
-def _atlas(asset: Asset) -> Atlas:
-    return atlas_from_stage(open_measured(asset))
+def _atlas(asset: Asset) -> AssetMaps:
+    return AssetMaps(open_measured(asset))
 
 
-def _lobes(atlas: Atlas) -> Lobes:
+def _lobes(atlas: AssetMaps) -> Lobes:
     rows = [LOBE.get(item.label, (1.0, 0.0)) for item in atlas.scene.objects]
     phi, psi = np.array(rows, np.float32).T
     return Lobes(phi=phi, psi=psi)
@@ -94,7 +93,7 @@ def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, see
     return result
 
 
-def _add_specular(capture: MadeCapture, atlas: Atlas, frames: Frames) -> None:
+def _add_specular(capture: MadeCapture, atlas: AssetMaps, frames: Frames) -> None:
     """To the photographs of the diffuse room."""
     lit, lobes = lit_scene(atlas, black_environment()), _lobes(atlas)
     for i, path in enumerate(sorted((capture.folder / "frames").iterdir())):
@@ -142,7 +141,7 @@ def fitted(room: Room) -> Asset:
     return _fitted(room, "fitted", usdbrdf.FitOptions())
 
 
-def _reflecting(room: Room, atlas: Atlas) -> np.ndarray:
+def _reflecting(room: Room, atlas: AssetMaps) -> np.ndarray:
     """(T,): measured and no lamp."""
     owner = np.array([item.label for item in atlas.scene.objects])[atlas.texels.object_index()]
     measured = (atlas.map("coverage")[:, 0] == MEASURED) & (room.clean.map("coverage")[:, 0] == 1)
@@ -154,7 +153,7 @@ def _off(found: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.median(np.abs(found - wanted).sum(axis=1) / wanted.sum(axis=1)))
 
 
-def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
+def _true_irradiance(clean: AssetMaps, which: np.ndarray) -> np.ndarray:
     """S of some texels in the glossy room: that of the diffuse one, and pi times the mean specular
     radiance that arrives along 64 cosine-distributed rays."""
     lit, texels = lit_scene(clean, black_environment()), clean.texels
@@ -180,7 +179,7 @@ def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
 
 def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
     stage = open_measured(room.glossy)
-    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
     run = StageRun(tmp_path, "fit", tmp_path / "work")
     lit = lit_scene(atlas, black_environment())
     found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
@@ -213,7 +212,7 @@ def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset)
 
 def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Path):
     """From S of the glossy room's lit texture to that of its diffuse radiance and lobes."""
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     some = np.flatnonzero(_reflecting(room, atlas))
     some = np.random.default_rng(1).choice(some, 400, replace=False)
     wanted = _true_irradiance(room.clean, some)
@@ -238,14 +237,14 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
 
 def _refined(room: Room, folder: Path) -> np.ndarray:
     """Refined irradiance of the glossy room in its own lit texture."""
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     run = StageRun(folder, "fit", folder / "work")
     lit, diffuse = lit_scene(atlas, black_environment()), 0.8 * atlas.map("lit")
     return refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)
 
 
 def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: Path, monkeypatch):
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     frames, lit = frames_from_stage(atlas.stage), lit_scene(atlas, black_environment())
     given = []
 
@@ -274,14 +273,14 @@ def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):
 
 def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
     """A lamp of which more is known than the lit texture shows has lit S already."""
-    by_name = Atlas.map_where_present
+    by_name = AssetMaps.map_where_present
 
-    def brighter(atlas: Atlas, aov: str, channels: int) -> Float:
+    def brighter(atlas: AssetMaps, aov: str, channels: int) -> Float:
         return by_name(atlas, aov, channels) * (2 if aov == "emission" else 1)
 
-    monkeypatch.setattr(Atlas, "map_where_present", brighter)
+    monkeypatch.setattr(AssetMaps, "map_where_present", brighter)
     lobes = Lobes(phi=np.ones(5, np.float32), psi=np.zeros(5, np.float32))
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     emission = atlas.map_where_present("emission", 3)
     diffuse = np.where(emission > 0, emission, atlas.map("lit"))
     run, lit = StageRun(tmp_path, "fit", tmp_path / "work"), lit_scene(atlas, black_environment())
@@ -334,7 +333,7 @@ def test_the_material_shows_the_base_colour(fitted: Asset):
 def test_other_fits_leave_the_albedo(room: Room):
     paper = _fitted(room, "paper", usdbrdf.FitOptions(method="paper", max_pixels=60))
     stage = open_measured(paper)
-    for item in atlas_from_stage(stage).scene.objects:
+    for item in AssetMaps(stage).scene.objects:
         names = {aov.name for aov in read_aovs(stage, item.prim_path)}
         assert "lit" in names
         assert not names & {"diffuse", "refined_irradiance", "base_color"}

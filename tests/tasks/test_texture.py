@@ -11,12 +11,12 @@ import pytest
 import usdbrdf
 from tests.scenes import make_capture, ring_of_poses, write_ply
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.tasks import texture as module
-from usdbrdf.tasks.atlas import MapWriter, TexelMap
 
 OPTIONS = usdbrdf.TextureOptions(texel_size=0.2)
 

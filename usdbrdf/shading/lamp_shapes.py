@@ -9,6 +9,8 @@ import numpy as np
 from trimesh.bounds import oriented_bounds_2D
 
 from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.scene import Scene
+from usdbrdf.model.texels import Texels
 
 # A lamp is replaced by at most so many flat lights (a box has six sides), which together must
 # carry this share of its power.
@@ -64,6 +66,22 @@ def lamp_shapes(points: Float, triangles: Int, radiance: Float) -> tuple[LampSha
     normals = cross / (2 * area[:, None])
     sphere = _sphere(corners, normals, area, light)
     return (sphere,) if sphere else _flat_parts(corners, normals, area, light)
+
+
+def shapes_of_object(
+    scene: Scene, texels: Texels, shines: Float, index: int
+) -> tuple[LampShape, ...]:
+    """Lights in place of one object, if it has a shape for that; shines (T, 3): emitted radiance,
+    W/(m^2 sr)."""
+    own, faces = texels.of_object(index), scene.objects[index].faces
+    area, face = texels.area[own], texels.face[own] - faces.start
+    triangles = scene.triangles[faces]
+    weight = np.bincount(face, area, len(triangles))
+    power = np.stack([np.bincount(face, area * c, len(triangles)) for c in shines[own].T], axis=1)
+    # Faces smaller than a texel may have none: they shine as the lamp does on the whole.
+    mean = power.sum(axis=0) / max(weight.sum(), 1e-12)
+    radiance = np.where(weight[:, None] > 0, power / np.maximum(weight, 1e-12)[:, None], mean)
+    return lamp_shapes(scene.points, triangles, radiance.astype(np.float32))
 
 
 def _sphere(corners: Double, normals: Double, area: Double, light: Double) -> LampShape | None:

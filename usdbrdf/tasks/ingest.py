@@ -1,4 +1,4 @@
-"""Step 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
+"""Task 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
-from usdbrdf.tasks.step import Step, hash_of_files
+from usdbrdf.tasks.task import Task, hash_of_files
 from usdbrdf.untrusted.usd_paths import layers_of_usd
 
 
@@ -43,7 +43,7 @@ def ingest(
     if chosen.package:
         # Our own adapters change with the version of the code, which every stamp holds.
         parameters["adapter_package"] = chosen.package
-    step = Step(
+    task = Task(
         asset=asset,
         name="ingest",
         role="scan",
@@ -62,7 +62,7 @@ def ingest(
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         write_scan_layer(
-            run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, step.provenance
+            run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, task.provenance
         )
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
@@ -79,7 +79,7 @@ def ingest(
             "warnings": list(scan.warnings),
         }
 
-    return step.run(work)
+    return task.run(work)
 
 
 def _places(capture: Path, options: IngestOptions, asset: Asset) -> dict[str, str]:

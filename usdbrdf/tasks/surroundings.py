@@ -10,7 +10,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, to_working_space
 from usdbrdf.files.images import read_radiance
 from usdbrdf.model.arrays import Float
-from usdbrdf.tasks.step import hash_of_files
+from usdbrdf.tasks.task import hash_of_files
 from usdbrdf.transport.environment import Environment, black_environment
 
 # What these files hold is radiance even where all of it happens to be 0 or 1.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Vt
+from pxr import Gf, Sdf, Usd, Vt
 
 from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
 from usdbrdf.asset.layers.author import apply_schema, attribute, export, over
@@ -14,7 +14,6 @@ from usdbrdf.asset.layers.input_bindings import recorded_bindings
 from usdbrdf.asset.layers.looks import LIT, author_look_materials, author_looks
 from usdbrdf.asset.layout import Asset, path_in_layer
 from usdbrdf.asset.properties import Aov, FittedObject, ShadedObject, TexturedObject
-from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.schema import verify
 from usdbrdf.model.arrays import Float
 
@@ -33,12 +32,15 @@ def write_texturing_layer(
     header: StageHeader,
     provenance: Provenance,
     objects: Sequence[TexturedObject],
+    scan: Usd.Stage,
 ) -> None:
-    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``."""
+    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``.
+
+    scan  the composed stage of the weaker layers
+    """
     verify()
     scopes = Scopes.of(asset)
     folder = asset.layer("texturing").parent
-    measured = open_weaker(asset, "texturing")
     coordinates = new_layer(header, provenance)
     layer = new_layer(header, provenance)
     layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
@@ -46,7 +48,7 @@ def write_texturing_layer(
         over(coordinates, scopes.root)
         over(layer, scopes.root)
         for item in objects:
-            declared = measured.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
+            declared = scan.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
             author_texture_coordinates(
                 over(coordinates, item.prim_path),
                 item.corner_uv,

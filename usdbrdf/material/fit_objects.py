@@ -1,16 +1,16 @@
-"""Inside step 4: one pass over the frames for all objects, then a lobe for each of them."""
+"""One pass over the frames for all objects, then a lobe for each of them."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from usdbrdf.errors import UsageError
@@ -21,11 +21,9 @@ from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
-from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Texels
-from usdbrdf.tasks.atlas import Atlas
-from usdbrdf.tasks.texture import MEASURED, check_memory
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_samples import Mixture
 
@@ -38,7 +36,7 @@ _COUNTED_PIXELS = 80_000
 
 Method = Literal["views", "scaled", "paper"]
 
-Mapping = Literal["measured", "matched"]
+MaterialMapping = Literal["measured", "matched"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +50,7 @@ class FitOptions:
 
     method: Method = "views"
     max_pixels: int = 1500
-    mapping: Mapping = "matched"
+    mapping: MaterialMapping = "matched"
     materialx: bool = False
     environment: Path | None = None
     memory: float | None = None
@@ -61,7 +59,8 @@ class FitOptions:
     def __post_init__(self) -> None:
         if self.max_pixels < 50:
             raise UsageError("--max-pixels: at least 50 are needed. [usage.option]")
-        check_memory(self.memory)
+        if self.memory is not None and not self.memory > 0:
+            raise UsageError(f"--memory {self.memory}: not above 0. [usage.option]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,16 +74,62 @@ class Survey:
     smoothing: float
 
 
-def survey_frames(
-    run: StageRun, atlas: Atlas, lit: LitScene, frames: Frames, options: FitOptions
-) -> Survey:
-    """Gather all that the fits need of the frames, which are read once."""
+class ObjectFit(NamedTuple):
+    """What the frames say of one object's lobe; NaN where it could not be fitted.
 
-    def gather() -> dict[str, npt.NDArray[Any]]:
-        measured = (atlas.map("coverage")[:, 0] == MEASURED) & atlas.texels.interior
-        usable = measured & ~(atlas.map_where_present("emission", 3) > 0).any(axis=1)
+    phi, psi, phi_error, psi_error  the paper's parameters and their standard deviations
+    unresolved    share of the highlight that the pixels do not resolve
+    cost          at the minimum; evidence: 1 - cost / cost without a lobe
+    num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
+    """
+
+    phi: float = math.nan
+    psi: float = math.nan
+    phi_error: float = math.nan
+    psi_error: float = math.nan
+    unresolved: float = math.nan
+    cost: float = math.nan
+    evidence: float = math.nan
+    num_samples: int = 0
+    target: int = -1
+
+    def arrays(self) -> dict[str, Array]:
+        """As checkpoints hold it."""
+        return {
+            "numbers": np.array(self[:7]),
+            "used": np.array(self.num_samples),
+            "target": np.array(self.target),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> ObjectFit:
+        """The inverse of ``arrays``."""
+        counts = int(arrays["used"]), int(arrays["target"])
+        return cls._make([*map(float, arrays["numbers"]), *counts])
+
+    def rounded(self) -> ObjectFit:
+        """Without the digits that depend on how many threads the linear algebra had."""
+        return ObjectFit._make([*(round(number, 4) for number in self[:7]), *self[7:]])
+
+
+def survey_frames(
+    run: StageRun,
+    lit: LitScene,
+    texels: Texels,
+    usable: Bool,
+    frames: Frames,
+    options: FitOptions,
+) -> Survey:
+    """Gather all that the fits need of the frames, which are read once.
+
+    usable (T,): measured by frames, and no lamp
+    """
+
+    def gather() -> dict[str, Array]:
         by_views = options.method == "views"
-        follower = Follower(lit, atlas.texels, usable & by_views, len(frames), options.seed)
+        follower = Follower(
+            lit, texels, usable & texels.interior & by_views, len(frames), options.seed
+        )
         counts = []
         numbers = range(len(frames))
         for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
@@ -94,10 +139,8 @@ def survey_frames(
                 follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
             else:
                 counts.append(_count(lit, frames, i, pixels.valid))
-        target = (
-            follower.target_frames(atlas.texels) if by_views else choose_target_frames(counts)[0]
-        )
-        chosen = follower.chosen(atlas.texels, options.seed)
+        target = follower.target_frames(texels) if by_views else choose_target_frames(counts)[0]
+        chosen = follower.chosen(texels, options.seed)
         smoothing = np.array(follower.smoothing)
         return {"target": target, "smoothing": smoothing, **chosen.arrays()}
 
@@ -130,11 +173,11 @@ def fitted_objects(
     frames: Frames,
     survey: Survey,
     options: FitOptions,
-) -> list[dict[str, npt.NDArray[Any]]]:
-    """What ``fit_object`` says of every object, going on where an interrupted run was."""
+) -> list[ObjectFit]:
+    """``fit_object`` of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))
     stored = {i: run.checkpoint_if(f"object-{i}") for i in numbers}
-    done = {i: found for i, found in stored.items() if found is not None}
+    done = {i: ObjectFit.from_arrays(found) for i, found in stored.items() if found is not None}
     with (
         # With all cores for each object's small matrices BLAS's threads only wait for each other.
         threadpool_limits(limits=1, user_api="blas"),
@@ -148,12 +191,12 @@ def fitted_objects(
         try:
             for job in progress(as_completed(jobs), total=len(jobs), label="fit", unit="objects"):
                 i, found = jobs[job], job.result()
-                run.save(f"object-{i}", found)
+                run.save(f"object-{i}", found.arrays())
                 done[i] = found
         finally:
             for job in jobs:
                 job.cancel()
-    return [done[i] for i in numbers]
+    return [done[i].rounded() for i in numbers]
 
 
 def fit_object(
@@ -164,10 +207,9 @@ def fit_object(
     index: int,
     options: FitOptions,
     mixture: Mixture = MIXTURE,
-) -> dict[str, npt.NDArray[Any]]:
-    """phi, psi, their errors, share unresolved, cost and evidence (NaN where the object could not
-    be fitted), the number of samples, and the target frame (-1: none). mixture: see fit_views."""
-    numbers, used, target = np.full(7, np.nan), 0, int(survey.target[index])
+) -> ObjectFit:
+    """The lobe of one object by the chosen method; mixture: see fit_views."""
+    target = int(survey.target[index])
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
@@ -175,21 +217,25 @@ def fit_object(
             lit, texels, own, survey.smoothing, lambda frame: _view(frames, frame, *nothing), index,
             options.seed, mixture,
         )  # fmt: skip
-        if lobe is not None:
-            numbers[:] = (
-                lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
-                lobe.evidence,
-            )  # fmt: skip
-    elif target >= 0 and not _is_lamp(lit, index):
-        pixels = read_frame(frames, target)
-        view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
-        residual: Residual = "paper" if options.method == "paper" else "scaled"
-        found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
-        if found is not None:
-            # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
-            error = (found.phi_high - found.phi_low) / math.sqrt(12)
-            numbers[:] = found.phi, found.psi, error, np.nan, 0, found.cost, found.evidence
-    return {"numbers": numbers, "used": np.array(used), "target": np.array(target)}
+        if lobe is None:
+            return ObjectFit(num_samples=used, target=target)
+        return ObjectFit(
+            lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
+            lobe.evidence, used, target,
+        )  # fmt: skip
+    if target < 0 or _is_lamp(lit, index):
+        return ObjectFit(target=target)
+    pixels = read_frame(frames, target)
+    view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
+    residual: Residual = "paper" if options.method == "paper" else "scaled"
+    found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
+    if found is None:
+        return ObjectFit(num_samples=used, target=target)
+    # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
+    error = (found.phi_high - found.phi_low) / math.sqrt(12)
+    return ObjectFit(
+        found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence, used, target
+    )
 
 
 def _is_lamp(lit: LitScene, index: int) -> bool:

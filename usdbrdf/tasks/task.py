@@ -1,4 +1,4 @@
-"""What every step does around its own work: lock, stamp, provenance, hashes of what it reads."""
+"""What every task does around its own work: what it depends on, stamp, provenance of its layers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pxr import Ar
+from pxr import Ar, Usd
 
 from usdbrdf.asset.header import Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
@@ -21,8 +21,8 @@ from usdbrdf.job.task import StageResult, StageRun, run_stage
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
-    """One step about to run: its asset, its role ("texturing", ...), what it depends on."""
+class Task:
+    """A task about to run: its asset, its role ("texturing", ...), what its outputs depend on."""
 
     asset: Asset
     name: str
@@ -43,6 +43,7 @@ class Step:
 
     @property
     def provenance(self) -> Provenance:
+        """What the task's layers say of how they came about."""
         return Provenance(
             role=self.role,
             version=code_version(),
@@ -52,11 +53,15 @@ class Step:
 
     @property
     def header(self) -> StageHeader:
+        """Units, axes and times of the scan, which every layer repeats."""
         return read_header(self.asset.layer("scan"))
 
 
-def weaker_layers(asset: Asset, role: str) -> dict[str, str]:
-    """Hashes of the layers that a step of ``role`` composes; refuses if one is not there yet."""
+def open_task(asset: Asset, role: str) -> tuple[Usd.Stage, dict[str, str]]:
+    """The stage that a task of ``role`` builds upon, and the hashes of the layers in it.
+
+    Raises InputRefused where an earlier task has not run.
+    """
     files = [asset.layer(weaker) for weaker in ROLES[: ROLES.index(role)]]
     if role in ("shading", "material"):
         files.append(asset.uv_layer)
@@ -68,8 +73,23 @@ def weaker_layers(asset: Asset, role: str) -> dict[str, str]:
                 "[asset.incomplete]"
             )
     hashes = {file.name: sha256_of(file) for file in files}
-    geometry = _foreign_layers(asset)
-    return {**hashes, "geometry": hash_of_files(geometry)} if geometry else hashes
+    stage = open_weaker(asset, role)
+    geometry = _foreign_layers(stage, asset)
+    if geometry:
+        hashes["geometry"] = hash_of_files(geometry)
+    return stage, hashes
+
+
+def _foreign_layers(stage: Usd.Stage, asset: Asset) -> list[Path]:
+    """The files of the USD geometry that scan.usdc refers to, if that is where its meshes are."""
+    ours = asset.layer("scan").resolve().parent
+    # What lies in a package has the package's path, followed by its own in brackets.
+    files = {
+        Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
+        for layer in stage.GetUsedLayers()
+        if not layer.anonymous
+    }
+    return sorted(file for file in files if file.resolve().parent != ours)
 
 
 def hash_of_maps(asset: Asset, *aovs: str) -> str:
@@ -96,16 +116,3 @@ def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
         for name, digest in zip(names, digests, strict=True)
     ]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def _foreign_layers(asset: Asset) -> list[Path]:
-    """The files of the USD geometry that scan.usdc refers to, if that is where its meshes are."""
-    scan = asset.layer("scan").resolve()
-    stage = open_weaker(asset, "texturing")  # layers are valid only as long as it is held
-    # What lies in a package has the package's path, followed by its own in brackets.
-    files = {
-        Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
-        for layer in stage.GetUsedLayers()
-        if not layer.anonymous
-    }
-    return sorted(file for file in files if file.resolve() != scan)
