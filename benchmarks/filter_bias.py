@@ -32,7 +32,6 @@ from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.transport.lit_scene import lit_scene
 
 REFERENCE = Sampling(standard_error=0.0, max_rays=4096, seed=977)
 
@@ -100,7 +99,7 @@ def errors(
     keep = patch % share == 0
     order, patch = order[keep], patch[keep]
     position, normal = atlas.texels.position[order], atlas.texels.normal[order]
-    lit = lit_scene(atlas, black_environment())
+    lit = atlas.lit_scene(black_environment())
     reference = irradiance_at(
         lit.rays, lit.radiance, lit.lights, lit.environment, position, normal, patch, REFERENCE,
         lit.size,

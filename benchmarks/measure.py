@@ -15,7 +15,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.lit_scene import LitScene, lit_scene
+from usdbrdf.transport.lit_scene import LitScene
 
 T = TypeVar("T")
 
@@ -86,7 +86,7 @@ class Lit(NamedTuple):
 
 def lit_asset(folder: Path) -> Lit:
     atlas = AssetMaps(open_measured(Asset.at(folder)))
-    return Lit(atlas, lit_scene(atlas, black_environment()))
+    return Lit(atlas, atlas.lit_scene(black_environment()))
 
 
 def saved_plot(drawing: Any, path: Path) -> Path:

@@ -25,6 +25,8 @@ from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
+from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.lit_scene import LitScene, lit_scene
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.textured_scene import TexturedScene
 
@@ -102,6 +104,10 @@ class AssetMaps:
         """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and of lamps what shading found (of
         those that clipped in every frame L_d is only a lower bound)."""
         return np.where(self.emissive[:, None], self.emission, self.lit)
+
+    def lit_scene(self, environment: Environment) -> LitScene:
+        """All that light transport needs, with ``light`` as the light."""
+        return lit_scene(self.surface, self.light, self.emissive, environment)
 
     def has(self, aov: str) -> bool:
         """Whether any object has the map."""

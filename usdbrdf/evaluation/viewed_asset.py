@@ -14,7 +14,6 @@ from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.render_view import ViewedAsset
 from usdbrdf.tasks.surroundings import environment_from_file
-from usdbrdf.transport.lit_scene import lit_scene
 
 
 def measured_atlas(folder: Path) -> tuple[Asset, AssetMaps]:
@@ -42,9 +41,7 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Path | None) -> Vi
             "first. [asset.incomplete]"
         )
     up_axis = read_header(asset.layer("scan")).up_axis
-    lit = lit_scene(
-        atlas.surface, atlas.light, atlas.emissive, environment_from_file(environment, up_axis)
-    )
+    lit = atlas.lit_scene(environment_from_file(environment, up_axis))
     diffuse = atlas.map_where_present(map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,

@@ -26,7 +26,7 @@ from usdbrdf.model.scene import SceneObject
 from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
 from usdbrdf.tasks.task import Task, hash_of_files, hash_of_maps, open_task
-from usdbrdf.transport.lit_scene import LitScene, lit_scene
+from usdbrdf.transport.lit_scene import LitScene
 
 
 def fit(asset: Asset, options: FitOptions) -> StageResult:
@@ -52,7 +52,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
     def work(run: StageRun) -> dict[str, Any]:
         maps = AssetMaps(stage)
         environment = environment_from_file(options.environment, task.header.up_axis)
-        lit = lit_scene(maps.surface, maps.light, maps.emissive, environment)
+        lit = maps.lit_scene(environment)
         usable = maps.coverage.measured & ~maps.emissive
         survey = survey_frames(run, lit, maps.texels, usable, frames, options)
         found = fitted_objects(run, lit, maps.texels, frames, survey, options)
