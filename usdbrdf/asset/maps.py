@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Usd
+from pxr import Ar, Usd
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov
+from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import aov_path
 from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.errors import InputRefused
@@ -22,6 +23,7 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
@@ -37,26 +39,47 @@ _AT_A_TIME = min(4, os.cpu_count() or 1)
 
 
 class AssetMaps:
-    """A textured scene, its texels, and what earlier tasks measured of them.
+    """The scene of a composed stage, its photographs, and what tasks measured of its texels.
 
-    stage   the composed stage that all of it was read from
-    scene   its labelled meshes, in metres; texels: where their texels lie
-
-    Every map is decoded at most once; the arrays are shared, so nobody writes to them. What is (T,)
-    or (T, C) is per texel, float32, linear Rec.709.
+    Each is read when it is first asked for, and every map is decoded at most once; the arrays are
+    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear Rec.709.
     """
 
     def __init__(self, stage: Usd.Stage) -> None:
         self.stage = stage
-        self.scene = scene_from_stage(stage)
+        self._read: dict[str, Float] = {}
+
+    def layers_elsewhere(self, folder: Path) -> list[Path]:
+        """Files of layers that are not in the asset's ``folder``: captured USD geometry."""
+        # What lies in a package has the package's path, followed by its own in brackets.
+        files = {
+            Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
+            for layer in self.stage.GetUsedLayers()
+            if not layer.anonymous
+        }
+        ours = (folder / "layers").resolve()
+        return sorted(file for file in files if file.resolve().parent != ours)
+
+    @cached_property
+    def frames(self) -> Frames:
+        """The photographs, poses in metres."""
+        return frames_from_stage(self.stage)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The labelled meshes as one triangle soup, in metres."""
+        return scene_from_stage(self.stage)
+
+    @cached_property
+    def texels(self) -> Texels:
+        """Where the texels lie; InputRefused before the texturing task has run."""
         if self.scene.corner_uv is None:
             raise InputRefused(
                 "the stage has no texture coordinates of ours. Run `usdbrdf texture` first. "
                 "[asset.incomplete]"
             )
         sizes = [image_size(self._file(obj, "coverage"))[:2] for obj in self.scene.objects]
-        self.texels = texels_from_atlas(self.scene, np.array(sizes, np.int32))
-        self._read: dict[str, Float] = {}
+        return texels_from_atlas(self.scene, np.array(sizes, np.int32))
 
     @cached_property
     def surface(self) -> TexturedScene:

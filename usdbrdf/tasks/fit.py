@@ -9,53 +9,49 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.inputs import hashes_of_inputs, open_before
 from usdbrdf.asset.layers.material_layer import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import FittedObject
-from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.material.fit_objects import FitOptions, ObjectFit, fitted_objects, survey_frames
 from usdbrdf.material.refine import LightBefore, Shown, means_without_lobes, refined_light
 from usdbrdf.material.refined_irradiance import Lobes
 from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
-from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
-from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
-from usdbrdf.tasks.task import Task, hash_of_files, hash_of_maps, open_task
+from usdbrdf.tasks.surroundings import environment_from_file
+from usdbrdf.tasks.task import Task
 from usdbrdf.transport.lit_scene import LitScene
+
+# The maps that the fit reads.
+_READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 
 
 def fit(asset: Asset, options: FitOptions) -> StageResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
-    stage, layers = open_task(asset, "material")
-    frames = frames_from_stage(stage)
+    maps = AssetMaps(open_before(asset, "material"))
     lightmap_filter = _filter_of_shading(asset) if options.method == "views" else NONE
     chosen = {k: v for k, v in asdict(options).items() if k not in ("environment", "memory")}
-    read = hash_of_maps(asset, "lit", "coverage", "irradiance", "irradiance_raw", "emission")
     task = Task(
         asset=asset,
         name="fit",
         role="material",
         parameters={**chosen, "denoise": lightmap_filter},
-        inputs={
-            **layers,
-            **environment_hash(options.environment),
-            "maps": read,
-            "frames": hash_of_files(frames.image_paths),
-        },
+        inputs=hashes_of_inputs(
+            asset, "material", maps, aovs=_READ, photographs=True, environment=options.environment
+        ),
     )
 
     def work(run: StageRun) -> dict[str, Any]:
-        maps = AssetMaps(stage)
         environment = environment_from_file(options.environment, task.header.up_axis)
         lit = maps.lit_scene(environment)
         usable = maps.coverage.measured & ~maps.emissive
-        survey = survey_frames(run, lit, maps.texels, usable, frames, options)
-        found = fitted_objects(run, lit, maps.texels, frames, survey, options)
+        survey = survey_frames(run, lit, maps.texels, usable, maps.frames, options)
+        found = fitted_objects(run, lit, maps.texels, maps.frames, survey, options)
         observed = maps.coverage.observed
         objects = [
             _record(obj, found[i], options, bool(observed[maps.texels.of_object(i)].any()))
@@ -64,7 +60,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":
-            objects = _refined(run, asset, maps, lit, frames, objects, lightmap_filter, options)
+            objects = _refined(run, asset, maps, lit, objects, lightmap_filter, options)
         materialx = f"layers/{asset.materialx_layer.name}"
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
@@ -112,7 +108,6 @@ def _refined(
     asset: Asset,
     maps: AssetMaps,
     lit: LitScene,
-    frames: Frames,
     objects: list[FittedObject],
     lightmap_filter: str,
     options: FitOptions,
@@ -124,7 +119,14 @@ def _refined(
     )
     texels = maps.texels
     means = means_without_lobes(
-        run, lit, texels, frames, Shown(maps.lit, maps.samples), lobes, options.memory, options.seed
+        run,
+        lit,
+        texels,
+        maps.frames,
+        Shown(maps.lit, maps.samples),
+        lobes,
+        options.memory,
+        options.seed,
     )
     maps.forget("samples")
     traced = maps.traced_irradiance if lightmap_filter == OIDN else maps.irradiance
@@ -145,7 +147,7 @@ def _refined(
         r, g, b = np.average(refined.base_color[own], axis=0, weights=area)
         colour = (float(r), float(g), float(b))
         with_maps.append(replace(item, aovs=writer.write(i, written), mean_color=colour))
-    view = overview(maps.scene, lit.rays, frames)
+    view = overview(maps.scene, lit.rays, maps.frames)
     view.write(run.output("previews/base_color.png"), texels, refined.base_color, exposure=1)
     return with_maps
 

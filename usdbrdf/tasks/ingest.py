@@ -15,9 +15,10 @@ from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
-from usdbrdf.tasks.task import Task, hash_of_files
+from usdbrdf.tasks.task import Task
 from usdbrdf.untrusted.usd_paths import layers_of_usd
 
 

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from usdbrdf.asset.inputs import hashes_of_inputs, open_before
 from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.shading_layer import write_shading_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import Aov, ShadedObject
-from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
@@ -22,8 +22,8 @@ from usdbrdf.model.arrays import Array, Float
 from usdbrdf.shading.denoise import AUTO, chosen_filter
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, doubts, shade_surface
-from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
-from usdbrdf.tasks.task import Task, hash_of_maps, open_task
+from usdbrdf.tasks.surroundings import environment_from_file
+from usdbrdf.tasks.task import Task
 from usdbrdf.transport.irradiance import Sampling
 
 # More Sobol points than this fill the memory, and improve nothing.
@@ -53,29 +53,27 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
-    stage, layers = open_task(asset, "shading")
+    maps = AssetMaps(open_before(asset, "shading"))
     task = Task(
         asset=asset,
         name="shade",
         role="shading",
         parameters={**asdict(options.sampling), "denoise": lightmap_filter},
-        inputs={
-            **layers,
-            **environment_hash(options.environment),
-            "maps": hash_of_maps(asset, "lit", "coverage"),
-        },
+        inputs=hashes_of_inputs(
+            asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment
+        ),
     )
 
     def work(run: StageRun) -> dict[str, Any]:
-        maps = AssetMaps(stage)
         environment = environment_from_file(options.environment, task.header.up_axis)
         shaded = shade_surface(
             run, maps.surface, maps.lit, maps.coverage, environment, options.sampling,
             lightmap_filter,
         )  # fmt: skip
-        objects = _write_maps(MapWriter(run, asset, maps.scene, maps.texels), shaded)
+        writer = MapWriter(run, asset, maps.scene, maps.texels)
+        objects = _write_maps(writer, shaded)
         _write_layers(run, task, maps, objects, shaded.emission)
-        view = overview(maps.scene, maps.surface.rays, frames_from_stage(stage))
+        view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
         for doubt in doubts(shaded, [item.identifier for item in objects]):

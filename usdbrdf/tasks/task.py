@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-from pxr import Ar, Usd
 
 from usdbrdf.asset.header import Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.asset.readers.compose import open_weaker
-from usdbrdf.errors import InputRefused
-from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.job.stamp import code_version
 from usdbrdf.job.task import StageResult, StageRun, run_stage
 
@@ -55,64 +47,3 @@ class Task:
     def header(self) -> StageHeader:
         """Units, axes and times of the scan, which every layer repeats."""
         return read_header(self.asset.layer("scan"))
-
-
-def open_task(asset: Asset, role: str) -> tuple[Usd.Stage, dict[str, str]]:
-    """The stage that a task of ``role`` builds upon, and the hashes of the layers in it.
-
-    Raises InputRefused where an earlier task has not run.
-    """
-    files = [asset.layer(weaker) for weaker in ROLES[: ROLES.index(role)]]
-    if role in ("shading", "material"):
-        files.append(asset.uv_layer)
-    for file in files:
-        if not file.is_file():
-            raise InputRefused(
-                f"{asset.folder}: {file.name} is missing, so an earlier step has not run here. "
-                "Run `usdbrdf convert`, or the steps ingest, texture, shade, fit in this order. "
-                "[asset.incomplete]"
-            )
-    hashes = {file.name: sha256_of(file) for file in files}
-    stage = open_weaker(asset, role)
-    geometry = _foreign_layers(stage, asset)
-    if geometry:
-        hashes["geometry"] = hash_of_files(geometry)
-    return stage, hashes
-
-
-def _foreign_layers(stage: Usd.Stage, asset: Asset) -> list[Path]:
-    """The files of the USD geometry that scan.usdc refers to, if that is where its meshes are."""
-    ours = asset.layer("scan").resolve().parent
-    # What lies in a package has the package's path, followed by its own in brackets.
-    files = {
-        Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
-        for layer in stage.GetUsedLayers()
-        if not layer.anonymous
-    }
-    return sorted(file for file in files if file.resolve().parent != ours)
-
-
-def hash_of_maps(asset: Asset, *aovs: str) -> str:
-    """One SHA-256 over all objects' maps of these AOVs."""
-    endings = tuple(f".{aov}.exr" for aov in aovs)
-    folder = asset.folder / "textures"
-    return hash_of_files(sorted(f for f in folder.glob("*.exr") if f.name.endswith(endings)))
-
-
-def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
-    """One SHA-256 over names (relative to ``root``, if given) and contents of many files, wherever
-    they lie, in the order in which they come."""
-    names = list(files)
-    for name in names:
-        if not name.is_file():
-            raise InputRefused(
-                f"{name}: this file, which was there at ingest, is missing. Run `usdbrdf convert` "
-                "with the capture again, from where it lies now. [input.missing]"
-            )
-    with environment_failures("reading the inputs"), ThreadPoolExecutor() as pool:
-        digests = list(pool.map(sha256_of, names))
-    lines = [
-        f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
-        for name, digest in zip(names, digests, strict=True)
-    ]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

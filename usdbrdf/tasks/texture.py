@@ -5,19 +5,19 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from usdbrdf.asset.inputs import hashes_of_inputs, open_before
 from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import MapWriter, TexelMap
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import TexturedObject
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.scene import given_corner_uv, scene_from_stage
+from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.errors import UsageError
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import StageResult, StageRun
-from usdbrdf.tasks.task import Task, hash_of_files, open_task
+from usdbrdf.tasks.task import Task
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 from usdbrdf.transport.rays import RayScene
@@ -57,21 +57,20 @@ def check_memory(memory: float | None) -> None:
 
 def texture(asset: Asset, options: TextureOptions) -> StageResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
-    stage, layers = open_task(asset, "texturing")
-    frames = frames_from_stage(stage)
+    maps = AssetMaps(open_before(asset, "texturing"))
     task = Task(
         asset=asset,
         name="texture",
         role="texturing",
         parameters={k: v for k, v in asdict(options).items() if k != "memory"},
-        inputs={**layers, "frames": hash_of_files(frames.image_paths)},
+        inputs=hashes_of_inputs(asset, "texturing", maps, photographs=True),
     )
 
     def work(run: StageRun) -> dict[str, Any]:
-        scene = scene_from_stage(stage)
+        scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
         size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)
-        given = [given_corner_uv(stage, obj.prim_path) for obj in scene.objects]
+        given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
         charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, size))
         scene = replace(scene, corner_uv=charts["corner_uv"])
         surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)
@@ -86,7 +85,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         write_texturing_layer(
             run.output(f"layers/{asset.layer('texturing').name}"),
             run.output(f"layers/{asset.uv_layer.name}"),
-            asset, task.header, task.provenance, objects, stage,
+            asset, task.header, task.provenance, objects, maps.stage,
         )  # fmt: skip
         view = overview(scene, rays, frames)
         view.write(run.output("previews/lit.png"), surface.texels, found.lit)
