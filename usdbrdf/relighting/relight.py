@@ -16,7 +16,7 @@ from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Float
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.picture import (
@@ -87,7 +87,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     inserts = options.inserts
     captured = published(stage, time, lambda sentence: say(f"warning: {sentence}"))
     if options.views is None:
-        views: tuple[View, ...] = (published_camera(stage, options.camera, time),)
+        views: tuple[Camera, ...] = (published_camera(stage, options.camera, time),)
     else:
         views = views_from_document(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
@@ -119,7 +119,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
 def _photograph(
     mitsuba: Any,
     loaded: Any,
-    views: Sequence[View],
+    views: Sequence[Camera],
     targets: Sequence[Path],
     options: RelightOptions,
     *,
@@ -142,7 +142,7 @@ def _photograph(
 
 
 def _rendered(
-    mitsuba: Any, loaded: Any, views: Sequence[View], options: RelightOptions, *, denoise: bool
+    mitsuba: Any, loaded: Any, views: Sequence[Camera], options: RelightOptions, *, denoise: bool
 ) -> Iterator[Float]:
     """(H, W, 3) radiance of one view after the other."""
     for i, view in enumerate(views):
@@ -201,7 +201,7 @@ def _check(options: RelightOptions, output: Path, folder: Path) -> None:
             raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
 
 
-def _targets(output: Path, views: Sequence[View], options: RelightOptions) -> list[Path]:
+def _targets(output: Path, views: Sequence[Camera], options: RelightOptions) -> list[Path]:
     if options.views is None:
         return [output]
     targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]

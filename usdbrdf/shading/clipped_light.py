@@ -27,8 +27,8 @@ from usdbrdf.shading.clipped_emitters import (
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at
-from usdbrdf.transport.patch_draws import independent_patches
 from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.tile_draws import independent_tiles
 
 # Fewer clipped texels than this light nothing.
 _MIN_TEXELS = 16
@@ -263,7 +263,7 @@ def _traced(
         environment,
         surface.texels.position[chosen],
         surface.texels.normal[chosen],
-        independent_patches(len(chosen)),
+        independent_tiles(len(chosen)),
         replace(_SAMPLING, seed=seed),
         surface.diagonal_m,
     ).mean

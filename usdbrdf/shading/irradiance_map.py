@@ -12,8 +12,13 @@ from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.incoming_light import whole_patches
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import (
+    Irradiance,
+    Sampling,
+    irradiance_at,
+    tiles_of_texels,
+    whole_tiles,
+)
 from usdbrdf.transport.textured_scene import TexturedScene
 
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
@@ -34,7 +39,7 @@ def trace_irradiance(
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
-    order, patch = patches_of_texels(texels)
+    order, patch = tiles_of_texels(texels)
     tiles = tiles_of_patches(patch)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
@@ -57,7 +62,7 @@ def trace_irradiance(
 
 def tiles_of_patches(patch: Array) -> list[slice]:
     """Ranges of about _TILE texels that do not cut a patch."""
-    return whole_patches(patch, _TILE)
+    return whole_tiles(patch, _TILE)
 
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
