@@ -15,7 +15,7 @@ from usdbrdf.asset.layers.lights_layer import (
 )
 from usdbrdf.asset.readers.render_scene import published
 from usdbrdf.files.images import write_exr
-from usdbrdf.shading.lamp_shapes import LampShape
+from usdbrdf.model.light import LampShape
 from usdbrdf.validation.validate import validate
 
 RADIANCE = np.array([8.0, 4.0, 2.0])
@@ -149,8 +149,7 @@ def test_both_variants_validate(built):
 
 def test_a_ball_is_hidden_inside_its_light(built):
     lamp = ball_lamp(built)
-    common = (built.asset, built.header, built.provenance("shading"))
-    write_lights_layer(built.asset.lights_layer, *common, [lamp], np.eye(4))
+    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [lamp], np.eye(4))
     stage = opened(built, USDLUX)
     (light,) = (p for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI))
     assert light.GetTypeName() == "SphereLight"
@@ -184,8 +183,7 @@ def test_lights_stand_in_the_world_whatever_the_root_does(built):
     order = Sdf.AttributeSpec(prim, "xformOpOrder", types.TokenArray, Sdf.VariabilityUniform)
     order.default = ["xformOp:transform"]
     edits.Save()
-    common = (built.asset, built.header, built.provenance("shading"))
-    write_lights_layer(built.asset.lights_layer, *common, [ball_lamp(built)], root)
+    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [ball_lamp(built)], root)
     (light,) = published(opened(built, USDLUX), TIME, pytest.fail).lights
     assert light.world_from_here[:3, 3] == pytest.approx([1.0, 2.0, 2.5])
     scale = abs(np.linalg.det(light.world_from_here[:3, :3])) ** (1 / 3)

@@ -116,9 +116,11 @@ def test_materialx_is_told_the_same(built):
     from usdbrdf.asset.layers.material_layer import write_material_layer
 
     built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
-    common = (built.asset, built.header, built.provenance("material"))
     write_material_layer(
-        built.asset.layer("material"), *common, built.fitted, materialx=built.asset.materialx_layer
+        built.asset.layer("material"),
+        built.draft("material"),
+        built.fitted,
+        materialx=built.asset.materialx_layer,
     )
     stage = open_measured(built.asset)
     root = f"/{built.asset.name}/mtl"

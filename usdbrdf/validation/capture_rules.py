@@ -8,7 +8,8 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.layers.capture_camera import lens_from_pinhole
-from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.asset.readers.objects import authored
+from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 
 _TOLERANCE = 1e-3

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf
 
-from usdbrdf.asset.layers.author import apply_schema, attribute, define
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    attribute_per_frame,
+    author_fact,
+    define,
+)
 from usdbrdf.asset.layout import is_storable
+from usdbrdf.asset.properties import Photographs, known_facts
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
@@ -41,7 +47,6 @@ def author_capture_camera(
     reset_transform  the poses are in the world, whatever the camera's ancestors do
     """
     prim = define(layer, path, "Camera")
-    apply_schema(prim, "UsdBrdfCaptureAPI")
     _author_pose(prim, frames.world_from_camera, reset_transform)
     _author_lens(prim, frames, meters_per_unit)
     _author_exposure(prim, frames.exposure_time)
@@ -59,14 +64,14 @@ def relative_path(target: Path, folder: Path) -> str:
     return relative if relative.startswith("../") else f"./{relative}"
 
 
-def asset_path(target: Path, folder: Path) -> Sdf.AssetPath:
-    """The same as a USD value; refuses names that USD cannot hold."""
+def storable_path(target: Path, folder: Path) -> str:
+    """The same; refuses names that USD cannot hold."""
     if not is_storable(target):
         raise InputRefused(
             f"{str(target)!r}: the name holds characters that USD cannot store in a path. "
             "Rename the file. [stage.asset_path]"
         )
-    return Sdf.AssetPath(relative_path(target, folder))
+    return relative_path(target, folder)
 
 
 def lens_from_pinhole(
@@ -91,7 +96,7 @@ def _author_pose(prim: Sdf.PrimSpec, world_from_camera: Double, reset_transform:
     # USD multiplies row vectors from the left: its matrices are ours transposed.
     poses = [Gf.Matrix4d(pose.T.tolist()) for pose in np.asarray(world_from_camera, np.float64)]
     name = "xformOp:transform"
-    attribute(prim, name, Types.Matrix4d, poses[0], samples=_per_frame(poses))
+    attribute_per_frame(prim, name, Types.Matrix4d, poses, always=True)
     order = ["!resetXformStack!", name] if reset_transform else [name]
     attribute(prim, "xformOpOrder", Types.TokenArray, order, uniform=True)
 
@@ -109,7 +114,7 @@ def _author_lens(prim: Sdf.PrimSpec, frames: Frames, meters_per_unit: float) -> 
         "verticalApertureOffset",
     )
     for name, values in zip(names, zip(*lens, strict=True), strict=True):
-        _author_varying(prim, name, Types.Float, values, float)
+        attribute_per_frame(prim, name, Types.Float, values)
     attribute(prim, "projection", Types.Token, "perspective")
     near, far = NEAR_M / meters_per_unit, FAR_M / meters_per_unit
     attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(near, far))
@@ -124,52 +129,31 @@ def _author_exposure(prim: Sdf.PrimSpec, exposure_time: Double) -> None:
     attribute(prim, "exposure", Types.Float, 0.0)
     attribute(prim, "exposure:fStop", Types.Float, 1.0)
     attribute(prim, "exposure:iso", Types.Float, 100.0)
-    _author_varying(prim, "exposure:time", Types.Float, times, float)
-    _author_varying(prim, "exposure:responsivity", Types.Float, times, lambda t: 1.0 / t)
+    attribute_per_frame(prim, "exposure:time", Types.Float, times)
+    attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
 
 
 def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
-    prefix = "usdBrdf:capture"
-    images = [asset_path(path, folder) for path in frames.image_paths]
-    attribute(prim, f"{prefix}:image", Types.Asset, images[0], samples=_per_frame(images))
-    _author_back_plate(prim, images)
-    for name, values in (
-        ("exposureTime", frames.exposure_time),
-        ("saturationRadiance", frames.saturation_radiance),
-        ("noiseFloorRadiance", frames.noise_floor_radiance),
-    ):
-        numbers = [float(value) for value in values]
-        samples = _per_frame(numbers)
-        attribute(prim, f"{prefix}:{name}", Types.Double, numbers[0], samples=samples)
-    pinholes = [tuple(row) for row in frames.intrinsics.tolist()]
-    sizes = [tuple(int(value) for value in row) for row in frames.resolution.tolist()]
-    _author_varying(prim, f"{prefix}:pinhole", Types.Double4, pinholes, lambda v: Gf.Vec4d(*v))
-    _author_varying(prim, f"{prefix}:resolution", Types.Int2, sizes, lambda v: Gf.Vec2i(*v))
-    attribute(prim, f"{prefix}:encoding", Types.Token, frames.encoding, uniform=True)
-    attribute(prim, f"{prefix}:radiometric", Types.Bool, bool(frames.radiometric), uniform=True)
+    photographs = Photographs(
+        image=[storable_path(path, folder) for path in frames.image_paths],
+        exposure_time=frames.exposure_time.tolist(),
+        saturation_radiance=frames.saturation_radiance.tolist(),
+        noise_floor_radiance=frames.noise_floor_radiance.tolist(),
+        intrinsics=frames.intrinsics.tolist(),
+        resolution=frames.resolution.tolist(),
+        encoding=frames.encoding,
+        radiometric=frames.radiometric,
+    )
+    for fact, value in known_facts(photographs):
+        author_fact(prim, fact, value)
+        if fact.name == "image":
+            _author_back_plate(prim, value)
 
 
-def _author_back_plate(prim: Sdf.PrimSpec, images: Sequence[Sdf.AssetPath]) -> None:
+def _author_back_plate(prim: Sdf.PrimSpec, images: Sequence[str]) -> None:
     """The photographs where applications look for plates (new in USD 26.11; older versions pass
     over a schema that they do not know). Muted: no render may change because of them."""
     apply_schema(prim, f"BackPlateAPI:{_PLATE}")
-    prefix = f"backPlate:{_PLATE}"
-    attribute(prim, f"{prefix}:image", Types.Asset, images[0], samples=_per_frame(images))
+    prefix, values = f"backPlate:{_PLATE}", [Sdf.AssetPath(image) for image in images]
+    attribute_per_frame(prim, f"{prefix}:image", Types.Asset, values, always=True)
     attribute(prim, f"{prefix}:plateVisibility", Types.Token, "mute")
-
-
-def _author_varying(
-    prim: Sdf.PrimSpec,
-    name: str,
-    type_name: Sdf.ValueTypeName,
-    values: Sequence[Any],
-    stored: Callable[[Any], Any],
-) -> None:
-    """Samples only where the value changes: a constant is easier to override."""
-    constant = all(value == values[0] for value in values)
-    samples = {} if constant else _per_frame([stored(value) for value in values])
-    attribute(prim, name, type_name, stored(values[0]), samples=samples)
-
-
-def _per_frame(values: Sequence[Any]) -> dict[float, Any]:
-    return {float(i + 1): value for i, value in enumerate(values)}

@@ -6,15 +6,15 @@ and local opinions beat variants: every look would show the same material.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from pxr import Sdf
 
-from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.header import Draft, Scopes
 from usdbrdf.asset.layers.author import apply_schema, define, over, relationship
-from usdbrdf.asset.layers.input_bindings import BINDING, Competing
+from usdbrdf.asset.layers.input_usd import BINDING, recorded_bindings
 from usdbrdf.asset.layers.preview_surface import Colour, unlit_colour, unlit_texture
-from usdbrdf.asset.properties import Aov
+from usdbrdf.asset.properties import Aov, FittedObject, ShadedObject, TexturedObject
 
 VARIANT_SET = "look"
 
@@ -33,19 +33,14 @@ Shown = Aov | Colour | None
 
 
 def author_looks(
-    layer: Sdf.Layer,
-    scopes: Scopes,
-    looks: Mapping[str, Bindings],
-    *,
-    selected: str,
-    competing: Mapping[str, Competing],
+    layer: Sdf.Layer, draft: Draft, looks: Mapping[str, Bindings], *, selected: str
 ) -> None:
     """Add variants to the default prim and select one; weaker layers' variants remain.
 
-    competing  per object, what an input file binds otherwise and must be bound too
+    What an input file binds otherwise than by the mesh is bound in every look too.
     """
-    root = Sdf.Path(scopes.root)
-    over(layer, scopes.root)
+    root, competing = Sdf.Path(draft.scopes.root), recorded_bindings(draft.asset)
+    over(layer, draft.scopes.root)
     for look, bindings in looks.items():
         variant = root.AppendVariantSelection(VARIANT_SET, look)
         over(layer, str(variant))
@@ -80,6 +75,25 @@ def author_look_materials(
             material = _no_data(layer, scopes)
         bindings[prim_path] = material
     return bindings
+
+
+def aov_looks(
+    layer: Sdf.Layer,
+    scopes: Scopes,
+    objects: Sequence[TexturedObject] | Sequence[ShadedObject] | Sequence[FittedObject],
+    *,
+    hidden: frozenset[str] = frozenset(),
+) -> dict[str, dict[str, str]]:
+    """One look per map that any object has, with a binding for every object."""
+    names = {aov.name: None for item in objects for aov in item.aovs if aov.name not in hidden}
+    looks = {}
+    for name in names:
+        maps = [
+            (item.prim_path, item.identifier, {a.name: a for a in item.aovs}.get(name))
+            for item in objects
+        ]
+        looks[name] = author_look_materials(layer, scopes, name, maps)
+    return looks
 
 
 def _no_data(layer: Sdf.Layer, scopes: Scopes) -> str:

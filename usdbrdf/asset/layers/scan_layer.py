@@ -10,18 +10,28 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
-from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over, relationship
+from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    author_record,
+    define,
+    export,
+    over,
+    relationship,
+)
 from usdbrdf.asset.layers.capture_camera import author_capture_camera
-from usdbrdf.asset.layers.input_bindings import competing_bindings, weaken_bindings
-from usdbrdf.asset.layers.input_geometry import (
+from usdbrdf.asset.layers.input_usd import (
     author_overrides,
     author_reference,
+    competing_bindings,
     has_transform,
     input_mesh,
     open_input,
+    weaken_bindings,
 )
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.properties import LabelledObject
 from usdbrdf.asset.schema import verify
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.capture import Scan
@@ -30,20 +40,16 @@ from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
 Types = Sdf.ValueTypeNames
 
 
-def write_scan_layer(
-    path: Path, scan: Scan, asset: Asset, header: StageHeader, provenance: Provenance
-) -> None:
+def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
     verify()
-    folder = asset.layer("scan").parent
+    asset, folder = draft.asset, draft.asset.layer("scan").parent
     stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
-    scopes = Scopes.beside(f"/{header.name}", taken)
+    scopes = Scopes.beside(f"/{draft.header.name}", taken)
     meshes = _input_meshes(source, scan, scopes.root) if source else {}
-    layer = new_layer(
-        header,
-        provenance,
+    layer = draft.new_layer(
         adapter=scan.adapter,
         radiometric=scan.frames.radiometric,
         counts=scan.counts,
@@ -74,12 +80,9 @@ def write_scan_layer(
 
 def author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
     """What makes a mesh one of our objects."""
-    apply_schema(prim, "UsdBrdfObjectAPI")
-    text = readable_label(label.label)
-    class_name = readable_label(label.class_name)
-    attribute(prim, "usdBrdf:label", Types.String, text, uniform=True)
-    attribute(prim, "usdBrdf:class", Types.String, class_name, uniform=True)
-    attribute(prim, "usdBrdf:identifier", Types.Token, label.identifier, uniform=True)
+    text, class_name = readable_label(label.label), readable_label(label.class_name)
+    record = LabelledObject(label=text, class_name=class_name, identifier=label.identifier)
+    author_record(prim, record)
     prim.SetInfo("displayName", text)
     if class_name:
         apply_schema(prim, "SemanticsLabelsAPI:class")
