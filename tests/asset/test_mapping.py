@@ -10,7 +10,7 @@ from pxr import Sdf
 from usdbrdf.asset.layers.preview_surface import fit_from_preview_surface, preview_surface_from_fit
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import read_fit
-from usdbrdf.asset.readers.render_scene import published_file
+from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.transport.renderer_match import shown_lobe
 
 CHAIR, LAMP = 0, 2
@@ -30,7 +30,7 @@ def surfaces(built, overriding=None):
         prim = Sdf.CreatePrimInLayer(layer, f"{material}/PreviewSurface")
         Sdf.AttributeSpec(prim, f"inputs:{name}", Sdf.ValueTypeNames.Float).default = value
     layer.Save()
-    found = published_file(Path(layer.realPath), lambda text: None).surfaces
+    found = render_scene_from_file(Path(layer.realPath), lambda text: None).surfaces
     return {surface.name.split("/")[-1]: surface.material for surface in found}
 
 

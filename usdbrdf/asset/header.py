@@ -14,6 +14,7 @@ from pxr import Sdf, Tf, UsdGeom, Vt
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import SCHEMA_VERSION
+from usdbrdf.asset.schema import verify
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Scan
 
@@ -203,5 +204,9 @@ class Draft:
         return Scopes.of(self.asset)
 
     def new_layer(self, **facts: Any) -> Sdf.Layer:
-        """An anonymous layer with header and provenance; ``facts`` join the latter."""
-        return new_layer(self.header, self.provenance, **facts)
+        """An anonymous layer with header, provenance and the default prim as an ``over``;
+        ``facts`` join the provenance. Raises where USD does not know our schemas."""
+        verify()
+        layer = new_layer(self.header, self.provenance, **facts)
+        Sdf.CreatePrimInLayer(layer, f"/{self.header.name}")
+        return layer

@@ -213,7 +213,7 @@ class Aov:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Measured:
+class MeasuredObject:
     """What every task hands over of an object: the mesh, its identifier, maps by their names."""
 
     prim_path: str
@@ -222,7 +222,7 @@ class _Measured:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TexturedObject(_Measured):
+class TexturedObject(MeasuredObject):
     """Result of the task texture for one object.
 
     corner_uv  (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
@@ -247,7 +247,7 @@ class TexturedObject(_Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShadedObject(_Measured):
+class ShadedObject(MeasuredObject):
     """Result of the task shade for one object: how it reflects or, of an emitter, how it shines.
 
     aovs  "albedo" of a reflector, "emission" of an emitter, and others
@@ -294,7 +294,7 @@ class ShadedObject(_Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FittedObject(_Measured):
+class FittedObject(MeasuredObject):
     """Result of the task fit for one object; NaN where a number is not known.
 
     aovs        "diffuse", "refined_irradiance" and "base_color", if the fit refined them

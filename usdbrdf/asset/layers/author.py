@@ -150,25 +150,24 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
     When the disk is full USD leaves a truncated file in place of the old one: hence a name beside.
     """
     with temporary_beside(path) as written:
+        failure = EnvironmentFailure(
+            f"{path}: the USD layer could not be written completely. Free disk space or correct "
+            "the permission, then run the same command again. [environment.io]"
+        )
         try:
             done = layer.Export(str(written))
+            stored = Sdf.Layer.OpenAsAnonymous(str(written)) if done else None
         except Tf.ErrorException as error:
-            raise EnvironmentFailure(_not_written(path)) from error
-        if not done:
-            raise EnvironmentFailure(_not_written(path))
-        _check(written, layer, path, folder)
+            raise failure from error
+        if not stored or stored.defaultPrim != layer.defaultPrim:
+            raise failure
+        _check_composition(stored, path, folder)
         os.replace(written, path)
 
 
-def _check(written: Path, layer: Sdf.Layer, path: Path, folder: Path) -> None:
-    try:
-        stored = Sdf.Layer.OpenAsAnonymous(str(written))
-    except Tf.ErrorException as error:
-        raise EnvironmentFailure(_not_written(path)) from error
-    if not stored or stored.defaultPrim != layer.defaultPrim:
-        raise EnvironmentFailure(_not_written(path))
+def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
     UsdUtils.ModifyAssetPaths(stored, lambda asset: _absolute(asset, folder))
-    # Sublayers that are not there yet are published later, or by another stage.
+    # Sublayers that are not there yet are published later, or by another task.
     stored.subLayerPaths = [sub for sub in stored.subLayerPaths if Path(sub).is_file()]
     stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
     problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
@@ -181,10 +180,3 @@ def _check(written: Path, layer: Sdf.Layer, path: Path, folder: Path) -> None:
 
 def _absolute(asset: str, folder: Path) -> str:
     return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
-
-
-def _not_written(path: Path) -> str:
-    return (
-        f"{path}: the USD layer could not be written completely. Free disk space or correct the "
-        "permission, then run the same command again. [environment.io]"
-    )

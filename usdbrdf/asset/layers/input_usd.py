@@ -22,8 +22,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import attribute, over, relationship
-from usdbrdf.asset.layers.capture_camera import relative_path
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import Asset, relative_path
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused

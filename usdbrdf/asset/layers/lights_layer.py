@@ -59,7 +59,6 @@ def write_lights_layer(
     world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
     """
     scopes, layer = draft.scopes, draft.new_layer()
-    root = over(layer, scopes.root)
     shaped = [lamp for lamp in lamps if lamp.shapes]
     if shaped:
         emissive, usdlux = (
@@ -67,7 +66,7 @@ def write_lights_layer(
             for name in (EMISSIVE, USDLUX)
         )
         over(layer, str(emissive))
-        root.variantSelections[VARIANT_SET] = EMISSIVE
+        layer.GetPrimAtPath(scopes.root).variantSelections[VARIANT_SET] = EMISSIVE
         define(layer, _within(usdlux, scopes.path("lights")), "Scope")
         for lamp in shaped:
             _author_lamp(layer, usdlux, draft, lamp, world_from_root)

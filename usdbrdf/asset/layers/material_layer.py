@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from pxr import Sdf
 
@@ -38,28 +37,17 @@ from usdbrdf.asset.layers.preview_surface import (
 from usdbrdf.asset.layers.shading_layer import ALBEDO_TEXTURE
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.properties import FittedObject
-from usdbrdf.asset.schema import verify
 
 Types = Sdf.ValueTypeNames
 
 BASE_COLOR = "base_color"
 
 
-class Coloured(NamedTuple):
-    """What an object's UsdPreviewSurface is told, and the texture of its diffuse colour as the
-    layers spell its path; "" is black."""
-
-    lobe: PreviewLobe
-    texture: str
-
-
 def write_material_layer(
     path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
 ) -> None:
     """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
-    verify()
     asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
-    over(layer, scopes.root)
     shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
     networks = {}
     for item in objects:
@@ -71,18 +59,21 @@ def write_material_layer(
             _author_lobe(layer, material, shown)
         texture = _author_colour(layer, material, item, shown.diffuse, shading)
         if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
-            networks[material] = Coloured(shown, texture)
+            networks[material] = (shown, texture)
     looks = {
         **aov_looks(layer, scopes, objects),
-        "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
-        "specular": author_look_materials(layer, scopes, "specular", _greys(objects, "psi")),
+        "roughness": author_look_materials(
+            layer, scopes, "roughness", objects, lambda item: _grey(item, item.phi)
+        ),
+        "specular": author_look_materials(
+            layer, scopes, "specular", objects, lambda item: _grey(item, item.psi)
+        ),
     }
     author_looks(layer, draft, looks, selected=SHADED)
-    folder = asset.layer("material").parent
     if materialx:
         layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
         _write_materialx(materialx, draft, networks)
-    export(layer, path, folder=folder)
+    export(layer, path, folder=asset.layer("material").parent)
 
 
 def _author_lobe(layer: Sdf.Layer, material: str, shown: PreviewLobe) -> None:
@@ -112,44 +103,41 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _greys(objects: Sequence[FittedObject], parameter: str) -> list[tuple[str, str, Shown]]:
-    """Each object's parameter as a grey; None where it is not known."""
-    return [
-        (item.prim_path, item.identifier, grey if item.is_known else None)
-        for item in objects
-        for grey in [(getattr(item, parameter),) * 3]
-    ]
+def _grey(item: FittedObject, parameter: float) -> Shown:
+    return (parameter,) * 3 if item.is_known else None
 
 
-def _write_materialx(path: Path, draft: Draft, materials: Mapping[str, Coloured]) -> None:
-    """Write materialx.usda to ``path``; materials by prim path."""
+def _write_materialx(
+    path: Path, draft: Draft, materials: Mapping[str, tuple[PreviewLobe, str]]
+) -> None:
+    """Write materialx.usda to ``path``. materials, by prim path: what UsdPreviewSurface is told,
+    and the texture of its diffuse colour as layers spell its path; "" is black."""
     layer = draft.new_layer()
-    over(layer, draft.scopes.root)
-    for material, shown in materials.items():
-        _author_network(layer, material, shown)
+    for material, (shown, texture) in materials.items():
+        _author_network(layer, material, shown, texture)
     export(layer, path, folder=draft.asset.materialx_layer.parent)
 
 
-def _author_network(layer: Sdf.Layer, material: str, shown: Coloured) -> None:
+def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
     surface = f"{material}/OpenPBR"
     connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
     prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)
     author_inputs(
         prim, Types.Float,
         base_weight=1.0, base_diffuse_roughness=0.0, base_metalness=0.0, specular_weight=1.0,
-        specular_roughness=shown.lobe.roughness, specular_ior=shown.lobe.ior,
+        specular_roughness=shown.roughness, specular_ior=shown.ior,
     )  # fmt: skip
-    if not shown.texture:
+    if not file:
         author_inputs(prim, Types.Color3f, base_color=(0.0, 0.0, 0.0))
         return
     st, image, scaled = (f"{material}/Mtlx{name}" for name in ("St", "BaseColor", "Scaled"))
     prim_st = node(layer, st, "ND_geompropvalue_vector2", "out", Types.Float2)
     author_inputs(prim_st, Types.String, geomprop="st")
     texture = node(layer, image, "ND_image_color3", "out", Types.Color3f)
-    author_inputs(texture, Types.Asset, file=Sdf.AssetPath(shown.texture))
+    author_inputs(texture, Types.Asset, file=Sdf.AssetPath(file))
     author_inputs(texture, Types.String, uaddressmode="clamp", vaddressmode="clamp")
     connect(texture, "inputs:texcoord", Types.Float2, f"{st}.outputs:out")
     product = node(layer, scaled, "ND_multiply_color3FA", "out", Types.Color3f)
-    author_inputs(product, Types.Float, in2=shown.lobe.diffuse)
+    author_inputs(product, Types.Float, in2=shown.diffuse)
     connect(product, "inputs:in1", Types.Color3f, f"{image}.outputs:out")
     connect(prim, "inputs:base_color", Types.Color3f, f"{scaled}.outputs:out")

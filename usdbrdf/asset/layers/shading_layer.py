@@ -23,7 +23,6 @@ from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
 from usdbrdf.asset.layers.looks import SHADED, aov_looks, author_looks
 from usdbrdf.asset.layers.preview_surface import colour_from_texture, surface
 from usdbrdf.asset.properties import ShadedObject
-from usdbrdf.asset.schema import verify
 from usdbrdf.errors import UsdBrdfError
 
 Types = Sdf.ValueTypeNames
@@ -47,10 +46,8 @@ _RENDER_VARS = (
 
 def write_shading_layer(path: Path, draft: Draft, objects: Sequence[ShadedObject]) -> None:
     """Write shading.usda to ``path``; its sublayer is ``write_lights_layer``'s."""
-    verify()
     asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
     layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
-    over(layer, scopes.root)
     define(layer, scopes.path("materials"), "Scope")
     for item in objects:
         author_record(over(layer, item.prim_path), item)

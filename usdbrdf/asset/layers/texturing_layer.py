@@ -14,7 +14,6 @@ from usdbrdf.asset.layers.looks import LIT, aov_looks, author_looks
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.compose import open_weaker
-from usdbrdf.asset.schema import verify
 from usdbrdf.model.arrays import Float
 
 Types = Sdf.ValueTypeNames
@@ -29,15 +28,12 @@ def write_texturing_layer(
     path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject]
 ) -> None:
     """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``."""
-    verify()
     asset, scopes = draft.asset, draft.scopes
     folder = asset.layer("texturing").parent
     scanned = open_weaker(asset, "texturing")
     coordinates, layer = draft.new_layer(), draft.new_layer()
     layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
     with Sdf.ChangeBlock():
-        over(coordinates, scopes.root)
-        over(layer, scopes.root)
         for item in objects:
             declared = scanned.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
             author_texture_coordinates(
