@@ -59,11 +59,9 @@ def author_texture_coordinates(
     # Two floats as one integer: equal bits, much faster than rows.
     _, first, index = np.unique(corners.view(np.uint64), return_index=True, return_inverse=True)
     kind = declared if type(declared.defaultValue) in _PAIRS else Types.TexCoord2fArray
-    array = type(kind.defaultValue)
-    values = array.FromNumpy(corners[first].astype(_PAIRS[array]))
-    indices = Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32))
+    values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
     attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
-    attribute(prim, "primvars:st:indices", Types.IntArray, indices)
+    attribute(prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32))
 
 
 def _author_thumbnail(root: Sdf.PrimSpec) -> None:
