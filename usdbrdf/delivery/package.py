@@ -13,7 +13,7 @@ from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.surfaces import paths_of, published_surfaces
+from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.flat_stage import (
     fit_for_arkit,
     flattened,
@@ -108,7 +108,7 @@ def _write_glb(
     subject = asset.root_layer
     if lights := lights_of(flat):
         _warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
-    surfaces = [s.moved(turn) for s in published_surfaces(flat, time, _warn, subject)]
+    surfaces = [s.moved(turn) for s in surfaces_from_stage(flat, time, _warn, subject)]
     return write_glb(output, surfaces, textures.max_size, _warn)
 
 

@@ -10,7 +10,12 @@ from typing import Any
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.render_scene import eye_height, published, published_camera, time_code
+from usdbrdf.asset.readers.render_scene import (
+    eye_height,
+    render_scene_from_stage,
+    time_code,
+    view_from_stage,
+)
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.images import read_radiance, write_exr
@@ -85,9 +90,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     stage = open_edited(asset)
     time = time_code(stage, options.frame)
     inserts = options.inserts
-    captured = published(stage, time, lambda sentence: say(f"warning: {sentence}"))
+    captured = render_scene_from_stage(stage, time, lambda sentence: say(f"warning: {sentence}"))
     if options.views is None:
-        views: tuple[Camera, ...] = (published_camera(stage, options.camera, time),)
+        views: tuple[Camera, ...] = (view_from_stage(stage, options.camera, time),)
     else:
         views = views_from_document(options.views, asset, captured.metres_per_unit)
     if options.width is not None:

@@ -64,9 +64,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         materialx = f"layers/{asset.materialx_layer.name}"
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
-            asset,
-            task.header,
-            task.provenance,
+            task.draft,
             objects,
             materialx=run.output(materialx) if options.materialx else None,
         )

@@ -126,8 +126,8 @@ def _record(writer: MapWriter, shaded: Shaded, i: int, aovs: tuple[Aov, ...]) ->
 def _write_layers(
     run: StageRun, task: Task, maps: AssetMaps, objects: list[ShadedObject], emission: Float
 ) -> None:
-    asset, about = task.asset, (task.asset, task.header, task.provenance)
-    write_shading_layer(run.output(f"layers/{asset.layer('shading').name}"), *about, objects)
+    asset = task.asset
+    write_shading_layer(run.output(f"layers/{asset.layer('shading').name}"), task.draft, objects)
     lamps = [
         Lamp(
             prim_path=item.prim_path,
@@ -138,7 +138,7 @@ def _write_layers(
         if item.emitter
     ]
     lights = run.output(f"layers/{asset.lights_layer.name}")
-    write_lights_layer(lights, *about, lamps, world_from_root(maps.stage))
+    write_lights_layer(lights, task.draft, lamps, world_from_root(maps.stage))
 
 
 def _summary(shaded: Shaded, objects: list[ShadedObject]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from usdbrdf.asset.header import Provenance, StageHeader, read_header
+from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.stamp import code_version
 from usdbrdf.job.task import StageResult, StageRun, run_stage
@@ -47,3 +47,8 @@ class Task:
     def header(self) -> StageHeader:
         """Units, axes and times of the scan, which every layer repeats."""
         return read_header(self.asset.layer("scan"))
+
+    @property
+    def draft(self) -> Draft:
+        """What the task's layers begin with."""
+        return Draft(asset=self.asset, header=self.header, provenance=self.provenance)

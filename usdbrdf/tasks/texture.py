@@ -85,8 +85,10 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         write_texturing_layer(
             run.output(f"layers/{asset.layer('texturing').name}"),
             run.output(f"layers/{asset.uv_layer.name}"),
-            asset, task.header, task.provenance, objects, maps.stage,
-        )  # fmt: skip
+            task.draft,
+            objects,
+            maps.stage,
+        )
         view = overview(scene, rays, frames)
         view.write(run.output("previews/lit.png"), surface.texels, found.lit)
         return {
