@@ -10,6 +10,7 @@ import numpy.typing as npt
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Bool, Float, Int, Long
+from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,
     EstimatedRadiance,
@@ -20,7 +21,7 @@ from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.patch_draws import independent_patches
 from usdbrdf.transport.rays import RayScene

@@ -18,9 +18,10 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
 from usdbrdf.model.capture import Frames
+from usdbrdf.options import FitOptions
 from usdbrdf.shading.denoise import NONE
 from usdbrdf.tasks.atlas import Atlas, MapWriter, atlas_from_stage
-from usdbrdf.tasks.fit_objects import FitOptions, fitted_objects, survey_frames
+from usdbrdf.tasks.fit_objects import fitted_objects, survey_frames
 from usdbrdf.tasks.lit import lit_scene
 from usdbrdf.tasks.preview import overview
 from usdbrdf.tasks.refine import refined_maps

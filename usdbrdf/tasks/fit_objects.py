@@ -6,14 +6,12 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from usdbrdf.errors import UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import StageRun
@@ -24,8 +22,9 @@ from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, co
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import FitOptions
 from usdbrdf.tasks.atlas import Atlas
-from usdbrdf.tasks.texture import MEASURED, check_memory
+from usdbrdf.tasks.texture import MEASURED
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_samples import Mixture
 
@@ -35,33 +34,6 @@ _AT_A_TIME = 2
 
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
-
-Method = Literal["views", "scaled", "paper"]
-
-Mapping = Literal["measured", "matched"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitOptions:
-    """method "views": many views of the same texels, L_d free per texel, and L_d refined with what
-    was found; "scaled": the target frame alone, L_d times a free factor per channel; "paper": the
-    target frame, the paper's residual, its minimum always kept. max_pixels: of the target frame.
-    Without evidence the first two write the class prior. mapping: what UsdPreviewSurface is told of
-    phi and psi; materialx: whether MaterialX is told too; memory in GiB (None: three quarters of
-    the machine's), on which no result depends."""
-
-    method: Method = "views"
-    max_pixels: int = 1500
-    mapping: Mapping = "matched"
-    materialx: bool = False
-    environment: Path | None = None
-    memory: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.max_pixels < 50:
-            raise UsageError("--max-pixels: at least 50 are needed. [usage.option]")
-        check_memory(self.memory)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +15,11 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov, ShadedObject
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.model.arrays import Bool, Float
-from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter
+from usdbrdf.options import BEFORE_FILTER, ShadeOptions
+from usdbrdf.shading.denoise import OIDN, chosen_filter
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.lamp_shapes import LampShape, lamp_shapes
 from usdbrdf.tasks.albedo_map import albedo_map
@@ -31,34 +30,8 @@ from usdbrdf.tasks.step import Step, hash_of_maps, weaker_layers
 from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
 from usdbrdf.tasks.texture import CLIPPED, MEASURED
 from usdbrdf.tasks.trace import denoised_irradiance, trace_irradiance
-from usdbrdf.transport.irradiance import Irradiance, Sampling
+from usdbrdf.transport.irradiance import Irradiance
 from usdbrdf.transport.rays import RayScene
-
-# What the lightmap filter is given may have this many times the standard error that was asked for:
-# of 3.3 % it left 0.5 % on captures of rooms.
-_BEFORE_FILTER = 1.1
-
-# More Sobol points than this fill the memory, and improve nothing.
-_MAX_RAYS = 1 << 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShadeOptions:
-    """sampling; denoise "none", "oidn" (lightmap filter, extra ``denoise``) or "auto": oidn where
-    it is installed; environment, a latitude-longitude HDR picture for rays that leave the scene,
-    None for black."""
-
-    sampling: Sampling = field(default_factory=Sampling)
-    denoise: Literal["auto", "none", "oidn"] = AUTO
-    environment: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not self.sampling.standard_error >= 0:
-            raise UsageError("--standard-error: must not be negative. [usage.option]")
-        if not 4 <= self.sampling.max_rays <= _MAX_RAYS:
-            raise UsageError(
-                f"--rays {self.sampling.max_rays}: not between 4 and {_MAX_RAYS}. [usage.option]"
-            )
 
 
 def shade(asset: Asset, options: ShadeOptions) -> StageResult:
@@ -86,7 +59,7 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
         )
         filtered, sampling = lightmap_filter == OIDN, options.sampling
         if filtered:
-            sampling = replace(sampling, standard_error=_BEFORE_FILTER * sampling.standard_error)
+            sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
         traced = trace_irradiance(run, atlas, rays, light.lit, environment, sampling)
         irradiance = denoised_irradiance(atlas.texels, traced.mean) if filtered else traced.mean
         shaded = _shaded(atlas, light, seen, clipped, traced, irradiance)

@@ -15,7 +15,7 @@ from usdbrdf.asset.properties import Aov, TexturedObject
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.scene import given_corner_uv, scene_from_stage
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import atlas_side, unwrap
 from usdbrdf.job.progress import progress, say
@@ -24,6 +24,7 @@ from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.atlas import MapWriter, TexelMap
 from usdbrdf.tasks.in_passes import in_passes
 from usdbrdf.tasks.preview import overview
@@ -39,37 +40,6 @@ MEASURED, CLIPPED, FILLED = 1.0, 0.5, 0.0
 
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
-
-
-@dataclass(frozen=True, kw_only=True)
-class TextureOptions:
-    """texel_size in metres (None: the frames' own median pixel footprint); quantile of the
-    observations that becomes L_d; max_texels: a chosen texel size is coarsened to stay below;
-    memory in GiB (None: three quarters of the machine's), on which no result depends."""
-
-    texel_size: float | None = None
-    quantile: float = 0.5
-    max_texels: int = 1_000_000
-    memory: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.texel_size is not None and not self.texel_size > 0:
-            raise UsageError(
-                f"--texel-size {self.texel_size}: not a positive length. [usage.option]"
-            )
-        if self.max_texels < 1:
-            raise UsageError(
-                f"--max-texels {self.max_texels}: at least 1 is needed. [usage.option]"
-            )
-        check_memory(self.memory)
-        if not 0 < self.quantile < 1:
-            raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
-
-
-def check_memory(memory: float | None) -> None:
-    """Raises UsageError where ``memory``, in GiB, is given and none."""
-    if memory is not None and not memory > 0:
-        raise UsageError(f"--memory {memory}: not above 0. [usage.option]")
 
 
 def texture(asset: Asset, options: TextureOptions) -> StageResult:

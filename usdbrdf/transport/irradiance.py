@@ -21,12 +21,13 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.incoming_light import (
     BLOCKS,
@@ -51,22 +52,6 @@ _FIRST_ROUND = 64
 
 # Points that a thread takes at a time: near points' nearly parallel rays follow each other.
 _POINTS = 1 << 12
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How S is estimated.
-
-    estimator       "mis" or "cosine"
-    standard_error  "mis" doubles a patch's rays until its relative standard error is below this
-    max_rays        per texel; "cosine" traces exactly this many
-    seed            of the random bits
-    """
-
-    estimator: Literal["mis", "cosine"] = "mis"
-    standard_error: float = 0.03
-    max_rays: int = 2048
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
