@@ -137,7 +137,7 @@ def _memory() -> float | None:
         "memory for texturing and for refining, which then take as many passes over the frames as "
         "that asks for"
     )
-    more = {"unset": "three quarters of the machine's", "shared": "memory", "help": text}
+    more = {"unset": "three quarters of the machine's", "shared": "options", "help": text}
     return option("--memory GIB", None, (1e-3, 2**20), **more)
 
 
