@@ -38,9 +38,10 @@ from usdbrdf.evaluation.truth import (
     true_albedo,
 )
 from usdbrdf.files.frames import read_frame
+from usdbrdf.options import Sampling
 from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture

@@ -30,8 +30,9 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 
 REFERENCE = Sampling(standard_error=0.0, max_rays=4096, seed=977)
 

@@ -10,9 +10,10 @@ import pytest
 from tests.physics.surfaces import World, quad, room, world_of
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.textured_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 

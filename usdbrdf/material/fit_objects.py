@@ -7,13 +7,11 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from usdbrdf.errors import UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import StageRun
@@ -24,6 +22,7 @@ from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, co
 from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import FitOptions
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_radiance import Mixture
 
@@ -33,34 +32,6 @@ _AT_A_TIME = 2
 
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
-
-Method = Literal["views", "scaled", "paper"]
-
-MaterialMapping = Literal["measured", "matched"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitOptions:
-    """method "views": many views of the same texels, L_d free per texel, and L_d refined with what
-    was found; "scaled": the target frame alone, L_d times a free factor per channel; "paper": the
-    target frame, the paper's residual, its minimum always kept. max_pixels: of the target frame.
-    Without evidence the first two write the class prior. mapping: what UsdPreviewSurface is told of
-    phi and psi; materialx: whether MaterialX is told too; memory in GiB (None: three quarters of
-    the machine's), on which no result depends."""
-
-    method: Method = "views"
-    max_pixels: int = 1500
-    mapping: MaterialMapping = "matched"
-    materialx: bool = False
-    environment: Path | None = None
-    memory: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.max_pixels < 50:
-            raise UsageError("--max-pixels: at least 50 are needed. [usage.option]")
-        if self.memory is not None and not self.memory > 0:
-            raise UsageError(f"--memory {self.memory}: not above 0. [usage.option]")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,10 +19,11 @@ from usdbrdf.job.progress import progress
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
 from usdbrdf.shading.denoise import OIDN
 from usdbrdf.shading.irradiance_map import denoised_irradiance, tiles_of_patches
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import specular_irradiance

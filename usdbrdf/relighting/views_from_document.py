@@ -8,10 +8,10 @@ from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.checks import rigid_records
 from usdbrdf.capture.findings import Findings
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.camera import Camera
+from usdbrdf.options import IngestOptions
 
 
 def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:

@@ -18,6 +18,7 @@ from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,
     EstimatedRadiance,
@@ -26,7 +27,7 @@ from usdbrdf.shading.clipped_emitters import (
 )
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at
+from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.textured_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 

@@ -10,15 +10,10 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
 from usdbrdf.shading.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.irradiance import (
-    Irradiance,
-    Sampling,
-    irradiance_at,
-    tiles_of_texels,
-    whole_tiles,
-)
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
 from usdbrdf.transport.textured_scene import TexturedScene
 
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what

@@ -11,18 +11,16 @@ import numpy as np
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.albedo import albedo_map
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.denoise import OIDN
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.irradiance_map import denoised_irradiance, trace_irradiance
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling
+from usdbrdf.transport.irradiance import Irradiance
 from usdbrdf.transport.textured_scene import TexturedScene
 
-# What the lightmap filter is given may have this many times the standard error that was asked for:
-# of 3.3 % it left 0.5 % on captures of rooms.
-_BEFORE_FILTER = 1.1
 # Shares that are worth a warning: of the known texels with an albedo over 1, of light's directions
 # that leave the scan.
 _MANY_OVER_ONE, _MOSTLY_OPEN = 0.05, 0.5
@@ -82,7 +80,7 @@ def shade_surface(
     """
     light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed)
     if lightmap_filter == OIDN:
-        before = replace(sampling, standard_error=_BEFORE_FILTER * sampling.standard_error)
+        before = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
         traced = trace_irradiance(run, surface, light.lit, environment, before)
         irradiance = denoised_irradiance(surface.texels, traced.mean)
     else:

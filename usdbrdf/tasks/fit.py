@@ -17,11 +17,12 @@ from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
-from usdbrdf.material.fit_objects import FitOptions, ObjectFit, fitted_objects, survey_frames
+from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, survey_frames
 from usdbrdf.material.refine import LightBefore, Shown, means_without_lobes, refined_light
 from usdbrdf.material.refined_irradiance import Lobes
 from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
 from usdbrdf.model.scene import SceneObject
+from usdbrdf.options import FitOptions
 from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task

@@ -11,12 +11,12 @@ from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pendi
 from usdbrdf.asset.layers.scan_layer import write_scan_layer
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.untrusted.usd_paths import layers_of_usd
 

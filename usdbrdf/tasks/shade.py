@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -15,38 +14,15 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import Aov, ShadedObject
-from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.model.arrays import Array, Float
-from usdbrdf.shading.denoise import AUTO, chosen_filter
+from usdbrdf.options import ShadeOptions
+from usdbrdf.shading.denoise import chosen_filter
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, doubts, shade_surface
 from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task
-from usdbrdf.transport.irradiance import Sampling
-
-# More Sobol points than this fill the memory, and improve nothing.
-_MAX_RAYS = 1 << 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShadeOptions:
-    """sampling; denoise "none", "oidn" (lightmap filter, extra ``denoise``) or "auto": oidn where
-    it is installed; environment, a latitude-longitude HDR picture for rays that leave the scene,
-    None for black."""
-
-    sampling: Sampling = field(default_factory=Sampling)
-    denoise: Literal["auto", "none", "oidn"] = AUTO
-    environment: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not self.sampling.standard_error >= 0:
-            raise UsageError("--standard-error: must not be negative. [usage.option]")
-        if not 4 <= self.sampling.max_rays <= _MAX_RAYS:
-            raise UsageError(
-                f"--rays {self.sampling.max_rays}: not between 4 and {_MAX_RAYS}. [usage.option]"
-            )
 
 
 def shade(asset: Asset, options: ShadeOptions) -> StageResult:

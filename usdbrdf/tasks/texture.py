@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from usdbrdf.asset.inputs import hashes_of_inputs, open_before
@@ -12,47 +12,16 @@ from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.scene import given_corner_uv
-from usdbrdf.errors import UsageError
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
 from usdbrdf.texturing.texel_size import texel_size_from_frames
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.textured_scene import TexturedScene
-
-
-@dataclass(frozen=True, kw_only=True)
-class TextureOptions:
-    """texel_size in metres (None: the frames' own median pixel footprint); quantile of the
-    observations that becomes L_d; max_texels: a chosen texel size is coarsened to stay below;
-    memory in GiB (None: three quarters of the machine's), on which no result depends."""
-
-    texel_size: float | None = None
-    quantile: float = 0.5
-    max_texels: int = 1_000_000
-    memory: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.texel_size is not None and not self.texel_size > 0:
-            raise UsageError(
-                f"--texel-size {self.texel_size}: not a positive length. [usage.option]"
-            )
-        if self.max_texels < 1:
-            raise UsageError(
-                f"--max-texels {self.max_texels}: at least 1 is needed. [usage.option]"
-            )
-        check_memory(self.memory)
-        if not 0 < self.quantile < 1:
-            raise UsageError(f"--quantile {self.quantile}: not between 0 and 1. [usage.option]")
-
-
-def check_memory(memory: float | None) -> None:
-    """Raises UsageError where ``memory``, in GiB, is given and none."""
-    if memory is not None and not memory > 0:
-        raise UsageError(f"--memory {memory}: not above 0. [usage.option]")
 
 
 def texture(asset: Asset, options: TextureOptions) -> StageResult:
