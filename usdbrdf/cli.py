@@ -30,7 +30,7 @@ from usdbrdf.evaluation.evaluate_views import DOCUMENT as EVALUATION
 from usdbrdf.evaluation.report import summary_line, truth_line
 from usdbrdf.fit_options import fit_options
 from usdbrdf.job.progress import printable, say, set_quiet
-from usdbrdf.job.task import StageResult
+from usdbrdf.job.task import TaskResult
 from usdbrdf.relighting.command_options import relight_options
 from usdbrdf.validation.cure_layer import write_cures
 from usdbrdf.validation.validate import has_errors, listed_rules, validate
@@ -91,7 +91,7 @@ def _terminate(_signal: int, _frame: object) -> NoReturn:
 def _run_steps(chosen: Arguments) -> int:
     # All options are checked before anything is touched.
     steps = {name: _step(name, chosen) for name in chosen.steps}
-    results: dict[str, StageResult] = {}
+    results: dict[str, TaskResult] = {}
     with working_on(chosen.output, hand_edits=chosen.hand_edits, wait_s=chosen.wait) as asset:
         for name, step in steps.items():
             results[name] = step(asset)
@@ -111,7 +111,7 @@ def _run_steps(chosen: Arguments) -> int:
     return 0
 
 
-def _step(name: str, chosen: Arguments) -> Callable[[Asset], StageResult]:
+def _step(name: str, chosen: Arguments) -> Callable[[Asset], TaskResult]:
     if name == "ingest":
         return partial(
             ingest,

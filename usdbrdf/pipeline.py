@@ -22,15 +22,9 @@ from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import OwnershipConflict
-from usdbrdf.job.lock import folder_lock
-from usdbrdf.job.ownership import (
-    edited_files,
-    make_parents,
-    prepare_asset_folder,
-    removed_if_unused,
-)
+from usdbrdf.job.ownership import edited_files, owned_folder
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult
+from usdbrdf.job.task import TaskResult
 from usdbrdf.tasks.fit import fit
 from usdbrdf.tasks.fit_objects import FitOptions
 from usdbrdf.tasks.ingest import ingest
@@ -54,7 +48,7 @@ def convert(
     options: ConvertOptions | None = None,
     *,
     adapter: str | None = None,
-) -> dict[str, StageResult]:
+) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
     capture   folder or file that one of the adapters reads
@@ -76,20 +70,24 @@ def convert(
 
 @contextmanager
 def working_on(
-    folder: str | Path, *, hand_edits: str = "refuse", wait_s: float = 0.0
+    folder: str | Path,
+    *,
+    hand_edits: str = "refuse",
+    wait_s: float = 0.0,
+    without_lock: bool = False,
 ) -> Iterator[Asset]:
     """Prepare and lock an asset folder for one or more steps.
 
     A folder that is made here, its parents too, is removed again if nothing gets written into it.
 
-    hand_edits  what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
-                "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
+    hand_edits    what to do with files of ours that somebody changed: "refuse"
+                  (OwnershipConflict), "adopt" (keep their content as adopted-N.usda beside
+                  edits.usda) or "discard"
+    wait_s        how long to wait for another run in the folder before FolderBusy
+    without_lock  go on where the file system has no locks, which is FolderBusy otherwise
     """
-    place = Path(folder)
-    new = make_parents(place)
-    state = prepare_asset_folder(place)
-    with folder_lock(state, wait_s), removed_if_unused(new):
-        asset = Asset.at(place)
+    with owned_folder(Path(folder), wait_s=wait_s, without_lock=without_lock):
+        asset = Asset.at(Path(folder))
         _settle(asset, edited_files(asset.folder), hand_edits)
         yield asset
 

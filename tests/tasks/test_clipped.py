@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.tasks.clipped import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
@@ -59,7 +59,7 @@ def truth(world: World) -> np.ndarray:
 
 def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
     atlas = Atlas(stage=None, scene=world.scene, texels=world.texels)
-    run = StageRun(folder, "shade", folder / "work")
+    run = TaskRun(folder, "shade", folder / "work")
     return estimate_clipped_light(
         run, atlas, world.rays, lit, ~clipped, clipped, black_environment(), 0
     )

@@ -23,7 +23,7 @@ from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import task as stage_module
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.camera import pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.tasks import refine, trace
@@ -181,7 +181,7 @@ def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
 def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
     stage = open_measured(room.glossy)
     atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     lit = lit_scene(atlas, black_environment())
     found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
     which = _reflecting(room, atlas)
@@ -218,7 +218,7 @@ def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Pat
     some = np.random.default_rng(1).choice(some, 400, replace=False)
     wanted = _true_irradiance(room.clean, some)
     lit, diffuse = lit_scene(room.clean, black_environment()), room.clean.map("lit")
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     found = refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)[some]
     before = atlas.map("irradiance")[some]
     off = [(some.sum() / wanted.sum() - 1, _off(some, wanted)) for some in (before, found)]
@@ -239,7 +239,7 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
 def _refined(room: Room, folder: Path) -> np.ndarray:
     """Refined irradiance of the glossy room in its own lit texture."""
     atlas = atlas_from_stage(open_measured(room.glossy))
-    run = StageRun(folder, "fit", folder / "work")
+    run = TaskRun(folder, "fit", folder / "work")
     lit, diffuse = lit_scene(atlas, black_environment()), 0.8 * atlas.map("lit")
     return refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)
 
@@ -254,7 +254,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
         return refined_irradiance(run, atlas, lit, diffuse, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
     unseen = atlas.map("coverage")[:, 0] == 0
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
@@ -284,7 +284,7 @@ def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
     atlas = atlas_from_stage(open_measured(room.glossy))
     emission = atlas.map_where_present("emission", 3)
     diffuse = np.where(emission > 0, emission, atlas.map("lit"))
-    run, lit = StageRun(tmp_path, "fit", tmp_path / "work"), lit_scene(atlas, black_environment())
+    run, lit = TaskRun(tmp_path, "fit", tmp_path / "work"), lit_scene(atlas, black_environment())
     found = refined_irradiance(run, atlas, lit, diffuse, lobes, "none", 0)
     traced = atlas.map("irradiance")
     reflects = _reflecting(room, atlas)

@@ -13,7 +13,7 @@ from tests.scenes import make_capture, ring_of_poses, write_ply
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.tasks import texture as module
 from usdbrdf.tasks.atlas import MapWriter, TexelMap
@@ -86,7 +86,7 @@ class _Picture:
 def test_large_values_are_kept_where_they_matter_and_counted_where_not(tmp_path, capsys):
     values = np.full((8, 3), 0.5, np.float32)
     values[3] = (70_001, 1, 70_003)
-    writer = MapWriter(StageRun(tmp_path, "texture", tmp_path / "work"), Asset(tmp_path, "a"),
+    writer = MapWriter(TaskRun(tmp_path, "texture", tmp_path / "work"), Asset(tmp_path, "a"),
                        _Picture())  # fmt: skip
     obj = SceneObject(
         prim_path="/a/box", identifier="box", label="", class_name="", first_face=0, num_faces=1

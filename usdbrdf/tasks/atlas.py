@@ -19,7 +19,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
@@ -103,7 +103,7 @@ class TexelMap(NamedTuple):
 class MapWriter:
     """Writes the maps of a step, and counts the values that were too large for them."""
 
-    run: StageRun
+    run: TaskRun
     asset: Asset
     texels: Texels
     clamped: int = 0

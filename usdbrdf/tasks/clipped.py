@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Float, Int, Long
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,
@@ -67,7 +67,7 @@ class ClippedLight:
 
 
 def estimate_clipped_light(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     rays: RayScene,
     lit: Float,

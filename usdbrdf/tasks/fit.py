@@ -15,7 +15,7 @@ from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading.denoise import NONE
@@ -31,7 +31,7 @@ from usdbrdf.tasks.texture import FILLED
 from usdbrdf.transport.lit_scene import LitScene
 
 
-def fit(asset: Asset, options: FitOptions) -> StageResult:
+def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda."""
     layers = weaker_layers(asset, "material")
     stage = open_weaker(asset, "material")
@@ -55,7 +55,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         },
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         atlas = atlas_from_stage(stage)
         environment = environment_from_file(options.environment, step.header.up_axis)
         lit = lit_scene(atlas, environment)
@@ -86,7 +86,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
 
 
 def _refined(
-    run: StageRun,
+    run: TaskRun,
     asset: Asset,
     atlas: Atlas,
     lit: LitScene,

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from usdbrdf.errors import UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
@@ -76,7 +76,7 @@ class Survey:
 
 
 def survey_frames(
-    run: StageRun, atlas: Atlas, lit: LitScene, frames: Frames, options: FitOptions
+    run: TaskRun, atlas: Atlas, lit: LitScene, frames: Frames, options: FitOptions
 ) -> Survey:
     """Gather all that the fits need of the frames, which are read once."""
 
@@ -124,7 +124,7 @@ def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
 
 
 def fitted_objects(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     frames: Frames,

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array
 from usdbrdf.texturing.passes import by_parts
 
 
 def in_passes(
-    run: StageRun,
+    run: TaskRun,
     name: str,
     groups: Sequence[slice],
     count: int,

@@ -12,7 +12,7 @@ import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Texels
@@ -52,7 +52,7 @@ _DARKEST = 1e-3
 
 
 def refined_maps(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     lit: LitScene,
     frames: Frames,
@@ -114,7 +114,7 @@ def _level(lit: Float) -> Float:
 
 
 def _without_lobes(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     lit: LitScene,
     frames: Frames,
@@ -147,7 +147,7 @@ def _bytes_of(lit: LitScene) -> int:
 
 
 def _observe(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     lit: LitScene,
     frames: Frames,

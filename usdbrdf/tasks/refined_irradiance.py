@@ -18,7 +18,7 @@ import numpy.typing as npt
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.job.progress import progress
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.tasks.atlas import Atlas
@@ -55,7 +55,7 @@ def filter_of(asset: Asset) -> str:
 
 
 def refined_irradiance(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     lit: LitScene,
     diffuse: Float,
@@ -73,7 +73,7 @@ def refined_irradiance(
 
 
 def _change(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     lit: LitScene,
     radiance: Float,

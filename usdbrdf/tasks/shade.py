@@ -18,7 +18,7 @@ from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter
 from usdbrdf.shading.emitters import Emitters, find_emitters
@@ -61,7 +61,7 @@ class ShadeOptions:
             )
 
 
-def shade(asset: Asset, options: ShadeOptions) -> StageResult:
+def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     """Trace S, divide, find the emitters, write shading.usda and its EXR maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
@@ -75,7 +75,7 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
     parameters = {**asdict(options.sampling), "denoise": lightmap_filter}
     step = Step(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         atlas = atlas_from_stage(stage)
         coverage = atlas.map("coverage")[:, 0]
         seen, clipped = coverage == MEASURED, coverage == CLIPPED
@@ -152,7 +152,7 @@ def _maps(shaded: _Shaded) -> dict[str, TexelMap]:
     return maps
 
 
-def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str, Any]:
+def _write(run: TaskRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str, Any]:
     """Maps, layer and summary."""
     traced, emissive = shaded.traced, shaded.emitters.emissive
     shines = np.where(emissive[:, None], shaded.light.lit, 0)

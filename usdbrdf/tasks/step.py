@@ -17,7 +17,7 @@ from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.job.stamp import code_version
-from usdbrdf.job.task import StageResult, StageRun, run_stage
+from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,9 @@ class Step:
     parameters: Mapping[str, Any]
     inputs: Mapping[str, str]
 
-    def run(self, work: Callable[[StageRun], dict[str, Any]]) -> StageResult:
+    def run(self, work: Callable[[TaskRun], dict[str, Any]]) -> TaskResult:
         """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
-        return run_stage(
+        return run_task(
             self.asset.folder,
             self.name,
             order=1 + ROLES.index(self.role),

@@ -19,7 +19,7 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import atlas_side, unwrap
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
@@ -72,7 +72,7 @@ def check_memory(memory: float | None) -> None:
         raise UsageError(f"--memory {memory}: not above 0. [usage.option]")
 
 
-def texture(asset: Asset, options: TextureOptions) -> StageResult:
+def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
     layers = weaker_layers(asset, "texturing")
     stage = open_weaker(asset, "texturing")
@@ -85,7 +85,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         inputs={**layers, "frames": hash_of_files(frames.image_paths)},
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         scene = scene_from_stage(stage)
         rays = RayScene(scene.points, scene.triangles)
         size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)
@@ -116,7 +116,7 @@ def _charts(stage: Usd.Stage, scene: Scene, texel_size: float) -> dict[str, npt.
 
 
 def _measure(
-    run: StageRun,
+    run: TaskRun,
     texels: Texels,
     scene: Scene,
     rays: RayScene,
@@ -134,7 +134,7 @@ def _measure(
 
 
 def _observe(
-    run: StageRun,
+    run: TaskRun,
     texels: Texels,
     scene: Scene,
     rays: RayScene,
@@ -197,7 +197,7 @@ def _check_seen(measured: Bool, clipped: Bool) -> None:
 
 
 def _write(
-    run: StageRun,
+    run: TaskRun,
     step: Step,
     scene: Scene,
     texels: Texels,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.denoise import denoise_lightmaps
@@ -27,7 +27,7 @@ _TILE = 1 << 15
 
 
 def trace_irradiance(
-    run: StageRun,
+    run: TaskRun,
     atlas: Atlas,
     rays: RayScene,
     lit: Float,
