@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from usdbrdf.asset.layout import Asset
-    from usdbrdf.job.task import StageResult
+    from usdbrdf.job.task import TaskResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class _Run(TalkOptions, Command):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
 
-    def report(self, results: Mapping[str, StageResult], folder: Path) -> int:
+    def report(self, results: Mapping[str, TaskResult], folder: Path) -> int:
         """What the tasks found, with the root layer, whose name only a finished ingest knows."""
         from usdbrdf.asset.layout import Asset
 

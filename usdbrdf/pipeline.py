@@ -13,7 +13,6 @@ step, look, override in edits.usda, and go on.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -24,15 +23,10 @@ from typing import ParamSpec
 from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import OwnershipConflict
-from usdbrdf.job.lock import folder_lock
-from usdbrdf.job.ownership import (
-    edited_files,
-    make_parents,
-    prepare_asset_folder,
-    removed_if_unused,
-)
+from usdbrdf.job.lock import is_held
+from usdbrdf.job.ownership import STATE_FOLDER, edited_files, owned_folder
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult
+from usdbrdf.job.task import TaskResult
 from usdbrdf.options import ConvertOptions, HandEdits
 from usdbrdf.tasks.fit import fit as fit_task
 from usdbrdf.tasks.ingest import ingest as ingest_task
@@ -51,7 +45,7 @@ def convert(
     plugins: bool = True,
     hand_edits: HandEdits = "refuse",
     wait_s: float = 0.0,
-) -> dict[str, StageResult]:
+) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
     capture   folder or file that one of the adapters reads
@@ -74,51 +68,39 @@ def convert(
         }
 
 
-class _Held(threading.local):
-    """The folders that this thread works on."""
-
-    def __init__(self) -> None:
-        self.folders: set[Path] = set()
-
-
-_held = _Held()
-
-
 @contextmanager
 def working_on(
-    folder: str | Path, *, hand_edits: HandEdits = "refuse", wait_s: float = 0.0
+    folder: str | Path,
+    *,
+    hand_edits: HandEdits = "refuse",
+    wait_s: float = 0.0,
+    without_lock: bool = False,
 ) -> Iterator[Asset]:
-    """Prepare and lock an asset folder for one or more steps; once more in the same thread does
+    """Prepare and lock an asset folder for one or more tasks; once more in the same thread does
     nothing.
 
     A folder that is made here, its parents too, is removed again if nothing gets written into it.
 
-    hand_edits  what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
-                "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
-    wait_s      for how many seconds to wait for another run in this folder before FolderBusy
+    hand_edits    what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
+                  "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
+    wait_s        for how many seconds to wait for another run in this folder before FolderBusy
+    without_lock  go on where the file system has no locks, which is FolderBusy otherwise
     """
     place = Path(folder)
-    real = place.resolve()
-    if real in _held.folders:
+    if is_held(place / STATE_FOLDER):
         yield Asset.at(place)
         return
-    new = make_parents(place)
-    state = prepare_asset_folder(place)
-    with folder_lock(state, wait_s), removed_if_unused(new):
+    with owned_folder(place, wait_s=wait_s, without_lock=without_lock):
         asset = Asset.at(place)
         _settle(asset, edited_files(asset.folder), hand_edits)
-        _held.folders.add(real)
-        try:
-            yield asset
-        finally:
-            _held.folders.discard(real)
+        yield asset
 
 
-def _on_its_folder(task: Callable[P, StageResult]) -> Callable[P, StageResult]:
+def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
     """A task that works on the folder of its asset, alone there, and says if there was no need."""
 
     @wraps(task)
-    def run(*given: P.args, **named: P.kwargs) -> StageResult:
+    def run(*given: P.args, **named: P.kwargs) -> TaskResult:
         asset: Asset = signature(task).bind(*given, **named).arguments["asset"]
         with working_on(asset.folder):
             result = task(*given, **named)

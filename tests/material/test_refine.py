@@ -22,9 +22,9 @@ from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr, write_exr
-from usdbrdf.job import task as stage_module
+from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
 from usdbrdf.material.refine import (
     LightBefore,
@@ -86,7 +86,7 @@ def _lobes(atlas: AssetMaps) -> Lobes:
     return Lobes(phi=phi, psi=psi)
 
 
-def _refined_light(run: StageRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
+def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
     texels, lobes = atlas.texels, _lobes(atlas)
     shown = Shown(atlas.lit, atlas.samples)
     means = means_without_lobes(run, lit, texels, frames, shown, lobes, None, 0)
@@ -98,7 +98,7 @@ def _refined_light(run: StageRun, atlas: AssetMaps, lit: LitScene, frames: Frame
 
 
 def _irradiance(
-    run: StageRun, atlas: AssetMaps, lit: LitScene, diffuse: Float, lobes: Lobes
+    run: TaskRun, atlas: AssetMaps, lit: LitScene, diffuse: Float, lobes: Lobes
 ) -> Float:
     """S of the asset, with the diffuse radiance and the lobes as the light instead of its L_d."""
     change = np.where(atlas.emissive[:, None], 0, diffuse - atlas.lit).astype(np.float32)
@@ -203,7 +203,7 @@ def _true_irradiance(clean: AssetMaps, which: np.ndarray) -> np.ndarray:
 def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
     stage = open_measured(room.glossy)
     atlas, frames = AssetMaps(stage), frames_from_stage(stage)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     lit = atlas.lit_scene(black_environment())
     found = _refined_light(run, atlas, lit, frames)
     which = _reflecting(room, atlas)
@@ -240,7 +240,7 @@ def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Pat
     some = np.random.default_rng(1).choice(some, 400, replace=False)
     wanted = _true_irradiance(room.clean, some)
     lit, diffuse = room.clean.lit_scene(black_environment()), room.clean.map("lit")
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     found = _irradiance(run, atlas, lit, diffuse, _lobes(atlas))[some]
     before = atlas.map("irradiance")[some]
     off = [(some.sum() / wanted.sum() - 1, _off(some, wanted)) for some in (before, found)]
@@ -261,7 +261,7 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
 def _refined(room: Room, folder: Path) -> np.ndarray:
     """Refined irradiance of the glossy room in its own lit texture."""
     atlas = AssetMaps(open_measured(room.glossy))
-    run = StageRun(folder, "fit", folder / "work")
+    run = TaskRun(folder, "fit", folder / "work")
     lit, diffuse = atlas.lit_scene(black_environment()), 0.8 * atlas.map("lit")
     return _irradiance(run, atlas, lit, diffuse, _lobes(atlas))
 
@@ -276,7 +276,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
         return refined_irradiance(run, lit, texels, traced, change, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
     found = _refined_light(run, atlas, lit, frames)
     unseen = ~atlas.coverage.observed
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
@@ -306,7 +306,7 @@ def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
     atlas = AssetMaps(open_measured(room.glossy))
     emission = atlas.map_where_present("emission", 3)
     diffuse = np.where(emission > 0, emission, atlas.map("lit"))
-    run, lit = StageRun(tmp_path, "fit", tmp_path / "work"), atlas.lit_scene(black_environment())
+    run, lit = TaskRun(tmp_path, "fit", tmp_path / "work"), atlas.lit_scene(black_environment())
     found = _irradiance(run, atlas, lit, diffuse, lobes)
     traced = atlas.map("irradiance")
     reflects = _reflecting(room, atlas)
@@ -380,8 +380,8 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
             if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(stage_module, "_SAVE_AFTER", 0.0)
-    monkeypatch.setattr(stage_module, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
@@ -61,7 +61,7 @@ def truth(world: World) -> np.ndarray:
 
 def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
     surface = TexturedScene(world.scene, world.texels, world.rays)
-    run = StageRun(folder, "shade", folder / "work")
+    run = TaskRun(folder, "shade", folder / "work")
     coverage = CoverageMap.of(~clipped, clipped)
     return estimate_clipped_light(run, surface, lit, coverage, black_environment(), 0)
 

@@ -15,7 +15,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.texturing import lit_texture as module
@@ -96,7 +96,7 @@ def test_large_values_are_kept_where_they_matter_and_counted_where_not(tmp_path,
     obj = SceneObject(
         prim_path="/a/box", identifier="box", label="", class_name="", first_face=0, num_faces=1
     )
-    run = StageRun(tmp_path, "texture", tmp_path / "work")
+    run = TaskRun(tmp_path, "texture", tmp_path / "work")
     writer = MapWriter(run, Asset(tmp_path, "a"), SimpleNamespace(objects=[obj]), _Picture())
     writer.warn()
     assert capsys.readouterr().err == ""

@@ -21,7 +21,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import image_size, read_exr, write_exr
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
@@ -188,7 +188,7 @@ class TexelMap(NamedTuple):
 class MapWriter:
     """Writes the maps of a task, and counts the values that were too large for them."""
 
-    run: StageRun
+    run: TaskRun
     asset: Asset
     scene: Scene
     texels: Texels

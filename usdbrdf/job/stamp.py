@@ -1,6 +1,6 @@
-"""The record of a finished stage, and why a stage has to run (again).
+"""The record of a finished task, and why a task has to run (again).
 
-A stage is done if and only if its stamp can be read and is intact, its schema is known, version,
+A task is done if and only if its stamp can be read and is intact, its schema is known, version,
 parameters and inputs are equal, and every output is there with the hash in the stamp. Times play
 no part: touching a file changes nothing.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -20,17 +20,20 @@ from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.documents import json_text, read_json, write_json
 
+STATE_FOLDER = ".usdbrdf"
+
 STAMP_SCHEMA = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stamp:
-    """What a stage did.
+    """What a task did.
 
+    stage                its name
     parameters, inputs   what it depends on; inputs maps a label to a SHA-256
     outputs              asset-relative path -> SHA-256
     once                 paths created where absent and the artist's from then on: no hash
-    summary              what the stage's work returned
+    summary              what the task's work returned
     earlier              only in the journal of a publish: path -> hashes that it may replace
     """
 
@@ -51,19 +54,19 @@ class Stamp:
 
 
 def stamp_of(name: str, parameters: Mapping[str, Any], inputs: Mapping[str, str]) -> Stamp:
-    """The stamp of a stage that has not run yet, its parameters as JSON gives them back."""
+    """The stamp of a task that has not run yet, its parameters as JSON gives them back."""
     plain = json.loads(json_text(dict(parameters)))
     return Stamp(stage=name, version=code_version(), parameters=plain, inputs=dict(inputs))
 
 
 def stamp_path(asset: Path, order: int, name: str) -> Path:
-    """Where the stamp of a stage lies."""
-    return asset / ".usdbrdf" / "stamps" / f"{order}-{name}.json"
+    """Where the stamp of a task lies."""
+    return asset / STATE_FOLDER / "stamps" / f"{order}-{name}.json"
 
 
 def journal_path(asset: Path, name: str) -> Path:
-    """Where a stage notes what it is about to publish, while it does."""
-    return asset / ".usdbrdf" / f"publishing-{name}.json"
+    """Where a task notes what it is about to publish, while it does."""
+    return asset / STATE_FOLDER / f"publishing-{name}.json"
 
 
 def read_stamp(path: Path) -> Stamp | None:
@@ -87,7 +90,7 @@ def write_stamp(path: Path, stamp: Stamp) -> None:
 
 
 def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
-    """The reason why a stage has to run, in words, or None if it is done."""
+    """The reason why a task has to run, in words, or None if it is done."""
     stamp = read_stamp(stamp_path(asset, order, wanted.stage))
     if stamp is None:
         return "not done before"
@@ -109,9 +112,14 @@ def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
 
 def known_hashes(state_folder: Path) -> dict[str, set[str]]:
     """Every hash that stamps and journals give for a published file, by asset-relative path."""
-    known: dict[str, set[str]] = {}
     paths = [*state_folder.glob("stamps/*.json"), *state_folder.glob("publishing-*.json")]
-    for stamp in filter(None, map(read_stamp, paths)):
+    return hashes_in(map(read_stamp, paths))
+
+
+def hashes_in(stamps: Iterable[Stamp | None]) -> dict[str, set[str]]:
+    """The hashes that these stamps and journals give, by asset-relative path."""
+    known: dict[str, set[str]] = {}
+    for stamp in filter(None, stamps):
         for relative, sha256 in stamp.outputs.items():
             known.setdefault(relative, set()).add(sha256)
         for relative, hashes in stamp.earlier.items():
@@ -122,8 +130,8 @@ def known_hashes(state_folder: Path) -> dict[str, set[str]]:
 def check_relative(relative: str) -> str:
     """The path itself, if it stays in the asset folder and out of our own state folder."""
     path = PurePosixPath(relative)
-    if path.is_absolute() or ".." in path.parts or path.parts[:1] in ((), (".usdbrdf",)):
-        raise UsdBrdfError(f"{relative!r} is not a path inside the asset. [stage.output]")
+    if path.is_absolute() or ".." in path.parts or path.parts[:1] in ((), (STATE_FOLDER,)):
+        raise UsdBrdfError(f"{relative!r} is not a path inside the asset. [task.output]")
     return path.as_posix()
 
 

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
@@ -84,7 +84,7 @@ class ObjectFit(NamedTuple):
 
 
 def survey_frames(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     usable: Bool,
@@ -132,7 +132,7 @@ def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
 
 
 def fitted_objects(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     frames: Frames,

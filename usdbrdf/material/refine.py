@@ -15,7 +15,7 @@ import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
@@ -88,7 +88,7 @@ class Refined:
 
 
 def refined_light(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     found: RobustMean,
@@ -141,7 +141,7 @@ def _level(lit: Float) -> Float:
 
 
 def means_without_lobes(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     frames: Frames,
@@ -173,7 +173,7 @@ def _bytes_of(lit: LitScene) -> int:
 
 
 def _observed(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     frames: Frames,

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.job.progress import progress
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
@@ -47,7 +47,7 @@ class Lobes:
 
 
 def refined_irradiance(
-    run: StageRun,
+    run: TaskRun,
     lit: LitScene,
     texels: Texels,
     traced: Float,
@@ -63,7 +63,7 @@ def refined_irradiance(
 
 
 def _change(
-    run: StageRun, lit: LitScene, texels: Texels, radiance: Float, lobes: Lobes, seed: int
+    run: TaskRun, lit: LitScene, texels: Texels, radiance: Float, lobes: Lobes, seed: int
 ) -> Float:
     """What the change of the diffuse ``radiance`` (T, 3) and the lobes' light add to S, traced tile
     by tile."""

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
@@ -164,7 +164,7 @@ class ClippedLight:
 
 
 def estimate_clipped_light(
-    run: StageRun,
+    run: TaskRun,
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
@@ -22,7 +22,7 @@ _TILE = 1 << 15
 
 
 def trace_irradiance(
-    run: StageRun,
+    run: TaskRun,
     surface: TexturedScene,
     lit: Float,
     environment: Environment,

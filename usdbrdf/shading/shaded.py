@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.options import BEFORE_FILTER, Sampling
@@ -66,7 +66,7 @@ class Shaded:
 
 
 def shade_surface(
-    run: StageRun,
+    run: TaskRun,
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,

@@ -16,7 +16,7 @@ from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, survey_frames
 from usdbrdf.material.refine import LightBefore, Shown, means_without_lobes, refined_light
 from usdbrdf.material.refined_irradiance import Lobes
@@ -32,7 +32,7 @@ from usdbrdf.transport.lit_scene import LitScene
 _READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 
 
-def fit(asset: Asset, options: FitOptions) -> StageResult:
+def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
     maps = AssetMaps(open_before(asset, "material"))
     lightmap_filter = _filter_of_shading(asset) if options.method == "views" else NONE
@@ -47,7 +47,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         ),
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         environment = environment_from_file(options.environment, task.header.up_axis)
         lit = maps.lit_scene(environment)
         usable = maps.coverage.measured & ~maps.emissive
@@ -103,7 +103,7 @@ def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool)
 
 
 def _refined(
-    run: StageRun,
+    run: TaskRun,
     asset: Asset,
     maps: AssetMaps,
     lit: LitScene,

@@ -15,7 +15,7 @@ from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.untrusted.usd_paths import layers_of_usd
@@ -28,7 +28,7 @@ def ingest(
     adapter: str | None = None,
     *,
     plugins: bool = True,
-) -> StageResult:
+) -> TaskResult:
     """Read and check a capture and write it as the weakest layer of ``asset``.
 
     Raises InputRefused for a capture that cannot be used; nothing is published then.
@@ -55,7 +55,7 @@ def ingest(
         inputs=inputs,
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         for warning in scan.warnings:
             say(f"warning: {warning}")

@@ -15,7 +15,7 @@ from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import Aov, ShadedObject
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.options import ShadeOptions
 from usdbrdf.shading.denoise import chosen_filter
@@ -25,7 +25,7 @@ from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task
 
 
-def shade(asset: Asset, options: ShadeOptions) -> StageResult:
+def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
@@ -40,7 +40,7 @@ def shade(asset: Asset, options: ShadeOptions) -> StageResult:
         ),
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         environment = environment_from_file(options.environment, task.header.up_axis)
         shaded = shade_surface(
             run, maps.surface, maps.lit, maps.coverage, environment, options.sampling,
@@ -100,7 +100,7 @@ def _record(writer: MapWriter, shaded: Shaded, i: int, aovs: tuple[Aov, ...]) ->
 
 
 def _write_layers(
-    run: StageRun, task: Task, maps: AssetMaps, objects: list[ShadedObject], emission: Float
+    run: TaskRun, task: Task, maps: AssetMaps, objects: list[ShadedObject], emission: Float
 ) -> None:
     asset = task.asset
     write_shading_layer(run.output(f"layers/{asset.layer('shading').name}"), task.draft, objects)

@@ -9,7 +9,7 @@ from typing import Any
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.stamp import code_version
-from usdbrdf.job.task import StageResult, StageRun, run_stage
+from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +22,9 @@ class Task:
     parameters: Mapping[str, Any]
     inputs: Mapping[str, str]
 
-    def run(self, work: Callable[[StageRun], dict[str, Any]]) -> StageResult:
+    def run(self, work: Callable[[TaskRun], dict[str, Any]]) -> TaskResult:
         """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
-        return run_stage(
+        return run_task(
             self.asset.folder,
             self.name,
             order=1 + ROLES.index(self.role),

@@ -15,7 +15,7 @@ from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageResult, StageRun
+from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
@@ -24,7 +24,7 @@ from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.textured_scene import TexturedScene
 
 
-def texture(asset: Asset, options: TextureOptions) -> StageResult:
+def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
     maps = AssetMaps(open_before(asset, "texturing"))
     task = Task(
@@ -35,7 +35,7 @@ def texture(asset: Asset, options: TextureOptions) -> StageResult:
         inputs=hashes_of_inputs(asset, "texturing", maps, photographs=True),
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
         size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)

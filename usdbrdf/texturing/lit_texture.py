@@ -9,7 +9,7 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import progress
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
@@ -52,7 +52,7 @@ class LitTexture:
 
 
 def lit_texture_from_frames(
-    run: StageRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
+    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
 ) -> LitTexture:
     """Project all frames, in as many passes over them as ``memory`` (GiB) asks for.
 
@@ -71,7 +71,7 @@ def lit_texture_from_frames(
 
 
 def _observed(
-    run: StageRun, surface: TexturedScene, frames: Frames, quantile: float, part: slice
+    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, part: slice
 ) -> Observation:
     """Some texels in all frames, going on from the last saved state of an interrupted run."""
     name = f"frames-{part.start}-{part.stop}"

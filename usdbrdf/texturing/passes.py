@@ -14,7 +14,7 @@ import numpy as np
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
@@ -99,7 +99,7 @@ def by_parts(
 
 
 def in_passes(
-    run: StageRun,
+    run: TaskRun,
     name: str,
     groups: Sequence[slice],
     count: int,
