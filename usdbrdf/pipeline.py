@@ -24,8 +24,9 @@ from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.lock import is_held
-from usdbrdf.job.ownership import STATE_FOLDER, edited_files, owned_folder
+from usdbrdf.job.ownership import edited_files, owned_folder
 from usdbrdf.job.progress import say
+from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.job.task import TaskResult
 from usdbrdf.options import ConvertOptions, HandEdits
 from usdbrdf.tasks.fit import fit as fit_task
