@@ -10,24 +10,20 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.texels import Texels
 
-# Fewer clipped texels than this light nothing.
-_MIN_TEXELS = 16
+_MIN_TEXELS = calibration.count("lamps.min_texels")
 
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
 
-# Texels this many of their sizes apart hang together.
-_REACH = 3.0
+_REACH = calibration.number("lamps.reach")
 
-# A wall beside a lamp clips where it is brightest: what surrounds the clipped part is then nearly
-# as bright, at least this share of it. What surrounds a lamp is not.
-_NEARLY = 0.3
+_NEARLY = calibration.number("lamps.nearly_as_bright")
 
-# The surroundings of a clipped part reach this far, metres.
-_AROUND = 0.1
+_AROUND = calibration.number("lamps.around")
 
 
 @dataclass(frozen=True, kw_only=True)

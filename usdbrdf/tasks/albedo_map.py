@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.albedo import albedo_from_irradiance
 from usdbrdf.texturing.inpaint import inpaint
 
-# Albedo of a surface that nobody saw.
-NEUTRAL = 0.5
+NEUTRAL = calibration.number("albedo.unseen")
 
-# S below this share of the scene's median is darkness in which an albedo means nothing.
-_DARK = 1e-3
+_DARK = calibration.number("albedo.dark")
 
 
 def albedo_map(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Bool, Float, Int, Long
@@ -32,8 +33,7 @@ _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 
-# A bright wall that clips is little brighter than its bound.
-_WALL_PRIOR = (0.3, 0.4)
+_WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.shading_layer import write_shading_layer
 from usdbrdf.asset.layout import Asset
@@ -34,9 +35,7 @@ from usdbrdf.tasks.trace import denoised_irradiance, trace_irradiance
 from usdbrdf.transport.irradiance import Irradiance, Sampling
 from usdbrdf.transport.rays import RayScene
 
-# What the lightmap filter is given may have this many times the standard error that was asked for:
-# of 3.3 % it left 0.5 % on captures of rooms.
-_BEFORE_FILTER = 1.1
+_BEFORE_FILTER = calibration.number("shade.before_filter")
 
 # More Sobol points than this fill the memory, and improve nothing.
 _MAX_RAYS = 1 << 20

@@ -6,6 +6,7 @@ from decimal import ROUND_CEILING, Context
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.capture import Frames
@@ -15,8 +16,7 @@ from usdbrdf.transport.rays import RayScene
 
 _RAYS_PER_FRAME = 600
 
-# An atlas is never full; this share of its area is charts.
-_PACKING = 0.7
+_PACKING = calibration.number("texel_size.packing")
 
 _DIGITS = 2
 
