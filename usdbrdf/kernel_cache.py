@@ -13,7 +13,7 @@ import hashlib
 import inspect
 import logging
 import os
-import pickle  # noqa: TID251 - how numba stores its code; read from folders of our own only
+import pickle
 import shutil
 import sys
 import tempfile
