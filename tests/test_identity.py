@@ -32,10 +32,12 @@ print(kept, probe.stats.cache_path, found.sum())
 """
 _TASK = """
 import pathlib
-from usdbrdf.job.task import run_stage
-work = lambda run: run.output("layers/a.usda").write_text("#usda 1.0") and {}
-done = run_stage(pathlib.Path("asset"), "one", order=1, parameters={}, inputs={}, work=work)
-print(done.reason)
+from usdbrdf.job.stamp import stamp_of, stamp_path, why_rerun, write_stamp
+asset, wanted = pathlib.Path("asset"), stamp_of("one", {}, {})
+print(why_rerun(asset, 1, wanted) or "done")
+file = stamp_path(asset, 1, "one")
+file.parent.mkdir(parents=True, exist_ok=True)
+write_stamp(file, wanted)
 """
 
 
@@ -103,7 +105,6 @@ def test_an_edit_of_what_a_kernel_calls_takes_effect(copy):
 
 @pytest.mark.parametrize("source", ["transport/warps.py", "calibration.json", "capture/parts.py"])
 def test_an_edit_of_any_source_runs_the_tasks_again(copy, source):
-    (copy / "asset").mkdir()
     assert _run(copy, _TASK) == ["not", "done", "before"]
     (copy / "usdbrdf" / source).touch()
     # Whose subject is finished assets, no task depends on.
