@@ -13,6 +13,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 from typing import get_type_hints as resolved_types
 
+from usdbrdf import calibration
 from usdbrdf.errors import UsageError
 
 if TYPE_CHECKING:
@@ -230,9 +231,8 @@ class TextureOptions(Options):
     memory: float | None = _memory()
 
 
-# What the lightmap filter is given may have this many times the standard error that was asked for:
-# of 3.3 % it left 0.5 % on captures of rooms.
-BEFORE_FILTER = 1.1
+# What the lightmap filter is given may have this many times the standard error asked for.
+BEFORE_FILTER = calibration.number("shade.before_filter")
 
 # Of "cosine": the paper's number of independent directions per texel.
 _RAYS = {"mis": 2048, "cosine": 10_000}

@@ -91,6 +91,10 @@ def test_changed_input_and_version_rerun(tmp_path, monkeypatch):
     assert run("aa").reran
     assert not run("aa").reran
     assert run("bb").reason == "inputs changed: scan"
+    with monkeypatch.context() as another:
+        another.setattr(stamp_module, "tasks_identity", lambda: "another")
+        assert run("bb").reason == "code changed"
+    assert run("bb").reason == "code changed"
     monkeypatch.setattr(stamp_module, "code_version", lambda: "9")
     assert run("bb").reason.startswith("version 9 instead of ")
 
@@ -214,6 +218,7 @@ def test_stamp_has_no_time_and_no_absolute_path(asset):
     assert str(asset.parent) not in text
     assert set(json.loads(text)) == {
         "check",
+        "code",
         "earlier",
         "inputs",
         "once",

@@ -1,8 +1,8 @@
 """The record of a finished task, and why a task has to run (again).
 
 A task is done if and only if its stamp can be read and is intact, its schema is known, version,
-parameters and inputs are equal, and every output is there with the hash in the stamp. Times play
-no part: touching a file changes nothing.
+code, parameters and inputs are equal, and every output is there with the hash in the stamp. Times
+play no part: touching a file changes nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.documents import json_text, read_json, write_json
+from usdbrdf.identity import tasks_identity
 
 STATE_FOLDER = ".usdbrdf"
 
@@ -30,6 +31,7 @@ class Stamp:
     """What a task did.
 
     stage                its name
+    version, code        of the package, and the hash of its sources
     parameters, inputs   what it depends on; inputs maps a label to a SHA-256
     outputs              asset-relative path -> SHA-256
     once                 paths created where absent and the artist's from then on: no hash
@@ -44,19 +46,26 @@ class Stamp:
     outputs: dict[str, str] = field(default_factory=dict)
     once: list[str] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
+    code: str = ""
     earlier: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def fingerprint(self) -> str:
         """12 hexadecimal digits of all that the outputs depend on."""
-        cause = [self.stage, self.version, self.parameters, self.inputs]
+        cause = [self.stage, self.version, self.code, self.parameters, self.inputs]
         return hashlib.sha256(json_text(cause).encode()).hexdigest()[:12]
 
 
 def stamp_of(name: str, parameters: Mapping[str, Any], inputs: Mapping[str, str]) -> Stamp:
     """The stamp of a task that has not run yet, its parameters as JSON gives them back."""
     plain = json.loads(json_text(dict(parameters)))
-    return Stamp(stage=name, version=code_version(), parameters=plain, inputs=dict(inputs))
+    return Stamp(
+        stage=name,
+        version=code_version(),
+        code=tasks_identity(),
+        parameters=plain,
+        inputs=dict(inputs),
+    )
 
 
 def stamp_path(asset: Path, order: int, name: str) -> Path:
@@ -96,6 +105,8 @@ def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
         return "not done before"
     if stamp.version != wanted.version:
         return f"version {wanted.version} instead of {stamp.version}"
+    if stamp.code != wanted.code:
+        return "code changed"
     for kind in ("parameters", "inputs"):
         names = _differing(getattr(stamp, kind), getattr(wanted, kind))
         if names:
@@ -137,7 +148,7 @@ def check_relative(relative: str) -> str:
 
 @cache
 def code_version() -> str:
-    """Version of the installed package; a plain checkout has none and never looks changed."""
+    """Version of the installed package, as layers tell it; a plain checkout has none."""
     try:
         return version("usdbrdf")
     except PackageNotFoundError:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
@@ -43,13 +44,10 @@ _MOST_SAMPLES = 24
 # sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
 
-# A sample's error, in parts of the texel's lit radiance: what poses, lobes and reading do to it;
-# and in parts of the noise floor, which lies some four deviations of the sensor's noise above zero.
-_RELATIVE_ERROR, _OF_NOISE_FLOOR = 0.03, 0.25
+_RELATIVE_ERROR = calibration.number("refine.relative_error")
+_OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 
-# Errors in proportion to what is seen: those of black surfaces are not below this share of the
-# scene's median.
-_DARKEST = 1e-3
+_DARKEST = calibration.number("refine.darkest")
 
 
 class Shown(NamedTuple):

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.inpaint import inpaint
 
-# Albedo of a surface that nobody saw.
-NEUTRAL = 0.5
+NEUTRAL = calibration.number("albedo.unseen")
 
-# S below this share of the scene's median is darkness in which an albedo means nothing.
-_DARK = 1e-3
+_DARK = calibration.number("albedo.dark")
 _TINY = float(np.finfo(np.float32).tiny)
 
 

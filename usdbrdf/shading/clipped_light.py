@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
@@ -31,21 +32,16 @@ from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.textured_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 
-# Fewer clipped texels than this light nothing.
-_MIN_TEXELS = 16
+_MIN_TEXELS = calibration.count("lamps.min_texels")
 
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
 
-# Texels this many of their sizes apart hang together.
-_REACH = 3.0
+_REACH = calibration.number("lamps.reach")
 
-# A wall beside a lamp clips where it is brightest: what surrounds the clipped part is then nearly
-# as bright, at least this share of it. What surrounds a lamp is not.
-_NEARLY = 0.3
+_NEARLY = calibration.number("lamps.nearly_as_bright")
 
-# The surroundings of a clipped part reach this far, metres.
-_AROUND = 0.1
+_AROUND = calibration.number("lamps.around")
 
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
@@ -53,8 +49,7 @@ _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 
-# A bright wall that clips is little brighter than its bound.
-_WALL_PRIOR = (0.3, 0.4)
+_WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
 @dataclass(frozen=True, kw_only=True)
