@@ -26,13 +26,7 @@ from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
-from usdbrdf.material.refine import (
-    LightBefore,
-    Refined,
-    Shown,
-    means_without_lobes,
-    refined_light,
-)
+from usdbrdf.material.refine import Refined, refined_light
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading import irradiance_map
@@ -87,14 +81,7 @@ def _lobes(atlas: AssetMaps) -> Lobes:
 
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
-    texels, lobes = atlas.texels, _lobes(atlas)
-    shown = Shown(atlas.lit, atlas.samples)
-    means = means_without_lobes(run, lit, texels, frames, shown, lobes, None, 0)
-    before = LightBefore(
-        atlas.lit, atlas.coverage, atlas.emission, atlas.emissive, atlas.irradiance,
-        atlas.irradiance,
-    )  # fmt: skip
-    return refined_light(run, lit, texels, means, before, lobes, "none", 0)
+    return refined_light(run, lit, atlas.texels, frames, atlas, _lobes(atlas), "none", None, 0)
 
 
 def _irradiance(

@@ -153,11 +153,6 @@ class AssetMaps:
                 values[self.texels.of_object(i)] = self.texels.from_image(i, picture)
         return values
 
-    def forget(self, *aovs: str) -> None:
-        """Free the memory of maps that are not needed any more."""
-        for aov in aovs:
-            self._read.pop(aov, None)
-
     def _decoded(self, aov: str) -> Float:
         files = [self._file(obj, aov) for obj in self.scene.objects]
         with ThreadPoolExecutor(_AT_A_TIME) as pool:

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Annotated, Any, Literal, get_type_hints
 
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
-from usdbrdf.model.arrays import Float
+from usdbrdf.model.arrays import Array, Float
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
 # away, not when one is added.
@@ -23,6 +23,12 @@ SCHEMA_VERSION = 1
 INSTANCE = "__INSTANCE_NAME__"
 
 Colour = tuple[float, float, float]
+
+
+def colour(values: Array) -> Colour:
+    """Three numbers as a record holds a colour."""
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
 
 
 @dataclass(frozen=True)
@@ -325,6 +331,16 @@ class FittedObject(MeasuredObject):
     def is_known(self) -> bool:
         """Whether there is a lobe to show."""
         return math.isfinite(self.phi) and math.isfinite(self.psi)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What a summary says of the object, JSON."""
+        names = ("phi", "psi", "phi_error", "psi_error", "phi_confidence", "psi_confidence",
+                 "status", "evidence", "target_frame")
+        row = {name: getattr(self, name) for name in names}
+        row |= {name: round(value, 4) if math.isfinite(value) else None
+                for name, value in row.items() if isinstance(value, float)}
+        return row | {"evidence": row["evidence"] or 0.0}
 # fmt: on
 
 

@@ -19,8 +19,16 @@ from usdbrdf.material.fit_target import Residual, fit_target_frame
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
+from usdbrdf.material.verdict import (
+    NEUTRAL,
+    Verdict,
+    class_prior,
+    verdict_on_frame,
+    verdict_on_views,
+)
 from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.scene import SceneObject
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import FitOptions
 from usdbrdf.transport.lit_scene import LitScene, View
@@ -206,3 +214,13 @@ def _is_lamp(lit: LitScene, index: int) -> bool:
     faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
     third = np.full(len(faces), 1 / 3, np.float32)
     return bool((lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5).all())
+
+
+def judged(found: ObjectFit, obj: SceneObject, method: str, observed: bool) -> Verdict:
+    """What to publish of a fit; ``observed``: some frame shows the object."""
+    phi, psi = (found.phi, found.phi_error), (found.psi, found.psi_error)
+    prior = class_prior(obj.class_name, obj.label) if observed else NEUTRAL
+    if method == "views":
+        return verdict_on_views(phi, psi, found.unresolved, found.evidence, prior, observed)
+    keep = method == "paper"
+    return verdict_on_frame(phi, found.psi, found.evidence, prior, observed, keep)

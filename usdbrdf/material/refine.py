@@ -9,7 +9,7 @@ place of the median, and what the pixels blurred is restored where it stands abo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Protocol
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.albedo import albedo_map
+from usdbrdf.shading.denoise import OIDN
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
@@ -50,29 +51,30 @@ _OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 _DARKEST = calibration.number("refine.darkest")
 
 
-class Shown(NamedTuple):
-    """Of T texels: lit (T, 3), L_d with the specular light in it, and samples (T,), how many frames
-    measured each."""
-
-    lit: Float
-    samples: Float
-
-
-@dataclass(frozen=True)
-class LightBefore:
-    """What texturing and shading know of T texels.
+class LightBefore(Protocol):
+    """What texturing and shading know of T texels; each is read when it is needed.
 
     lit         (T, 3) W/(m^2 sr): L_d with the specular light in it
+    samples     (T,): how many frames measured each texel
     emission    (T, 3) W/(m^2 sr): what shines by itself, zero elsewhere; emissive (T,): it does
-    irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced: before the lightmap filter
+    irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced_irradiance: before the lightmap
+                filter, where there was one
     """
 
-    lit: Float
-    coverage: CoverageMap
-    emission: Float
-    emissive: Bool
-    irradiance: Float
-    traced: Float
+    @property
+    def lit(self) -> Float: ...
+    @property
+    def samples(self) -> Float: ...
+    @property
+    def coverage(self) -> CoverageMap: ...
+    @property
+    def emission(self) -> Float: ...
+    @property
+    def emissive(self) -> Bool: ...
+    @property
+    def irradiance(self) -> Float: ...
+    @property
+    def traced_irradiance(self) -> Float: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,18 +91,20 @@ def refined_light(
     run: TaskRun,
     lit: LitScene,
     texels: Texels,
-    found: RobustMean,
+    frames: Frames,
     before: LightBefore,
     lobes: Lobes,
     lightmap_filter: str,
+    memory: float | None,
     seed: int,
 ) -> Refined:
-    """What the frames show of T texels without specular light (``means_without_lobes``), as L_d, S
-    and base colour.
+    """What the frames show of T texels without the specular light of the ``lobes``: L_d, S and base
+    colour; in as many passes over the frames as ``memory`` (GiB) asks for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
+    found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
     emissive, observed = before.emissive, before.coverage.observed
     known = np.isfinite(found.mean[:, 0]) & ~emissive
     restored_light = _restored(texels, found, known, _level(before.lit))
@@ -117,9 +121,8 @@ def refined_light(
 
     _, diffuse = reflected(diffuse, before.irradiance)
     change = np.where(emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
-    irradiance = refined_irradiance(
-        run, lit, texels, before.traced, change, lobes, lightmap_filter, seed
-    )
+    traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
+    irradiance = refined_irradiance(run, lit, texels, traced, change, lobes, lightmap_filter, seed)
     base_color, diffuse = reflected(diffuse, irradiance)
     return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
 
@@ -138,12 +141,12 @@ def _level(lit: Float) -> Float:
     return level
 
 
-def means_without_lobes(
+def _means_without_lobes(
     run: TaskRun,
     lit: LitScene,
     texels: Texels,
     frames: Frames,
-    shown: Shown,
+    before: LightBefore,
     lobes: Lobes,
     memory: float | None,
     seed: int,
@@ -159,7 +162,7 @@ def means_without_lobes(
         groups = smallest_groups(texels)
 
     def means(part: slice) -> dict[str, Float]:
-        observed = _observed(run, lit, texels, frames, shown, lobes, seed, part)
+        observed = _observed(run, lit, texels, frames, before, lobes, seed, part)
         return dict(vars(robust_mean(observed)))
 
     return RobustMean(**in_passes(run, "means", groups, len(texels), means))
@@ -175,13 +178,13 @@ def _observed(
     lit: LitScene,
     texels: Texels,
     frames: Frames,
-    shown: Shown,
+    before: LightBefore,
     lobes: Lobes,
     seed: int,
     part: slice,
 ) -> MeanState:
     """Some texels in all frames, going on from the last saved state of an interrupted run."""
-    owner, level = texels.object_index(), _level(shown.lit)
+    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
     name = f"refined-{part.start}-{part.stop}"
     saved = run.latest(name)
     start, observed = 0, MeanState.empty(part.stop - part.start)
@@ -192,11 +195,11 @@ def _observed(
     sampled = samples_from_frames(texels, lit.scene, lit.rays, frames, order, part)
     bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
-        taken = _subsample(some.texel, shown.samples[some.texel], some.frame, seed)
+        taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
         texel, radiance = some.texel[taken], some.radiance[taken]
         camera = frames.camera(some.frame)
         specular = np.empty_like(radiance)
-        often = shown.samples[texel] >= _MANY_FRAMES
+        often = samples[texel] >= _MANY_FRAMES
         for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
             own = texel[which]
             specular[which] = lobe_radiance(

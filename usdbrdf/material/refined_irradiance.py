@@ -38,7 +38,7 @@ _SPECULAR_RAYS, _RAYS_OF_LOBE = 8, 4
 _SEED = 0x5EED
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Lobes:
     """phi, psi (num_objects,) float32: one lobe per object."""
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,6 +65,53 @@ class Shaded:
         bounded = self.emitters.lower_bound[index]
         return self.light.error_of_object(index) if bounded else math.nan
 
+    def doubts(self, identifiers: Sequence[str]) -> Iterator[str]:
+        """Sentences about what a person should look at; identifiers: of the objects."""
+        if not self.emitters.emissive.any():
+            yield "no emitter was found, so a relit stage will be dark. [shading.no-light]"
+        for i, identifier in enumerate(identifiers):
+            status = self.radiance_status(i)
+            if status == "lowerBound":
+                yield (
+                    f"{identifier}: saturated in every frame, its radiance is only a lower bound. "
+                    "Capture a shorter exposure. [shading.clipped]"
+                )
+            elif status == "estimated":
+                radiance = ", ".join(f"{value:.3g}" for value in self.emitters.radiance[i])
+                yield (
+                    f"{identifier}: saturated in every frame; from the light that it casts its "
+                    f"radiance is {radiance}, +-{100 * self.radiance_error(i):.0f} %. Capture a "
+                    "shorter exposure to measure it. [shading.estimated]"
+                )
+        if self.over_one > _MANY_OVER_ONE:
+            yield (
+                f"{100 * self.over_one:.0f} % of the seen texels have an albedo over 1 and were "
+                "clamped. Check the exposures, or give the missing light as --environment. "
+                "[shading.albedo]"
+            )
+        escaped = float(self.traced.escaped.mean())
+        if escaped > _MOSTLY_OPEN:
+            yield (
+                f"{100 * escaped:.0f} % of the light's directions leave the scan and count as "
+                "black. Give the surroundings as --environment. [shading.open]"
+            )
+
+    def summary(self, identifiers: Sequence[str]) -> dict[str, Any]:
+        """Figures of the whole scene, JSON; identifiers: of the objects."""
+        lamps = [i for i in range(len(identifiers)) if self.emitters.is_lamp[i]]
+        return {
+            "rays_per_texel": float(self.traced.rays.mean()),
+            "standard_error": float(np.median(self.relative_error)),
+            "escaped_fraction": float(self.traced.escaped.mean()),
+            "emitters": [identifiers[i] for i in lamps],
+            "estimated_emitters": {
+                identifiers[i]: self.radiance_error(i)
+                for i in lamps
+                if self.radiance_status(i) == "estimated"
+            },
+            "albedo_over_one": self.over_one,
+        }
+
 
 def shade_surface(
     run: TaskRun,
@@ -109,35 +157,3 @@ def shade_surface(
         albedo=albedo,
         over_one=over_one,
     )
-
-
-def doubts(shaded: Shaded, identifiers: list[str]) -> Iterator[str]:
-    """Sentences about what a person should look at; ``identifiers`` of the objects."""
-    if not shaded.emitters.emissive.any():
-        yield "no emitter was found, so a relit stage will be dark. [shading.no-light]"
-    for i, identifier in enumerate(identifiers):
-        status = shaded.radiance_status(i)
-        if status == "lowerBound":
-            yield (
-                f"{identifier}: saturated in every frame, its radiance is only a lower bound. "
-                "Capture a shorter exposure. [shading.clipped]"
-            )
-        elif status == "estimated":
-            radiance = ", ".join(f"{value:.3g}" for value in shaded.emitters.radiance[i])
-            yield (
-                f"{identifier}: saturated in every frame; from the light that it casts its "
-                f"radiance is {radiance}, +-{100 * shaded.radiance_error(i):.0f} %. Capture a "
-                "shorter exposure to measure it. [shading.estimated]"
-            )
-    if shaded.over_one > _MANY_OVER_ONE:
-        yield (
-            f"{100 * shaded.over_one:.0f} % of the seen texels have an albedo over 1 and were "
-            "clamped. Check the exposures, or give the missing light as --environment. "
-            "[shading.albedo]"
-        )
-    escaped = float(shaded.traced.escaped.mean())
-    if escaped > _MOSTLY_OPEN:
-        yield (
-            f"{100 * escaped:.0f} % of the light's directions leave the scan and count as black. "
-            "Give the surroundings as --environment. [shading.open]"
-        )

@@ -14,13 +14,12 @@ from usdbrdf.asset.layers.material_layer import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
-from usdbrdf.asset.properties import FittedObject
+from usdbrdf.asset.properties import FittedObject, colour
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, survey_frames
-from usdbrdf.material.refine import LightBefore, Shown, means_without_lobes, refined_light
+from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, judged, survey_frames
+from usdbrdf.material.refine import refined_light
 from usdbrdf.material.refined_irradiance import Lobes
-from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
@@ -35,7 +34,10 @@ _READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
     maps = AssetMaps(open_before(asset, "material"))
-    lightmap_filter = _filter_of_shading(asset) if options.method == "views" else NONE
+    # S is refined as it was filtered, if the filter is here too.
+    shading = read_provenance(asset.layer("shading")).get("parameters", {})
+    filtered = options.method == "views" and shading.get("denoise") == OIDN
+    lightmap_filter = chosen_filter(AUTO) if filtered else NONE
     chosen = {k: v for k, v in asdict(options).items() if k not in ("environment", "memory")}
     task = Task(
         asset=asset,
@@ -69,26 +71,12 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
             objects,
             materialx=run.output(materialx) if options.materialx else None,
         )
-        return {"objects": {item.identifier: _summary_row(item) for item in objects}}
+        return {"objects": {item.identifier: item.summary for item in objects}}
 
     return task.run(work)
 
 
-def _filter_of_shading(asset: Asset) -> str:
-    """The lightmap filter of the shading task, if it is here too; else none."""
-    shading = asset.layer("shading")
-    known = shading.is_file() and read_provenance(shading).get("parameters", {})
-    return chosen_filter(AUTO) if known and known.get("denoise") == OIDN else NONE
-
-
 def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool) -> FittedObject:
-    phi, psi = (found.phi, found.phi_error), (found.psi, found.psi_error)
-    prior = class_prior(obj.class_name, obj.label) if seen else NEUTRAL
-    if options.method == "views":
-        verdict = verdict_on_views(phi, psi, found.unresolved, found.evidence, prior, seen)
-    else:
-        keep = options.method == "paper"
-        verdict = verdict_on_frame(phi, found.psi, found.evidence, prior, seen, keep)
     return FittedObject(
         prim_path=obj.prim_path,
         identifier=obj.identifier,
@@ -98,7 +86,7 @@ def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool)
         num_pixels=found.num_samples,
         method=options.method,
         mapping=options.mapping,
-        **vars(verdict),
+        **vars(judged(found, obj, options.method, seen)),
     )
 
 
@@ -112,27 +100,12 @@ def _refined(
     options: FitOptions,
 ) -> list[FittedObject]:
     """The objects with maps of L_d, S and base colour that are free of their specular light."""
-    lobes = Lobes(
-        phi=np.array([item.phi for item in objects], np.float32),
-        psi=np.array([item.psi for item in objects], np.float32),
-    )
+    numbers = [item.phi for item in objects], [item.psi for item in objects]
+    lobes = Lobes(*np.array(numbers, np.float32))
     texels = maps.texels
-    means = means_without_lobes(
-        run,
-        lit,
-        texels,
-        maps.frames,
-        Shown(maps.lit, maps.samples),
-        lobes,
-        options.memory,
-        options.seed,
+    refined = refined_light(
+        run, lit, texels, maps.frames, maps, lobes, lightmap_filter, options.memory, options.seed
     )
-    maps.forget("samples")
-    traced = maps.traced_irradiance if lightmap_filter == OIDN else maps.irradiance
-    before = LightBefore(
-        maps.lit, maps.coverage, maps.emission, maps.emissive, maps.irradiance, traced
-    )
-    refined = refined_light(run, lit, texels, means, before, lobes, lightmap_filter, options.seed)
     written = {
         "diffuse": TexelMap(refined.diffuse, 1.0, "W/(m^2 sr)", exact=True),
         "refined_irradiance": TexelMap(refined.irradiance, 1 / np.pi, "W/m^2"),
@@ -141,30 +114,8 @@ def _refined(
     writer = MapWriter(run, asset, maps.scene, texels)
     with_maps = []
     for i, item in enumerate(objects):
-        own = texels.of_object(i)
-        area = np.maximum(texels.area[own], 1e-12)
-        r, g, b = np.average(refined.base_color[own], axis=0, weights=area)
-        colour = (float(r), float(g), float(b))
-        with_maps.append(replace(item, aovs=writer.write(i, written), mean_color=colour))
+        mean = colour(texels.mean_of_object(i, refined.base_color))
+        with_maps.append(replace(item, aovs=writer.write(i, written), mean_color=mean))
     view = overview(maps.scene, lit.rays, maps.frames)
     view.write(run.output("previews/base_color.png"), texels, refined.base_color, exposure=1)
     return with_maps
-
-
-def _summary_row(item: FittedObject) -> dict[str, Any]:
-    """What the summary says of an object."""
-
-    def rounded(number: float) -> float | None:
-        return round(number, 4) if math.isfinite(number) else None
-
-    return {
-        "phi": round(item.phi, 4),
-        "psi": round(item.psi, 4),
-        "phi_error": rounded(item.phi_error),
-        "psi_error": rounded(item.psi_error),
-        "phi_confidence": item.phi_confidence,
-        "psi_confidence": item.psi_confidence,
-        "status": item.status,
-        "evidence": rounded(item.evidence) or 0.0,
-        "target_frame": item.target_frame,
-    }

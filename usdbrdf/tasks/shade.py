@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,14 @@ from usdbrdf.asset.layers.shading_layer import write_shading_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
-from usdbrdf.asset.properties import Aov, ShadedObject
+from usdbrdf.asset.properties import Aov, ShadedObject, colour
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.model.arrays import Array, Float
+from usdbrdf.model.arrays import Float
 from usdbrdf.options import ShadeOptions
 from usdbrdf.shading.denoise import chosen_filter
 from usdbrdf.shading.lamp_shapes import shapes_of_object
-from usdbrdf.shading.shaded import Shaded, doubts, shade_surface
+from usdbrdf.shading.shaded import Shaded, shade_surface
 from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task
 
@@ -52,9 +53,10 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
-        for doubt in doubts(shaded, [item.identifier for item in objects]):
+        identifiers = [item.identifier for item in objects]
+        for doubt in shaded.doubts(identifiers):
             say(f"warning: {doubt}")
-        return {**_summary(shaded, objects), "denoise": lightmap_filter}
+        return {**shaded.summary(identifiers), "denoise": lightmap_filter}
 
     return task.run(work)
 
@@ -82,20 +84,20 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
 def _record(writer: MapWriter, shaded: Shaded, i: int, aovs: tuple[Aov, ...]) -> ShadedObject:
     obj, own = writer.scene.objects[i], writer.texels.of_object(i)
     emitters, traced = shaded.emitters, shaded.traced
-    area = np.maximum(writer.texels.area[own], 1e-12)
+    mean = partial(writer.texels.mean_of_object, i)
     return ShadedObject(
         prim_path=obj.prim_path,
         identifier=obj.identifier,
         aovs=aovs,
         emitter=bool(emitters.is_lamp[i]),
-        radiance=_colour(emitters.radiance[i]),
+        radiance=colour(emitters.radiance[i]),
         radiance_status=shaded.radiance_status(i),
         radiance_error=shaded.radiance_error(i),
-        area_fraction=float(np.average(emitters.emissive[own], weights=area)),
-        mean_albedo=_colour(np.average(shaded.albedo[own], axis=0, weights=area)),
+        area_fraction=float(mean(emitters.emissive)),
+        mean_albedo=colour(mean(shaded.albedo)),
         rays_per_texel=float(traced.rays[own].mean()),
         standard_error=float(np.median(shaded.relative_error[own])),
-        escaped_fraction=float(np.average(traced.escaped[own], weights=area)),
+        escaped_fraction=float(mean(traced.escaped)),
     )
 
 
@@ -115,24 +117,3 @@ def _write_layers(
     ]
     lights = run.output(f"layers/{asset.lights_layer.name}")
     write_lights_layer(lights, task.draft, lamps, world_from_root(maps.stage))
-
-
-def _summary(shaded: Shaded, objects: list[ShadedObject]) -> dict[str, Any]:
-    emitters = [item for item in objects if item.emitter]
-    return {
-        "rays_per_texel": float(shaded.traced.rays.mean()),
-        "standard_error": float(np.median(shaded.relative_error)),
-        "escaped_fraction": float(shaded.traced.escaped.mean()),
-        "emitters": [item.identifier for item in emitters],
-        "estimated_emitters": {
-            item.identifier: item.radiance_error
-            for item in emitters
-            if item.radiance_status == "estimated"
-        },
-        "albedo_over_one": shaded.over_one,
-    }
-
-
-def _colour(values: Array) -> tuple[float, float, float]:
-    r, g, b = (float(value) for value in values)
-    return r, g, b
