@@ -30,8 +30,7 @@ _FOOTPRINT = 0.7
 
 # Pictures are often smoothed besides. On curved objects, whose highlights that widens, these are
 # tried as well, as long as so many of the samples keep the whole footprint on the object.
-_WIDER = (0.5, 1.0, 1.4, 2.0)
-
+_OTHER_WIDTHS_PX = (0.5, 1.0, 1.4, 2.0)
 _KEPT = 0.4
 
 # How likely each is follows a normal distribution of the logarithm about the width that the
@@ -41,10 +40,8 @@ _SPREAD_OF_WIDTHS = math.log(1.5)
 # From this deviation of the normal over a footprint on, in radians, an object counts as curved.
 _CURVED = 0.01
 
-# Fewer samples do not tell the variances of their errors: with 54 a ring was measured, and off by
-# three times what was stated.
+# Fewer samples do not tell the variances of their errors, and the stated ones are too small.
 MIN_OBSERVATIONS = 100
-
 _MIN_VIEWS = 3
 
 # A frame in which the texel's mean is not this many times the noise floor is left out: there only
@@ -53,11 +50,10 @@ _ABOVE_NOISE = 4.0
 
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
-
 _TIMES_FOR_CURVED = 2
 
 # Frames' errors hang together over about this many pixels.
-_PATCH_PIXELS = 16.0
+_CELL_PIXELS = 16.0
 
 
 def fit_views(
@@ -105,7 +101,7 @@ def _candidates(
 ) -> list[Candidate]:
     """What the lobe would look like with each of the footprints; see ``_likely``."""
     candidates = []
-    for points, width in zip(footprints, (_FOOTPRINT, *_WIDER), strict=False):
+    for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
         # Views of a texel share their random numbers: what they have in common then cancels in
         # their differences, which are all that is fitted.
         first, second, third = [
@@ -138,9 +134,9 @@ def _footprints(
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
-    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_WIDER)}
-    for count in range(len(_WIDER), 0, -1):
-        widths = (_FOOTPRINT, *_WIDER[:count])
+    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_OTHER_WIDTHS_PX)}
+    for count in range(len(_OTHER_WIDTHS_PX), 0, -1):
+        widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX[:count])
         inner = reduce(np.intersect1d, [within[width] for width in widths])
         inner = inner[_several_views(observed.texel[inner])]
         if len(inner) >= max(_KEPT * len(kept), MIN_OBSERVATIONS):
@@ -186,7 +182,7 @@ def _samples(
         position=position,
         radiance=observed.radiance,
         noise=np.hypot(observed.noise[:, None], contrast),
-        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, camera_of),
+        cell=_CELL_PIXELS * _pixel_size(position, observed.frame, camera_of),
     )
 
 

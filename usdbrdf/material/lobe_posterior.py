@@ -13,8 +13,7 @@ from usdbrdf.model.arrays import Double
 _PSI_GRID = np.linspace(0, 1, 201)
 
 # Differences of the cost by this share of the whole are not told apart, however many the samples:
-# on captures with known materials, errors of the model explained 0.2 to 3 % of the cost of objects
-# that show no lobe.
+# errors of the model explain 0.2 to 3 % of the cost of objects that show no lobe.
 _MODEL_DISCREPANCY = 0.01
 
 # How much pictures are smoothed is known badly: a footprint this many times as wide may be the true

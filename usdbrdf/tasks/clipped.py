@@ -20,11 +20,15 @@ from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at
+from usdbrdf.transport.irradiance import (
+    Irradiance,
+    Sampling,
+    independent_tiles,
+    irradiance_at,
+)
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
-from usdbrdf.transport.tile_draws import independent_tiles
 
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
