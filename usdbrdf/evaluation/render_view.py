@@ -56,7 +56,7 @@ def render_view(
     bands = []
     for top in range(0, height, rows):
         pixels = _sub_pixels(width, top, min(top + rows, height), per_side)
-        points = visible_points(seen.lit.rays, seen.lit.scene, camera, pixels)
+        points = visible_points(seen.lit, camera, pixels)
         values = _points_radiance(seen, points, max(1, rays // per_pixel), seed + top)
         bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
     picture = np.concatenate(bands).astype(np.float32)
@@ -81,7 +81,7 @@ def _points_radiance(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: 
     """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
     hit = points.face >= 0
     place = points.face, points.u, points.v
-    lamp = hit & (seen.lit.emission.at(*place)[:, 0] > 0.5)
+    lamp = hit & seen.lit.emits(points)
     values = np.zeros((len(hit), 8), np.float32)
     values[:, :3] = seen.measured.at(*place)
     values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
