@@ -25,6 +25,7 @@ import numpy as np
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_shading
@@ -37,10 +38,10 @@ from usdbrdf.evaluation.truth import (
     true_albedo,
 )
 from usdbrdf.files.frames import read_frame
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.options import Sampling
 from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -54,11 +55,11 @@ def main() -> int:
     parser.add_argument("truth", type=Path)
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--share", type=int, default=24, help="every n-th patch for L_d and S")
+    parser.add_argument("--share", type=int, default=24, help="every n-th tile for L_d and S")
     options = parser.parse_args()
 
     stage = open_measured(Asset.at(options.asset))
-    atlas = atlas_from_stage(stage)
+    atlas = AssetMaps(stage)
     truth = known_objects(options.truth, atlas)
     shines = emitters(atlas, truth)
     owner = atlas.texels.object_index()
@@ -84,29 +85,30 @@ def main() -> int:
     return 0
 
 
-def some_patches(atlas: Atlas, share: int) -> tuple[np.ndarray, np.ndarray]:
-    """Texels of every ``share``-th patch, and their patch numbers."""
-    order, patch = patches_of_texels(atlas.texels)
-    keep = patch % share == 0
-    return order[keep], patch[keep]
+def some_tiles(atlas: AssetMaps, share: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texels of every ``share``-th tile, and their tile numbers."""
+    order, tile = tiles_of_texels(atlas.texels)
+    keep = tile % share == 0
+    return order[keep], tile[keep]
 
 
-def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, float]:
+def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
     """L_d against the exact median of the samples that the streaming median saw."""
     frames = frames_from_stage(atlas.stage)
     scene, texels = atlas.scene, atlas.texels
     rays = RayScene(scene.points, scene.triangles)
-    chosen, _ = some_patches(atlas, share)
+    chosen, _ = some_tiles(atlas, share)
     chosen = chosen[scored[chosen]]
     place = np.full(len(texels), -1)
     place[chosen] = np.arange(len(chosen))
     store: list[list[np.ndarray]] = [[] for _ in chosen]
     for i in range(len(frames)):
         pixels = read_frame(frames, i)
-        pose, lens = frames.world_from_camera[i], frames.intrinsics[i]
-        surfaces = first_surfaces(rays, scene.face_object, pose, lens, frames.resolution[i])
-        picture = Picture(np.nan_to_num(pixels.radiance), pixels.valid, pixels.clipped, pose, lens)
-        kind, radiance = samples_from_frame(texels, texels.object_index(), surfaces, picture)
+        surfaces = first_surfaces(rays, scene.face_object, frames.camera(i))
+        picture = Picture(np.nan_to_num(pixels.radiance), pixels.valid, pixels.clipped)
+        kind, radiance = samples_from_frame(
+            texels, texels.object_index(), surfaces, picture, frames.camera(i)
+        )
         for t in np.flatnonzero((kind == SAMPLE) & (place >= 0)):
             store[place[t]].append(radiance[t])
     exact = np.array([np.median(samples, axis=0) for samples in store])
@@ -117,11 +119,11 @@ def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, flo
     }
 
 
-def irradiance_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, float]:
+def irradiance_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
     """S against a converged S from the same L_d."""
     scene, texels = atlas.scene, atlas.texels
     lit = atlas.map("lit")
-    order, patch = some_patches(atlas, share)
+    order, tile = some_tiles(atlas, share)
     reference = irradiance_at(
         RayScene(scene.points, scene.triangles),
         surface_texture(texels, scene.face_object, lit),
@@ -129,7 +131,7 @@ def irradiance_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, 
         black_environment(),
         texels.position[order],
         texels.normal[order],
-        patch,
+        tile,
         Sampling(standard_error=0.0, max_rays=REFERENCE_RAYS, seed=977),
         float(np.linalg.norm(np.ptp(scene.points, axis=0))),
     ).mean.mean(axis=1)
@@ -142,7 +144,7 @@ def irradiance_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, 
     }
 
 
-def emitter_error(atlas: Atlas, shines: np.ndarray, owner: np.ndarray) -> dict[str, Any]:
+def emitter_error(atlas: AssetMaps, shines: np.ndarray, owner: np.ndarray) -> dict[str, Any]:
     emissive = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
     found = [read_shading(atlas.stage, o.prim_path) for o in atlas.scene.objects]
     lamps = np.array([bool(record and record.emitter) for record in found])

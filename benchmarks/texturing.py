@@ -32,11 +32,11 @@ from measure import figure
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.model.capture import Frames
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.exposures import Probes
 from usdbrdf.texturing.observe import Observation, samples_from_frames
@@ -73,7 +73,7 @@ def main() -> int:
 def measure(asset: Path, most: int | None) -> dict[str, Any]:
     """All figures, of the first ``most`` frames."""
     stage = open_measured(Asset.at(asset))
-    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
     count = min(most or len(frames), len(frames))
     rays = RayScene(atlas.scene.points, atlas.scene.triangles)
     streamed(atlas, rays, frames, nothing(atlas, frames), 2)  # compiles
@@ -120,14 +120,14 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def nothing(atlas: Atlas, frames: Frames) -> Observation:
+def nothing(atlas: AssetMaps, frames: Frames) -> Observation:
     """The state before the first frame."""
     count = len(atlas.texels)
     return Observation.empty(slice(0, count), Probes.empty(count, len(frames)))
 
 
 def streamed(
-    atlas: Atlas, rays: RayScene, frames: Frames, observed: Observation, count: int
+    atlas: AssetMaps, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
     images = read_frames(frames, range(count))
@@ -138,7 +138,7 @@ def streamed(
 
 
 def by_parts(
-    atlas: Atlas, rays: RayScene, frames: Frames, count: int
+    atlas: AssetMaps, rays: RayScene, frames: Frames, count: int
 ) -> tuple[dict[str, float], list[tuple[np.ndarray, np.ndarray]]]:
     """CPU seconds of each part, one after the other; and every frame's texels and radiances."""
     spent: dict[str, float] = defaultdict(float)
@@ -154,18 +154,19 @@ def by_parts(
     observed = nothing(atlas, frames)
     samples = []
     for i in range(count):
-        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
+        camera = frames.camera(i)
         pixels = timed("read", read_frame, frames, i)
-        which = timed("cull", blocks.texels_in_view, pose, lens, size, MIN_COSINE)
+        which = timed("cull", blocks.texels_in_view, camera, MIN_COSINE)
         face_object = atlas.scene.face_object
-        surfaces = timed("occlusion", first_surfaces, rays, face_object, pose, lens, size)
+        surfaces = timed("occlusion", first_surfaces, rays, face_object, camera)
         kind, radiance = timed(
             "sample",
             functools.partial(samples_from_frame, which=which),
             texels,
             owner,
             surfaces,
-            Picture(pixels.radiance, pixels.valid, pixels.clipped, pose, lens),
+            Picture(pixels.radiance, pixels.valid, pixels.clipped),
+            camera,
         )
         taken = which[kind == SAMPLE], radiance[kind == SAMPLE]
         timed("psquare", psquare.update, observed.quantiles, *taken, QUANTILE)

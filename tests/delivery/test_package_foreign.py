@@ -10,12 +10,13 @@ import OpenImageIO as oiio
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.asset.readers.surfaces import surfaces_from_stage
 from usdbrdf.cli import main
 from usdbrdf.delivery.flat_stage import stage_in_look
-from usdbrdf.delivery.package import PackageOptions, package
+from usdbrdf.delivery.package import package
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_exr, read_radiance
+from usdbrdf.options import PackageOptions
 from usdbrdf.validation.standard import standard_findings
 
 LAMP = "/room/prop/lamp"
@@ -92,7 +93,7 @@ def prop(room):
 
 
 def material_of(stage):
-    (lamp,) = (s for s in published_surfaces(stage, TIME, pytest.fail) if s.name == LAMP)
+    (lamp,) = (s for s in surfaces_from_stage(stage, TIME, pytest.fail) if s.name == LAMP)
     return lamp.material
 
 

@@ -12,9 +12,10 @@ from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, estimates, quad, room, world_of
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import unwrap
+from usdbrdf.options import Sampling
 from usdbrdf.shading.albedo import albedo_from_irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 
 RHO = np.array([0.2, 0.5, 0.8])
 EMITTED = np.array([1.0, 0.5, 0.25])
@@ -37,10 +38,10 @@ def _somewhere_bright(world: World) -> np.ndarray:
 
 
 def _shade(world: World, lights: np.ndarray, estimator: str, rays: int) -> Irradiance:
-    order, patch = patches_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     found = irradiance_at(
         world.rays, world.texture(_lit(world)), world.lights(lights), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch,
+        world.texels.position[order], world.texels.normal[order], tile,
         Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=1), world.size,
     )  # fmt: skip
     back = np.argsort(order)
@@ -75,11 +76,11 @@ def test_no_ray_leaves_a_closed_room_with_real_charts():
     uv, resolution = unwrap(scene, 0.07)
     scene = replace(scene, corner_uv=uv)
     world = World(scene=scene, texels=texels_from_atlas(scene, resolution))
-    order, patch = patches_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     ones = np.ones((len(order), 3), np.float32)
     found = irradiance_at(
         world.rays, world.texture(ones), world.lights(ones), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch,
+        world.texels.position[order], world.texels.normal[order], tile,
         Sampling(standard_error=0.0, max_rays=64), world.size,
     )  # fmt: skip
     leaks = found.escaped > 0

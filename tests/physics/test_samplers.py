@@ -18,8 +18,8 @@ from usdbrdf.transport.brdf import distribution, half_vector, reflected_density,
 from usdbrdf.transport.warps import (
     cosine_direction,
     hashed_uniform,
-    patch_shifts,
-    sobol_points,
+    shifts_of,
+    sobol_bits,
     tangent_frame,
     triangle_point,
 )
@@ -229,20 +229,20 @@ def test_the_first_number_of_all_is_no_special_one():
     assert len({hashed_uniform(s, i, d) for s in (0, 1) for i in (0, 1) for d in (0, 1)}) == 8
 
 
-def test_shifts_of_different_seeds_and_patches_differ():
-    first, second = patch_shifts(50, 5, 1), patch_shifts(50, 5, 2)
+def test_shifts_of_different_seeds_and_numbers_differ():
+    first, second = shifts_of(np.arange(50), 5, 1), shifts_of(np.arange(50), 5, 2)
     assert len(np.unique(np.concatenate([first, second]))) == 500
-    np.testing.assert_array_equal(first, patch_shifts(50, 5, 1))
-    counts = np.histogram(patch_shifts(4000, 5, 3), 100, (0, 1))[0]
+    np.testing.assert_array_equal(first, shifts_of(np.arange(50), 5, 1))
+    counts = np.histogram(shifts_of(np.arange(4000), 5, 3), 100, (0, 1))[0]
     assert_distributed([chi_square_p(counts, np.full(100, 200.0))])
 
 
-def test_sobol_points_stratify_every_pair_of_dimensions():
+def test_sobol_points_stratify_both_dimensions_and_their_pair():
     # A (t, m, s)-net: 2^10 points put one point into each of 1024 intervals in every dimension,
     # and at most a few into each cell of a 32 x 32 grid.
-    points = sobol_points(10, 5)
-    assert points.shape == (1024, 5)
-    for d in range(5):
+    points = sobol_bits(10) * 2.0**-32
+    assert points.shape == (1024, 2)
+    for d in range(2):
         assert (np.bincount((points[:, d] * 1024).astype(int)) == 1).all()
     cells = np.histogram2d(points[:, 0], points[:, 1], bins=32, range=[[0, 1], [0, 1]])[0]
     assert (cells == 1).all()

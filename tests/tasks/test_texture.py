@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 import usdbrdf
 from tests.scenes import make_capture, ring_of_poses, write_ply
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import SceneObject
-from usdbrdf.tasks import texture as module
-from usdbrdf.tasks.atlas import MapWriter, TexelMap
+from usdbrdf.texturing import lit_texture as module
+from usdbrdf.texturing.lit_texture import LitTexture
 
 OPTIONS = usdbrdf.TextureOptions(texel_size=0.2)
 
@@ -37,14 +41,18 @@ def test_faces_wound_away_from_all_cameras_are_refused(tmp_path):
     assert not (tmp_path / "asset" / "textures").exists()
 
 
-def test_a_capture_that_shows_little_of_the_mesh_is_warned_about(capsys):
-    seen = np.arange(100) < 9
-    module._check_seen(seen, ~seen)
-    assert "91.0 % of the texels" in capsys.readouterr().err
-    module._check_seen(~seen, seen)
-    assert capsys.readouterr().err == ""
-    with pytest.raises(InputRefused, match="unseen"):
-        module._check_seen(np.zeros(3, bool), np.zeros(3, bool))
+def _texture_of(coverage: CoverageMap) -> LitTexture:
+    nothing = np.zeros((len(coverage.kind), 3), np.float32)
+    return LitTexture(
+        lit=nothing, mean=nothing, spread=nothing, samples=nothing[:, 0], coverage=coverage
+    )
+
+
+def test_a_capture_that_shows_little_of_the_mesh_is_warned_about():
+    some = np.arange(100) < 9
+    (doubt,) = _texture_of(CoverageMap.of(some, ~some)).doubts()
+    assert "91.0 % of the texels" in doubt
+    assert not [*_texture_of(CoverageMap.of(~some, some)).doubts()]
 
 
 def test_passes_for_lack_of_memory_change_no_byte(tmp_path, monkeypatch, capsys):
@@ -83,29 +91,19 @@ class _Picture:
         return values.reshape(2, 4, 3)
 
 
-def test_large_values_are_kept_where_they_matter_and_counted_where_not(tmp_path, capsys):
-    values = np.full((8, 3), 0.5, np.float32)
-    values[3] = (70_001, 1, 70_003)
-    writer = MapWriter(StageRun(tmp_path, "texture", tmp_path / "work"), Asset(tmp_path, "a"),
-                       _Picture())  # fmt: skip
+@pytest.mark.parametrize(("unit", "stored"), [(1.0, "half"), (1e5, "float"), (1e-7, "float")])
+def test_maps_keep_their_digits_whatever_the_unit(tmp_path, unit, stored):
+    values = np.float32(unit) * np.random.default_rng(3).lognormal(-2, 1, (8, 3)).astype(np.float32)
+    values[5] = 0
     obj = SceneObject(
         prim_path="/a/box", identifier="box", label="", class_name="", first_face=0, num_faces=1
     )
-    writer.warn()
-    assert capsys.readouterr().err == ""
-    maps = {
-        "lit": TexelMap(values, 1.0, "W/(m^2 sr)", exact=True),
-        "mean": TexelMap(values, 1.0, "W/(m^2 sr)"),
-    }
-    lit, mean = writer.write(0, obj, maps)
-    np.testing.assert_array_equal(read_exr(writer.run.output(lit.file)).reshape(8, 3), values)
-    assert read_exr(writer.run.output(mean.file)).max() == 65_504
-    assert writer.clamped == 2
-    writer.warn()
-    printed = capsys.readouterr().err
-    assert printed.count("[image.clamped]") == 1
-    assert "2 values" in printed
-    assert "unit" in printed
+    run = TaskRun(tmp_path, "texture", tmp_path / "work")
+    writer = MapWriter(run, Asset(tmp_path, "a"), SimpleNamespace(objects=[obj]), _Picture())
+    (lit,) = writer.write(0, {"lit": TexelMap(values, 1.0, "W/(m^2 sr)")})
+    file = writer.run.output(lit.file)
+    np.testing.assert_allclose(read_exr(file).reshape(8, 3), values, rtol=5e-4)
+    assert str(oiio.ImageInput.open(str(file)).spec().format) == stored
 
 
 def test_a_capture_near_the_end_of_half_floats_keeps_its_lit_map(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import posixpath
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from pxr import Sdf, Tf
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import identifier_from
 
-# The layers that the stages write, weakest first; each sees only those before it.
+# The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
 
 
@@ -61,13 +62,19 @@ class Asset:
         return self.folder / "layers" / "materialx.usda"
 
     def layer(self, role: str) -> Path:
-        """Path of a stage's layer; ``role`` is one of ``ROLES``."""
+        """Path of a task's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
         return self.folder / "layers" / f"{role}{suffix[role]}"
 
     def texture(self, identifier: str, aov: str) -> str:
         """Path of an object's map, relative to the asset folder."""
         return f"textures/{identifier}.{aov}.exr"
+
+    def textures(self, *aovs: str) -> list[Path]:
+        """All objects' maps of these AOVs that are there, in the order of their names."""
+        endings = tuple(f".{aov}.exr" for aov in aovs)
+        files = (self.folder / "textures").glob("*.exr")
+        return sorted(file for file in files if endings and file.name.endswith(endings))
 
 
 def is_storable(path: Path) -> bool:
@@ -77,6 +84,27 @@ def is_storable(path: Path) -> bool:
     except (Tf.ErrorException, UnicodeEncodeError):
         return False
     return ":SDF_FORMAT_ARGS:" not in str(path)
+
+
+def relative_path(target: Path, folder: Path) -> str:
+    """Path from ``folder`` to a file, anchored and with forward slashes.
+
+    Folders are resolved first: ``..`` above a symbolic link would lead elsewhere. The file itself
+    may be a link and stays one.
+    """
+    target = Path(os.path.realpath(target.parent)) / target.name
+    relative = os.path.relpath(target, os.path.realpath(folder)).replace(os.sep, "/")
+    return relative if relative.startswith("../") else f"./{relative}"
+
+
+def storable_path(target: Path, folder: Path) -> str:
+    """The same; refuses names that USD cannot hold."""
+    if not is_storable(target):
+        raise InputRefused(
+            f"{str(target)!r}: the name holds characters that USD cannot store in a path. "
+            "Rename the file. [stage.asset_path]"
+        )
+    return relative_path(target, folder)
 
 
 def path_in_layer(asset_relative: str) -> str:

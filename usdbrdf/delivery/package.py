@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,7 +12,7 @@ from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.surfaces import paths_of, published_surfaces
+from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.flat_stage import (
     fit_for_arkit,
     flattened,
@@ -36,23 +35,12 @@ from usdbrdf.delivery.usdz import write_usdz
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.progress import say
+from usdbrdf.options import PackageOptions
 from usdbrdf.relighting.insert import turned_up
 
 USDZ, GLB = ".usdz", ".glb"
 
-DEFAULT, ARKIT = "default", "arkit"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PackageOptions:
-    """textures "exr" or "png"; None: exr, but png in .glb and for ARKit, which take nothing else.
-    max_size: pixels of a texture's longer side; look: which of the asset's, None: the one that it
-    opens in; profile: "default", or "arkit" for AR Quick Look."""
-
-    textures: str | None = None
-    max_size: int | None = None
-    look: str | None = None
-    profile: str = DEFAULT
+ARKIT = "arkit"
 
 
 def package(folder: Path, output: Path, options: PackageOptions | None = None) -> dict[str, Any]:
@@ -108,7 +96,7 @@ def _write_glb(
     subject = asset.root_layer
     if lights := lights_of(flat):
         _warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
-    surfaces = [s.moved(turn) for s in published_surfaces(flat, time, _warn, subject)]
+    surfaces = [s.moved(turn) for s in surfaces_from_stage(flat, time, _warn, subject)]
     return write_glb(output, surfaces, textures.max_size, _warn)
 
 
@@ -150,8 +138,6 @@ def _texture_options(output: Path, folder: Path, options: PackageOptions) -> Pic
             f"--textures exr: {'ARKit' if suffix == USDZ else 'glTF'} knows PNG and JPEG only. "
             "[package.textures]"
         )
-    if options.max_size is not None and options.max_size < 1:
-        raise UsageError("--max-size: must be at least 1. [usage.option]")
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")
     if output.resolve().is_relative_to(folder.resolve()):

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit, write_pictures
@@ -14,7 +15,6 @@ from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 from usdbrdf.job.progress import say
-from usdbrdf.tasks.atlas import Atlas
 
 DOCUMENT = "comparison.json"
 
@@ -88,7 +88,7 @@ def _percent(value: float | None) -> str:
     return "unknown" if value is None else f"{100 * value:.2f} %"
 
 
-def _in_both(a: Atlas, b: Atlas, maps: MapNames) -> bool:
+def _in_both(a: AssetMaps, b: AssetMaps, maps: MapNames) -> bool:
     return all(x.has(name) for x in (a, b) for name in vars(maps).values())
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.previews import camera_hits
 from usdbrdf.evaluation.correspondence import Correspondence, correspondence
 from usdbrdf.evaluation.metrics import exposure_of, finite, median_relative, nrmse
 from usdbrdf.evaluation.pictures import magma, sheet
@@ -16,8 +18,6 @@ from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Byte, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.tasks.atlas import Atlas
-from usdbrdf.tasks.preview import camera_hits
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
@@ -36,7 +36,7 @@ class Relit:
     """On the texels of one asset, (T, 3) each: its radiance, the radiance predicted with the other
     asset's albedo, both albedos; the texels that are compared, (T,) bool."""
 
-    atlas: Atlas
+    atlas: AssetMaps
     measured: Float
     predicted: Float
     albedo: Float
@@ -44,7 +44,7 @@ class Relit:
     scored: Bool
 
 
-def matched(atlas: Atlas, other: Atlas) -> tuple[Correspondence, Bool]:
+def matched(atlas: AssetMaps, other: AssetMaps) -> tuple[Correspondence, Bool]:
     """The other asset's texels on those of ``atlas``, and which are compared: (T,) bool, seen at
     least three times, inside a triangle and without emission, in both."""
     same = correspondence(atlas.scene, atlas.texels, other.scene, other.texels)
@@ -52,7 +52,9 @@ def matched(atlas: Atlas, other: Atlas) -> tuple[Correspondence, Bool]:
     return same, _comparable(atlas) & there & same.known()
 
 
-def relit(atlas: Atlas, other: Atlas, same: Correspondence, scored: Bool, maps: MapNames) -> Relit:
+def relit(
+    atlas: AssetMaps, other: AssetMaps, same: Correspondence, scored: Bool, maps: MapNames
+) -> Relit:
     """Predict the radiance of ``atlas`` with the albedo of ``other``."""
     theirs = same.interpolated(other.map_where_present(maps.albedo, 3))
     measured = atlas.map_where_present(maps.radiance, 3)
@@ -79,7 +81,7 @@ def errors(reference: Float, values: Float, area: Float, part: Bool) -> dict[str
     }
 
 
-def _comparable(atlas: Atlas) -> Bool:
+def _comparable(atlas: AssetMaps) -> Bool:
     seen = atlas.map("samples")[:, 0] >= MIN_SAMPLES
     emits = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
     return np.asarray(seen & ~emits & atlas.texels.interior, np.bool_)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from usdbrdf.model.arrays import Bool, Double, Float
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
-from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # Surface points of a picture at once: what bounds the memory.
@@ -43,28 +44,19 @@ class RenderedView:
 
 
 def render_view(
-    seen: ViewedAsset,
-    world_from_camera: Double,
-    intrinsics: Double,
-    size: tuple[int, int],
-    *,
-    per_side: int,
-    rays: int,
-    seed: int,
+    seen: ViewedAsset, camera: Camera, *, per_side: int, rays: int, seed: int
 ) -> RenderedView:
-    """One picture of ``size`` (width, height), box-filtered over ``per_side``^2 points per pixel.
+    """The camera's picture, box-filtered over ``per_side``^2 points per pixel.
 
     rays  traced per pixel for I_nd, shared among its points
     """
-    width, height = size
+    width, height = camera.width, camera.height
     per_pixel = per_side**2
     rows = max(1, _POINTS_AT_ONCE // (width * per_pixel))
     bands = []
     for top in range(0, height, rows):
         pixels = _sub_pixels(width, top, min(top + rows, height), per_side)
-        points = visible_points(
-            seen.lit.rays, seen.lit.scene, world_from_camera, intrinsics, pixels
-        )
+        points = visible_points(seen.lit, camera, pixels)
         values = _points_radiance(seen, points, max(1, rays // per_pixel), seed + top)
         bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
     picture = np.concatenate(bands).astype(np.float32)
@@ -89,7 +81,7 @@ def _points_radiance(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: 
     """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
     hit = points.face >= 0
     place = points.face, points.u, points.v
-    lamp = hit & (seen.lit.emission.at(*place)[:, 0] > 0.5)
+    lamp = hit & seen.lit.emits(points)
     values = np.zeros((len(hit), 8), np.float32)
     values[:, :3] = seen.measured.at(*place)
     values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
@@ -98,7 +90,7 @@ def _points_radiance(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: 
     known = np.isfinite(seen.phi) & np.isfinite(seen.psi)
     reflects = np.flatnonzero(hit & ~lamp & known[owner])
     owner = owner[reflects]
-    values[reflects, 3:6] += non_diffuse_radiance(
+    values[reflects, 3:6] += lobe_radiance(
         seen.lit, points.take(reflects), seen.phi[owner], seen.psi[owner], rays, seed
     )
     return values

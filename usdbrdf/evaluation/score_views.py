@@ -107,9 +107,8 @@ def _batches(
 def _score(seen: ViewedAsset, views: Views, i: int, exposure: float, quality: Quality) -> _Scored:
     frames = views.frames
     pixels = read_frame(frames, i)
-    width, height = (int(n) for n in frames.resolution[i])
     rendered = render_view(
-        seen, frames.world_from_camera[i], frames.intrinsics[i], (width, height),
+        seen, frames.camera(i),
         per_side=quality.per_side, rays=quality.rays, seed=quality.seed + (i << 16),
     )  # fmt: skip
     counted = pixels.valid & rendered.surface

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.material.lobe_posterior import (
     NOTHING_KNOWN,
     LobeEstimate,
@@ -20,13 +21,14 @@ from usdbrdf.material.lobe_posterior import (
 from usdbrdf.material.verdict import SOME_EVIDENCE
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.transport.lobe_samples import Basis
+from usdbrdf.transport.lobe_radiance import Basis
 
 Pair = tuple[Float, Float]
 
 # Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
 # many with rays of their own.
-_NOISY, _REPEATS = 0.5, 4
+_NOISY = calibration.number("fit.noisy_rays")
+_REPEATS = 4
 
 
 def error_of_rays(

@@ -9,56 +9,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import reduce
 
 import numpy as np
-import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
 from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, View, sub_pixel_points
-from usdbrdf.transport.lobe_samples import Mixture, lobe_basis
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
+from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
-# A sample spreads over the pixels, by this many of standard deviation: half a pixel for a camera's
-# own blur, 0.4 for bilinear reading, 0.3 for the pixel's area.
-_FOOTPRINT = 0.7
+_FOOTPRINT = calibration.number("fit.footprint")
 
-# Pictures are often smoothed besides. On curved objects, whose highlights that widens, these are
-# tried as well, as long as so many of the samples keep the whole footprint on the object.
-_WIDER = (0.5, 1.0, 1.4, 2.0)
+_OTHER_WIDTHS_PX = calibration.numbers("fit.wider_footprints")
 
-_KEPT = 0.4
+_KEPT = calibration.number("fit.kept_in_footprint")
 
-# How likely each is follows a normal distribution of the logarithm about the width that the
-# pictures' noise tells: what smooths noise may leave bright highlights sharper.
-_SPREAD_OF_WIDTHS = math.log(1.5)
+_SPREAD_OF_WIDTHS = math.log(calibration.number("fit.spread_of_footprints"))
 
-# From this deviation of the normal over a footprint on, in radians, an object counts as curved.
-_CURVED = 0.01
+_CURVED = calibration.number("fit.curved_from")
 
-# Fewer samples do not tell the variances of their errors: with 54 a ring was measured, and off by
-# three times what was stated.
-MIN_OBSERVATIONS = 100
+MIN_OBSERVATIONS = calibration.count("fit.min_observations")
 
-_MIN_VIEWS = 3
+_MIN_VIEWS = calibration.count("fit.min_views")
 
-# A frame in which the texel's mean is not this many times the noise floor is left out: there only
-# the brighter samples would be valid.
-_ABOVE_NOISE = 4.0
+_ABOVE_NOISE = calibration.number("fit.above_noise")
 
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
-
 _TIMES_FOR_CURVED = 2
 
-# Frames' errors hang together over about this many pixels.
-_PATCH_PIXELS = 16.0
+_CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 
 def fit_views(
@@ -66,28 +53,28 @@ def fit_views(
     texels: Texels,
     observed: Observations,
     smoothing: float,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
     seed: int,
     mixture: Mixture = MIXTURE,
 ) -> tuple[LobeEstimate | None, int]:
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
-    smoothing: of the pictures, in pixels, see ``smoothing_of``. view_of(frame) gives poses and
-    pinholes; the images themselves are not needed any more.
+    smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
+    themselves are not needed.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
     fifteen times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
         return None, 0
-    observed, footprints = _footprints(lit, texels, observed, view_of, index)
+    observed, footprints = _footprints(lit, texels, observed, camera_of, index)
     if len(observed.texel) < MIN_OBSERVATIONS:
         return None, len(observed.texel)
-    samples = _samples(lit, texels, observed, footprints[0], view_of)
+    samples = _samples(lit, texels, observed, footprints[0], camera_of)
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
-        mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
+        mixture = mixture._replace(per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
         candidates = _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
@@ -106,7 +93,7 @@ def _candidates(
 ) -> list[Candidate]:
     """What the lobe would look like with each of the footprints; see ``_likely``."""
     candidates = []
-    for points, width in zip(footprints, (_FOOTPRINT, *_WIDER), strict=False):
+    for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
         # Views of a texel share their random numbers: what they have in common then cancels in
         # their differences, which are all that is fitted.
         first, second, third = [
@@ -124,24 +111,24 @@ def _footprints(
     lit: LitScene,
     texels: Texels,
     observed: Observations,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
 ) -> tuple[Observations, list[SurfacePoints]]:
     """The observations whose footprint lies on the object as a whole, of texels that several frames
     see; and the footprints' points, for the usual width and, on curved objects, for others."""
 
     def whole(some: Observations, width: float) -> tuple[Long, SurfacePoints]:
-        kept, points = _points(lit, texels, some, view_of, index, width * RINGS)
+        kept, points = _points(lit, texels, some, camera_of, index, width * RINGS)
         enough = _several_views(some.texel[kept])
         return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(RINGS))))
 
-    kept, points = whole(observed, _width(texels, observed, view_of))
+    kept, points = whole(observed, _width(texels, observed, camera_of))
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
-    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_WIDER)}
-    for count in range(len(_WIDER), 0, -1):
-        widths = (_FOOTPRINT, *_WIDER[:count])
+    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_OTHER_WIDTHS_PX)}
+    for count in range(len(_OTHER_WIDTHS_PX), 0, -1):
+        widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX[:count])
         inner = reduce(np.intersect1d, [within[width] for width in widths])
         inner = inner[_several_views(observed.texel[inner])]
         if len(inner) >= max(_KEPT * len(kept), MIN_OBSERVATIONS):
@@ -159,12 +146,12 @@ def _likely(width: float, smoothing: float) -> float:
     return math.exp(-0.5 * (math.log(width / expected) / _SPREAD_OF_WIDTHS) ** 2)
 
 
-def _width(texels: Texels, observed: Observations, view_of: Callable[[int], View]) -> float:
+def _width(texels: Texels, observed: Observations, camera_of: Callable[[int], Camera]) -> float:
     """Standard deviation of what the samples spread over, in pixels: the footprint of a single
     texel's, and the square that others are the mean of."""
     if observed.side[0] <= 1:
         return _FOOTPRINT
-    pixel = _pixel_size(texels.position[observed.texel], observed.frame, view_of)
+    pixel = _pixel_size(texels.position[observed.texel], observed.frame, camera_of)
     square = observed.side[0] * math.sqrt(float(np.median(texels.area[observed.texel])) / 12)
     return math.hypot(_FOOTPRINT, square / pixel)
 
@@ -174,7 +161,7 @@ def _samples(
     texels: Texels,
     observed: Observations,
     points: SurfacePoints,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
 ) -> ViewSamples:
     position = texels.position[observed.texel]
     # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
@@ -187,7 +174,7 @@ def _samples(
         position=position,
         radiance=observed.radiance,
         noise=np.hypot(observed.noise[:, None], contrast),
-        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, view_of),
+        cell=_CELL_PIXELS * _pixel_size(position, observed.frame, camera_of),
     )
 
 
@@ -206,13 +193,13 @@ def _several_views(texel: Int) -> Bool:
     return np.asarray(np.bincount(number)[number] >= _MIN_VIEWS, np.bool_)
 
 
-def _pixel_size(position: Float, frame: Int, view_of: Callable[[int], View]) -> float:
+def _pixel_size(position: Float, frame: Int, camera_of: Callable[[int], Camera]) -> float:
     """Median size of a pixel on the surface, in metres."""
     sizes = []
     for number in np.unique(frame):
-        view = view_of(int(number))
-        distance = np.linalg.norm(position[frame == number] - view.world_from_camera[:3, 3], axis=1)
-        sizes.append(distance / view.intrinsics[0])
+        camera = camera_of(int(number))
+        distance = np.linalg.norm(position[frame == number] - camera.eye, axis=1)
+        sizes.append(distance / camera.intrinsics[0])
     return float(np.median(np.concatenate(sizes)))
 
 
@@ -227,7 +214,7 @@ def _points(
     lit: LitScene,
     texels: Texels,
     observed: Observations,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
     offsets: Double,
 ) -> tuple[Long, SurfacePoints]:
@@ -236,21 +223,12 @@ def _points(
     kept, parts = [], []
     for frame in np.unique(observed.frame):
         which = np.flatnonzero(observed.frame == frame)
-        view = view_of(int(frame))
-        pixels = _project(texels.position[observed.texel[which]], view)
-        whole, points = sub_pixel_points(lit, view, pixels, index, offsets)
+        camera = camera_of(int(frame))
+        pixels = camera.project(texels.position[observed.texel[which]])
+        whole, points = sub_pixel_points(lit, camera, pixels, index, offsets)
         kept.append(which[whole])
         parts.append(points)
     unordered = np.concatenate(kept)
     order = np.argsort(unordered, kind="stable")
     each = (len(offsets) * order[:, None] + np.arange(len(offsets))).ravel()
     return unordered[order], SurfacePoints.joined(parts).take(each)
-
-
-def _project(position: Float, view: View) -> npt.NDArray[np.float64]:
-    """Pixel coordinates (P, 2) of world points (P, 3)."""
-    camera_from_world = np.linalg.inv(view.world_from_camera)
-    in_camera = position @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    fx, fy, cx, cy = view.intrinsics
-    depth = -in_camera[:, 2]
-    return np.stack([cx + fx * in_camera[:, 0] / depth, cy - fy * in_camera[:, 1] / depth], axis=-1)

@@ -12,30 +12,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
 from usdbrdf.transport.lit_scene import LitScene, View, visible_points
 from usdbrdf.transport.rays import lift_from_surface
-from usdbrdf.transport.warps import patch_shifts
+from usdbrdf.transport.warps import shifts_of
 
 # Side of the squares in texels, which are about as large as pixels.
 SIDE = 4.0
 
-# Normals this far apart, as a cosine, do not count as one plane's: 0.02 radians.
-_FLAT = 0.9998
+_FLAT = calibration.number("observations.flat_cosine")
 
-# An object is seen in squares if so many of its texels have one, and these are no wider than this
-# share of the scene: from within it a few hundredths of a radian.
-_MOST, _WIDEST = 0.5, 0.02
+_MOST = calibration.number("observations.squares_share")
+_WIDEST = calibration.number("observations.widest_square")
 
 
-def sides_of_samples(texels: Texels, usable: Bool, scene_size: float) -> tuple[Float, Bool]:
+def sides_of_samples(texels: Texels, usable: Bool, diagonal_m: float) -> tuple[Float, Bool]:
     """The side of what samples of each object average, (num_objects,), in texels: SIDE or 1; and
-    which of the ``usable`` texels (T,) have so much surface around them. scene_size in metres."""
+    which of the ``usable`` texels (T,) have so much surface around them. diagonal_m in metres."""
     owner = texels.object_index()
     objects = len(texels.resolution)
-    small = SIDE * np.sqrt(texels.area) <= _WIDEST * scene_size
+    small = SIDE * np.sqrt(texels.area) <= _WIDEST * diagonal_m
     flat = usable & small & on_flat_squares(texels, round(SIDE) // 2)
     share = np.bincount(owner, flat, objects) / np.maximum(np.bincount(owner, usable, objects), 1)
     in_squares = share >= _MOST
@@ -58,38 +57,36 @@ def on_flat_squares(texels: Texels, reach: int) -> Bool:
     return flat
 
 
-# The noise is looked at in tiles of so many pixels that show one object alone, so many per frame.
-_TILE, _TILES = 24, 60
+# The noise is looked at in windows of so many pixels that show one object alone, so many per frame.
+_WINDOW, _WINDOWS = 24, 60
 
-_FEWEST_TILES = 30
+_FEWEST_WINDOWS = calibration.count("observations.noise.min_tiles")
 
 _LAGS = 3
 
-# Errors of the model hang together a little too: less than this at neighbouring pixels is nothing,
-# and what hangs together farther than any smoothing, in pixels, is structure of the surface.
-_WHITE = 0.05
+_WHITE = calibration.number("observations.noise.white")
 
-_WIDEST_BLUR = 3.0
+_WIDEST_BLUR = calibration.number("observations.noise.widest_blur")
 
 
 def noise_correlation(lit: LitScene, view: View) -> Double:
-    """(N, 3): of N tiles of a frame, the correlation of its relative deviation from L_d between
+    """(N, 3): of N windows of a frame, the correlation of its relative deviation from L_d between
     pixels 1, 2 and 3 apart."""
     height, width = view.valid.shape
     corners = [
         (row, column)
-        for row in range(0, height - _TILE + 1, _TILE)
-        for column in range(0, width - _TILE + 1, _TILE)
-        if view.valid[row : row + _TILE, column : column + _TILE].all()
+        for row in range(0, height - _WINDOW + 1, _WINDOW)
+        for column in range(0, width - _WINDOW + 1, _WINDOW)
+        if view.valid[row : row + _WINDOW, column : column + _WINDOW].all()
     ]
-    chosen = np.linspace(0, len(corners) - 1, min(_TILES, len(corners))).round().astype(int)
+    chosen = np.linspace(0, len(corners) - 1, min(_WINDOWS, len(corners))).round().astype(int)
     if not len(chosen):
         return np.zeros((0, _LAGS))
-    within = np.moveaxis(np.indices((_TILE, _TILE)), 0, -1)
+    within = np.moveaxis(np.indices((_WINDOW, _WINDOW)), 0, -1)
     place = np.array(corners)[chosen][:, None, None] + within
     pixels = place[..., ::-1].reshape(-1, 2) + 0.5
-    seen = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, pixels)
-    diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _TILE, _TILE, 3)
+    seen = visible_points(lit, view.camera, pixels)
+    diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _WINDOW, _WINDOW, 3)
     owner = lit.owner(seen.face).reshape(len(chosen), -1)
     alone = (owner[:, 0] >= 0) & (owner == owner[:, :1]).all(axis=1)
     alone &= (diffuse > 0).all(axis=(1, 2, 3))
@@ -97,9 +94,9 @@ def noise_correlation(lit: LitScene, view: View) -> Double:
     return correlations((shown / diffuse[alone]).mean(axis=-1, dtype=np.float64))
 
 
-def correlations(tiles: Double) -> Double:
-    """(N, 3) correlation between pixels 1, 2 and 3 apart in tiles (N, H, W)."""
-    rest = tiles - tiles.mean(axis=(1, 2), keepdims=True)
+def correlations(windows: Double) -> Double:
+    """(N, 3) correlation between pixels 1, 2 and 3 apart in windows (N, H, W)."""
+    rest = windows - windows.mean(axis=(1, 2), keepdims=True)
     power = np.maximum((rest**2).mean(axis=(1, 2)), 1e-30)
     each = [
         (rest[:, lag:] * rest[:, :-lag]).mean(axis=(1, 2))
@@ -110,16 +107,16 @@ def correlations(tiles: Double) -> Double:
     return found
 
 
-def smoothing_of(tiles: Sequence[Double]) -> float:
+def smoothing_of(windows: Sequence[Double]) -> float:
     """Standard deviation in pixels of what smoothed the pictures, 0 if nothing did, NaN if they do
     not tell.
 
     White noise that a normal distribution of standard deviation s has smoothed correlates as
     exp(-d^2 / (4 s^2)) over a distance d. White noise that came on top, later, lessens all alike:
-    so the ratio of two correlations tells s. tiles: ``noise_correlation`` of frames.
+    so the ratio of two correlations tells s. windows: ``noise_correlation`` of frames.
     """
-    every = np.concatenate([np.zeros((0, _LAGS)), *tiles])
-    if len(every) < _FEWEST_TILES:
+    every = np.concatenate([np.zeros((0, _LAGS)), *windows])
+    if len(every) < _FEWEST_WINDOWS:
         return math.nan
     first, _, last = np.median(every, axis=0)
     if first < _WHITE:
@@ -132,22 +129,20 @@ def smoothing_of(tiles: Sequence[Double]) -> float:
 
 # Followed per object, kept per object, and views kept per texel.
 _FOLLOWED = 3000
-
 _KEPT = 200
-
 _VIEWS = 12
 
-_MIN_VIEWS = 3
+_MIN_VIEWS = calibration.count("observations.min_views")
 
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
 # whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
 _MAX_CELLS = 12_000_000
-
 _FEWEST = 40
 
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
-_PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
+_PROXY_RAYS = 4
+_PROXY_ALPHA = calibration.number("observations.proxy_alpha")
 
 # How far pictures were smoothed is measured on about so many frames.
 _FRAMES_OF_NOISE = 20
@@ -186,7 +181,7 @@ class Follower:
     def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
         self._lit = lit
-        side, usable = sides_of_samples(texels, usable, lit.size)
+        side, usable = sides_of_samples(texels, usable, lit.diagonal_m)
         self._index, rows = _texels_to_follow(texels, usable, frames, seed)
         self._owner = texels.object_index()[self._index]
         self._side = side[self._owner]
@@ -194,13 +189,13 @@ class Follower:
         across = self._side[:, None]
         self._texels = replace(own, step_x=across * own.step_x, step_y=across * own.step_y)
         # Offsets of the proxy's half vectors, the same for all texels so that views compare.
-        self._jitter = _PROXY_ALPHA * (2 * patch_shifts(_PROXY_RAYS, 3, seed) - 1)
+        self._jitter = _PROXY_ALPHA * (2 * shifts_of(np.arange(_PROXY_RAYS), 3, seed) - 1)
         # Row of a frame in the tables; what was not seen there is zero.
         self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
         self._added = 0
         self._frames_per_noise = max(1, -(-frames // _FRAMES_OF_NOISE))
-        self._noise_in_tiles: list[Double] = []
+        self._noise_in_windows: list[Double] = []
         cells = (rows, len(self._index))
         self._seen = np.zeros(cells, np.bool_)
         self._radiance = np.zeros((*cells, 3), np.float32)
@@ -211,24 +206,19 @@ class Follower:
         """Sample the followed texels in the next frame."""
         row = self._row.get(self._added)
         if len(self._index) and self._added % self._frames_per_noise == 0:
-            self._noise_in_tiles.append(noise_correlation(self._lit, view))
+            self._noise_in_windows.append(noise_correlation(self._lit, view))
         self._added += 1
         if row is None or not len(self._index):
             return
-        height, width = view.valid.shape
-        camera = view.world_from_camera, view.intrinsics
-        surfaces = first_surfaces(
-            self._lit.rays, self._lit.scene.face_object, *camera,
-            np.array([width, height], np.int32),
-        )  # fmt: skip
+        surfaces = first_surfaces(self._lit.rays, self._lit.scene.face_object, view.camera)
         kind, radiance = samples_from_frame(
-            self._texels, self._owner, surfaces,
-            Picture(view.radiance, view.valid, clipped, *camera), beside_glare=True,
+            self._texels, self._owner, surfaces, Picture(view.radiance, view.valid, clipped),
+            view.camera, beside_glare=True,
         )  # fmt: skip
         seen = np.flatnonzero(kind == SAMPLE)
         self._seen[row, seen] = True
         self._radiance[row, seen] = radiance[seen]
-        self._light[row, seen] = self._mirrored_light(seen, view.world_from_camera[:3, 3])
+        self._light[row, seen] = self._mirrored_light(seen, view.camera.eye)
         self._noise[row] = noise_floor
 
     def chosen(self, texels: Texels, seed: int) -> Observations:
@@ -253,7 +243,7 @@ class Follower:
     @property
     def smoothing(self) -> float:
         """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
-        return smoothing_of(self._noise_in_tiles)
+        return smoothing_of(self._noise_in_windows)
 
     def target_frames(self, texels: Texels) -> Int:
         """Per object, the frame in which its followed texels mirror most light beyond what each of
@@ -287,7 +277,7 @@ class Follower:
         position, normal = self._texels.position[which], self._texels.normal[which]
         to_eye = (eye - position).astype(np.float32)
         to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-12)
-        origin = lift_from_surface(position, normal, self._lit.size)
+        origin = lift_from_surface(position, normal, self._lit.diagonal_m)
         total = np.zeros(len(which), np.float32)
         for offset in self._jitter:
             half = (normal + offset).astype(np.float32)

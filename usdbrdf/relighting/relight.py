@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.render_scene import eye_height, published, published_camera, time_code
+from usdbrdf.asset.readers.render_scene import (
+    eye_height,
+    render_scene_from_stage,
+    time_code,
+    view_from_stage,
+)
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Float
-from usdbrdf.model.camera import View
-from usdbrdf.relighting.insert import Insert
+from usdbrdf.model.camera import Camera
+from usdbrdf.options import RelightOptions
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.picture import (
     DISPLAYED,
@@ -30,44 +34,7 @@ from usdbrdf.relighting.picture import (
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
 from usdbrdf.relighting.render import mitsuba_variant, render_view
 from usdbrdf.relighting.views_from_document import views_from_document
-from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter, denoise_picture
-
-MIN_BOUNCES = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class RelightOptions:
-    """What to render.
-
-    lights         USD file with lights or glowing meshes, or latitude-longitude .exr or .hdr; None
-                   is the light of the asset itself
-    keep_emitters  leave the asset's own light on beside ``lights``
-    inserts        models to put in
-    camera         prim path of a camera; None is the capture's
-    frame          time code; None is the earliest
-    views          document with poses, instead of a camera
-    samples        paths per pixel
-    bounces        reflections along a path, at least 4; in a bright room the ninth and later ones
-                   bring more than 1 % of the light
-    width          pixels; None is the camera's own
-    denoise        "none", "oidn", or "auto": oidn where it is installed
-    exposure       stops, for PNG and JPEG; None is automatic
-    format         extension of the pictures of ``views``
-    """
-
-    lights: Path | None = None
-    keep_emitters: bool = False
-    inserts: tuple[Insert, ...] = ()
-    camera: str | None = None
-    frame: float | None = None
-    views: Path | None = None
-    samples: int = 256
-    bounces: int = 32
-    width: int | None = None
-    seed: int = 0
-    denoise: str = AUTO
-    exposure: float | None = None
-    format: str = "exr"
+from usdbrdf.shading.denoise import OIDN, chosen_filter, denoise_picture
 
 
 def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
@@ -85,9 +52,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     stage = open_edited(asset)
     time = time_code(stage, options.frame)
     inserts = options.inserts
-    captured = published(stage, time, lambda sentence: say(f"warning: {sentence}"))
+    captured = render_scene_from_stage(stage, time, lambda sentence: say(f"warning: {sentence}"))
     if options.views is None:
-        views: tuple[View, ...] = (published_camera(stage, options.camera, time),)
+        views: tuple[Camera, ...] = (view_from_stage(stage, options.camera, time),)
     else:
         views = views_from_document(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
@@ -119,7 +86,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
 def _photograph(
     mitsuba: Any,
     loaded: Any,
-    views: Sequence[View],
+    views: Sequence[Camera],
     targets: Sequence[Path],
     options: RelightOptions,
     *,
@@ -142,7 +109,7 @@ def _photograph(
 
 
 def _rendered(
-    mitsuba: Any, loaded: Any, views: Sequence[View], options: RelightOptions, *, denoise: bool
+    mitsuba: Any, loaded: Any, views: Sequence[Camera], options: RelightOptions, *, denoise: bool
 ) -> Iterator[Float]:
     """(H, W, 3) radiance of one view after the other."""
     for i, view in enumerate(views):
@@ -175,13 +142,6 @@ def _write_exposed_alike(targets: Sequence[Path], rendered: Iterator[Float]) -> 
 
 def _check(options: RelightOptions, output: Path, folder: Path) -> None:
     """Everything that can be refused before the renderer is started."""
-    if options.bounces < MIN_BOUNCES:
-        raise UsageError(
-            f"--bounces {options.bounces}: light between surfaces needs at least {MIN_BOUNCES}. "
-            "[relight.bounces]"
-        )
-    if options.samples < 1 or (options.width is not None and options.width < 1):
-        raise UsageError("--samples and --width must be at least 1. [relight.size]")
     if options.views is None:
         check_picture_name(output)
     refuse_taken(output, folder=options.views is not None)
@@ -201,7 +161,7 @@ def _check(options: RelightOptions, output: Path, folder: Path) -> None:
             raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
 
 
-def _targets(output: Path, views: Sequence[View], options: RelightOptions) -> list[Path]:
+def _targets(output: Path, views: Sequence[Camera], options: RelightOptions) -> list[Path]:
     if options.views is None:
         return [output]
     targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]

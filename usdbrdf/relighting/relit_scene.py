@@ -9,13 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.asset.readers.lights import sky_of_picture
-from usdbrdf.asset.readers.render_scene import Published, published_file
+from usdbrdf.asset.readers.render_scene import (
+    RenderScene,
+    render_scene_from_file,
+    sky_of_picture,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
 from usdbrdf.model.light import Light, RelitScene
 from usdbrdf.model.material import Surface
-from usdbrdf.relighting.insert import Insert, placed, turned_up, with_material
+from usdbrdf.options import Insert
+from usdbrdf.relighting.insert import placed, turned_up, with_material
 from usdbrdf.relighting.inserted_models import surfaces_from_model
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their
@@ -60,7 +64,7 @@ SKY_SUFFIXES = frozenset({".exr", ".hdr"})
 
 
 def relit_scene(
-    asset: Published,
+    asset: RenderScene,
     lights: Path | None,
     inserts: Sequence[Insert],
     *,
@@ -100,7 +104,7 @@ def relit_scene(
 def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
         return (), (sky_of_picture(file, up_axis),)
-    found = published_file(file, _warn)
+    found = render_scene_from_file(file, _warn)
     if not found.lights and not any(surface.material.emits for surface in found.surfaces):
         raise InputRefused(
             f"{file}: no light in it, and no mesh that glows. Add UsdLux lights or an "
@@ -111,11 +115,11 @@ def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequenc
     return surfaces, [light.moved(turn) for light in found.lights]
 
 
-def _model(insert: Insert, asset: Published) -> tuple[Surface, ...]:
+def _model(insert: Insert, asset: RenderScene) -> tuple[Surface, ...]:
     """In metres, with the asset's up axis."""
     suffix = insert.model.suffix.lower()
     if suffix in USD_SUFFIXES:
-        found = published_file(insert.model, _warn)
+        found = render_scene_from_file(insert.model, _warn)
         if found.lights:
             _warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
         surfaces, model_up, scale = found.surfaces, found.up_axis, 1.0

@@ -8,13 +8,13 @@ from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.checks import rigid_records
 from usdbrdf.capture.findings import Findings
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
+from usdbrdf.options import IngestOptions
 
 
-def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> tuple[View, ...]:
+def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
     """The views of a document of the asset's capture, named after their images.
 
     Poses are in the capture's frame and unit and are treated as ingest treated those of the
@@ -43,7 +43,7 @@ def views_from_document(source: Path, asset: Asset, metres_per_unit: float) -> t
         pose[:3, 3] *= metres_per_unit
         width, height = record.resolution
         views.append(
-            View(
+            Camera(
                 name=record.name,
                 world_from_camera=pose,
                 intrinsics=record.intrinsics,

@@ -10,7 +10,6 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, to_working_space
 from usdbrdf.files.images import read_radiance
 from usdbrdf.model.arrays import Float
-from usdbrdf.tasks.step import hash_of_files
 from usdbrdf.transport.environment import Environment, black_environment
 
 # What these files hold is radiance even where all of it happens to be 0 or 1.
@@ -25,15 +24,6 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
     _refuse_what_is_not_light(picture, image)
     image = to_working_space(image, WORKING_SPACE)
     return Environment(image=image, z_up=up_axis == "Z")
-
-
-def environment_hash(picture: Path | None) -> dict[str, str]:
-    """The picture's entry in a step's inputs."""
-    if picture is None:
-        return {}
-    if not picture.is_file():
-        raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
-    return {"environment": hash_of_files([picture])}
 
 
 def _refuse_what_is_not_light(picture: Path, image: Float) -> None:

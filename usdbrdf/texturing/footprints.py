@@ -7,8 +7,10 @@ import numpy as np
 from numba import prange
 from scipy import ndimage
 
+from usdbrdf import calibration
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import Projection, project
 
@@ -23,12 +25,12 @@ RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
 _OF_TEXEL, _LARGEST = 1 / 12, 1e6
 
 
-def footprints(texels: Texels, which: Int, world_from_camera: Double, intrinsics: Double) -> Float:
+def footprints(texels: Texels, which: Int, camera: Camera) -> Float:
     """A pixel's steps right and down on the surface at some texels, as a covariance in texels:
     (M, 3), xx, xy, yy. Texels that the camera sees from the front."""
     found = np.zeros((len(which), 3), np.float32)
-    camera = Projection.of(world_from_camera, intrinsics)
-    _footprints(which, texels.position, texels.step_x, texels.step_y, camera, found)
+    steps = texels.step_x, texels.step_y
+    _footprints(which, texels.position, *steps, Projection.of(camera), found)
     return found
 
 
@@ -128,12 +130,9 @@ def _blur(
                 out[t, c] += ((1 - fy) * upper + fy * lower) / len(offsets)
 
 
-# Standard deviation of a sample's blur in pixels: the camera's own, bilinear reading, the pixel. A
-# little less than the fit of highlights takes: what was not blurred must not be sharpened.
-SAMPLE_BLUR = 0.6
+SAMPLE_BLUR = calibration.number("refine.sample_blur")
 
-# What is detail and what is noise is decided over three blurs of this many pixels.
-_NEIGHBOURHOOD = 2.0
+_NEIGHBOURHOOD = calibration.number("refine.neighbourhood")
 
 
 def restored(

@@ -141,11 +141,11 @@ def samples_from_frames(
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
     for i, pixels in images:
-        camera = frames.world_from_camera[i], frames.intrinsics[i]
-        which = blocks.texels_in_view(*camera, frames.resolution[i], MIN_COSINE)
-        surfaces = first_surfaces(rays, scene.face_object, *camera, frames.resolution[i])
-        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped, *camera)
-        kind, radiance = samples_from_frame(texels, owner, surfaces, picture, which=which)
+        camera = frames.camera(i)
+        which = blocks.texels_in_view(camera, MIN_COSINE)
+        surfaces = first_surfaces(rays, scene.face_object, camera)
+        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped)
+        kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
         yield FrameSamples(
             frame=i,
             texel=which[kind == SAMPLE],

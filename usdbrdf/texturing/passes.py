@@ -13,7 +13,7 @@ import numpy as np
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
@@ -48,10 +48,10 @@ OF_TEXTURING = BytesPerTexel(grouped=180, result=48, after=200)
 
 
 def in_passes(
+    run: TaskRun,
+    name: str,
     groups: Sequence[slice],
     observe: Callable[[slice], Mapping[str, Array]],
-    run: StageRun,
-    name: str,
 ) -> dict[str, Array]:
     """Arrays of all texels, of which one pass observes each of the ``groups``; of several passes
     those that are done are kept under ``name`` for a run that goes on."""

@@ -15,21 +15,21 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from usdbrdf import calibration
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.glare import brightest_glare
 from usdbrdf.transport.rays import RayScene
 
-# Seen flatter than this a texel's footprint is smeared over its neighbours.
-MIN_COSINE = 0.1
+MIN_COSINE = calibration.number("samples.min_cosine")
 
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
 
-# Light this many times brighter than a sample spoils it (see ``brightest_glare``).
-_GLARE_CONTRAST = 3.0
+_GLARE_CONTRAST = calibration.number("samples.glare_contrast")
 
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 
@@ -43,14 +43,11 @@ class FirstSurfaces(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One frame: radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4)
-    float64; intrinsics fx, fy, cx, cy in pixels, (4,) float64."""
+    """One frame: radiance (H, W, 3) float32; valid, clipped (H, W) bool."""
 
     radiance: Float
     valid: Bool
     clipped: Bool
-    world_from_camera: Double
-    intrinsics: Double
 
 
 class Projection(NamedTuple):
@@ -61,12 +58,9 @@ class Projection(NamedTuple):
     intrinsics: Double
 
     @classmethod
-    def of(cls, world_from_camera: Double, intrinsics: Double) -> Projection:
-        return cls(
-            world_from_camera[:3, 3].copy(),
-            np.linalg.inv(world_from_camera).astype(np.float64, copy=False),
-            np.asarray(intrinsics, np.float64),
-        )
+    def of(cls, camera: Camera) -> Projection:
+        inverse = np.linalg.inv(camera.world_from_camera).astype(np.float64, copy=False)
+        return cls(camera.eye.copy(), inverse, np.asarray(camera.intrinsics, np.float64))
 
 
 class _Image(NamedTuple):
@@ -90,15 +84,9 @@ class _Surface(NamedTuple):
     object: Int
 
 
-def first_surfaces(
-    rays: RayScene,
-    face_object: Int,
-    world_from_camera: Double,
-    intrinsics: Double,
-    resolution: Int,
-) -> FirstSurfaces:
+def first_surfaces(rays: RayScene, face_object: Int, camera: Camera) -> FirstSurfaces:
     """The first hits of the rays through all pixels' centres."""
-    face, point = visible_faces(rays, world_from_camera, intrinsics, resolution)
+    face, point = visible_faces(rays, camera)
     shown = face_object[face]
     shown[face < 0] = -1
     return FirstSurfaces(shown, point)
@@ -109,6 +97,7 @@ def samples_from_frame(
     texel_object: Int,
     surfaces: FirstSurfaces,
     picture: Picture,
+    camera: Camera,
     *,
     which: Int | None = None,
     beside_glare: bool = False,
@@ -119,10 +108,11 @@ def samples_from_frame(
     texel_object  (T,) int32
     beside_glare  take samples there too, for whom highlights matter
     """
-    _, valid, clipped, *camera = picture
     if which is None:
         which = np.arange(len(texels), dtype=np.int32)
-    glare = np.zeros(valid.shape, np.float32) if beside_glare else brightest_glare(*picture[:3])
+    glare = np.zeros(picture.valid.shape, np.float32)
+    if not beside_glare:
+        glare = brightest_glare(*picture)
     kind = np.zeros(len(which), np.int8)
     values = np.zeros((len(which), 3), np.float32)
     _sample(
@@ -130,8 +120,8 @@ def samples_from_frame(
         _Surface(
             texels.position, texels.geometric_normal, texels.step_x, texels.step_y, texel_object
         ),
-        _Image(*surfaces, picture.radiance, valid, clipped, glare),
-        Projection.of(*camera),
+        _Image(*surfaces, picture.radiance, picture.valid, picture.clipped, glare),
+        Projection.of(camera),
         kind,
         values,
     )

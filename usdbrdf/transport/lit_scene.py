@@ -9,12 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.model.arrays import Bool, Double, Float, Int
-from usdbrdf.model.camera import camera_rays
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture
+from usdbrdf.transport.textured_scene import TexturedScene
+
+# Lobes pick among all lights alike, by power: each of the few rays is to meet one that shows.
+_BRIGHTER_THAN = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,21 +46,39 @@ class SurfacePoints:
         )
 
 
-def visible_points(
-    rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
-) -> SurfacePoints:
+@dataclass(frozen=True, kw_only=True)
+class LitScene:
+    """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
+    emission mask, and the diagonal of the scene's box."""
+
+    scene: Scene
+    rays: RayScene
+    radiance: SurfaceTexture
+    lights: Lights
+    emission: SurfaceTexture
+    environment: Environment
+    diagonal_m: float
+
+    def owner(self, face: Int) -> Int:
+        """The object of each face (R,), -1 where the face is -1."""
+        return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
+
+    def emits(self, place: SurfacePoints | Hits) -> Bool:
+        """(R,): is there an emitter?"""
+        return np.asarray(self.emission.at(place.face, place.u, place.v)[:, 0] > 0.5, np.bool_)
+
+
+def visible_points(lit: LitScene, camera: Camera, pixels: Double) -> SurfacePoints:
     """The surface under pixel coordinates (R, 2)."""
-    return points_of_rays(rays, scene, *camera_rays(world_from_camera, intrinsics, pixels))
+    return points_of_rays(lit, *camera.rays(pixels))
 
 
-def points_of_rays(
-    rays: RayScene, scene: Scene, origins: Float, directions: Float
-) -> SurfacePoints:
+def points_of_rays(lit: LitScene, origins: Float, directions: Float) -> SurfacePoints:
     """The surface that rays (R, 3) meet first, seen from where they come."""
-    hits = rays.closest(origins, directions)
+    hits = lit.rays.closest(origins, directions)
     face = np.maximum(hits.face, 0)
     weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
-    normal = np.einsum("rc,rcd->rd", weights, scene.corner_normals[face])
+    normal = np.einsum("rc,rcd->rd", weights, lit.scene.corner_normals[face])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     towards = np.einsum("rd,rd->r", normal, directions) > 0
     position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
@@ -70,42 +92,41 @@ def points_of_rays(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class LitScene:
-    """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
-    emission mask, and the scene's size in metres."""
-
-    scene: Scene
-    rays: RayScene
-    radiance: SurfaceTexture
-    lights: Lights
-    emission: SurfaceTexture
-    environment: Environment
-    size: float
-
-    def owner(self, face: Int) -> Int:
-        """The object of each face (R,), -1 where the face is -1."""
-        return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
+def lit_scene(
+    surface: TexturedScene, light: Float, emissive: Bool, environment: Environment
+) -> LitScene:
+    """The scene with its light (T, 3), W/(m^2 sr): L_d, and where texels are ``emissive`` (T,) the
+    radiance with which they shine."""
+    radiance = surface.texture(light)
+    shines = np.repeat(emissive[:, None].astype(np.float32), 3, axis=1)
+    return LitScene(
+        scene=surface.scene,
+        rays=surface.rays,
+        radiance=radiance,
+        lights=surface.lights(light, _BRIGHTER_THAN),
+        emission=radiance.showing(surface.texels, shines),
+        environment=environment,
+        diagonal_m=surface.diagonal_m,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One frame as the fit sees it: radiance (H, W, 3), valid (H, W), pose and pinhole."""
+    """One frame as the fit sees it: radiance (H, W, 3), valid (H, W), and its camera."""
 
     radiance: Float
     valid: Bool
-    world_from_camera: Double
-    intrinsics: Double
+    camera: Camera
 
 
 def sub_pixel_points(
-    lit: LitScene, view: View, pixels: Double, index: int, offsets: Double
+    lit: LitScene, camera: Camera, pixels: Double, index: int, offsets: Double
 ) -> tuple[Bool, SurfacePoints]:
     """Surface points at ``offsets`` (K, 2) in pixels from each of the pixel coordinates (P, 2).
 
     Returns which pixels have all K on object ``index``, (P,) bool, and their points in order.
     """
     inside = (pixels[:, None] + offsets).reshape(-1, 2)
-    points = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, inside)
+    points = visible_points(lit, camera, inside)
     whole = (lit.owner(points.face) == index).reshape(-1, len(offsets)).all(axis=1)
     return whole, points.take(np.flatnonzero(np.repeat(whole, len(offsets))))

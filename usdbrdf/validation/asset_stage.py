@@ -13,6 +13,7 @@ from pxr import Ar, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.readers.objects import authored
 from usdbrdf.delivery.packaged_files import named_files
 
 
@@ -148,12 +149,6 @@ def record_of(layer: Sdf.Layer) -> dict[str, Any]:
     """``customLayerData.usdbrdf`` of a layer; empty where it has none."""
     record = layer.customLayerData.get("usdbrdf", {})
     return record if isinstance(record, dict) else {}
-
-
-def authored(prim: Usd.Prim, name: str) -> Any:
-    """The authored value of an attribute: a schema's fallback is no measurement. Else None."""
-    attribute = prim.GetAttribute(name)
-    return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
 
 
 def located(layer: Sdf.Layer, asset_path: str) -> Path:

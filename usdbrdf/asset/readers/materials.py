@@ -36,7 +36,7 @@ _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedMaterial:
+class BoundMaterial:
     """A material, and which primvars of a mesh it reads ("" for none).
 
     uv_from_st  (3, 3) of column vectors, a UsdTransform2d; None is the identity
@@ -59,7 +59,7 @@ class PublishedMaterial:
         return np.asarray(moved, np.float32)
 
 
-def mappings_of_materials(stage: Usd.Stage) -> dict[str, str]:
+def fit_mappings(stage: Usd.Stage) -> dict[str, str]:
     """What a fit recorded of the materials that its objects are bound to (usdBrdf:fit:mapping), by
     material path; others are not in there."""
     found = {}
@@ -72,30 +72,30 @@ def mappings_of_materials(stage: Usd.Stage) -> dict[str, str]:
     return found
 
 
-def published_material(
+def material_from_usd(
     material: UsdShade.Material,
     time: Usd.TimeCode,
     warn: Callable[[str], None],
-    mapping: str = "measured",
-) -> PublishedMaterial:
+    mapping: str,
+) -> BoundMaterial:
     """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks of
     UsdPreviewSurface with the mesh's display colour.
 
     mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
              comes back is the lobe that was meant
     """
-    shader = _preview_surface(material)
-    if shader is None:
+    shader = material.ComputeSurfaceSource()[0] if material else None
+    if not shader or shader.GetShaderId() != "UsdPreviewSurface":
         if material:
             warn(f"<{material.GetPath()}>: no UsdPreviewSurface; shown in its display colour.")
-        return PublishedMaterial(material=_material_of({}), colour_primvar="displayColor")
+        return BoundMaterial(material=_material_of({}), colour_primvar="displayColor")
     reader = _Reader(time=time, warn=warn)
     inputs = {name: reader.read(shader.GetInput(name), value) for name, value in _FALLBACKS.items()}
     if inputs.pop("opacity").min() < 1:
         warn(f"<{material.GetPath()}>: opacity is not rendered; the surface is taken as opaque.")
     if mapping == "matched":
         inputs |= _as_fitted(inputs)
-    return PublishedMaterial(
+    return BoundMaterial(
         material=replace(_material_of(inputs), wrap=reader.wrap or "clamp"),
         uv_primvar=reader.uv_primvar,
         colour_primvar=reader.colour_primvar,
@@ -131,13 +131,6 @@ def _material_of(inputs: dict[str, Float]) -> Material:
         ior=float(known["ior"].flat[0]),
         specular=known["specularColor"] if specular_workflow else None,
     )
-
-
-def _preview_surface(material: UsdShade.Material) -> UsdShade.Shader | None:
-    if not material:
-        return None
-    shader = material.ComputeSurfaceSource()[0]
-    return shader if shader and shader.GetShaderId() == "UsdPreviewSurface" else None
 
 
 @dataclass(kw_only=True)

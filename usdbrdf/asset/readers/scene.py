@@ -8,12 +8,13 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Usd, UsdGeom, Vt
 
-from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.asset.properties import OBJECT, TEXTURING
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.options import IngestOptions
 
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
@@ -35,7 +36,7 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
     if not prims:
         raise InputRefused(
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
-            "Run ingest again. [stage.objects]"
+            "Run `usdbrdf ingest` again. [stage.objects]"
         )
     crease_angle_deg = _crease_angle_deg(stage)
     meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
@@ -66,16 +67,16 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
 
 def is_object(prim: Usd.Prim) -> bool:
     """True for a mesh that ingest labelled."""
-    label = prim.GetAttribute("usdBrdf:label")
+    label = prim.GetAttribute(OBJECT.attribute(OBJECT.key))
     return bool(label and label.HasAuthoredValue() and prim.IsA(UsdGeom.Mesh))
 
 
 def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
-    """(T, 3, 2) texture coordinates that the texturing stage authored; None before it ran.
+    """(T, 3, 2) texture coordinates that the task texture authored; None before it.
 
     An input file's own primvars:st does not count: only ours go with our textures.
     """
-    ours = mesh.GetPrim().GetAttribute("usdBrdf:texturing:texelSize")
+    ours = mesh.GetPrim().GetAttribute(TEXTURING.attribute(TEXTURING.key))
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     if not (ours and ours.HasAuthoredValue() and primvar):
         return None
@@ -143,13 +144,15 @@ def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
     return bool(np.linalg.det(np.array(mesh.ComputeLocalToWorldTransform(_TIME))[:3, :3]) < 0)
 
 
-def authored_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.float64] | None:
+def authored_normals(
+    mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode = _TIME
+) -> npt.NDArray[np.float64] | None:
     """(T, 3, 3) authored normals in the mesh's frame; None where there are none to use."""
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")  # stronger than the attribute
     if primvar and primvar.HasAuthoredValue():
-        values, interpolation = primvar.ComputeFlattened(_TIME), primvar.GetInterpolation()
+        values, interpolation = primvar.ComputeFlattened(time), primvar.GetInterpolation()
     else:
-        values = mesh.GetNormalsAttr().Get(_TIME)
+        values = mesh.GetNormalsAttr().Get(time)
         interpolation = mesh.GetNormalsInterpolation()
     if not values:
         return None
@@ -175,6 +178,6 @@ def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
         missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
         raise InputRefused(
             f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
-            "Run the stage texture again. [stage.st]"
+            "Run `usdbrdf texture` again. [stage.st]"
         )
     return np.concatenate(present)

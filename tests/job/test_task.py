@@ -1,0 +1,231 @@
+"""When a task runs again and when it does not."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.job import stamp as stamp_module
+from usdbrdf.job import task as task_module
+from usdbrdf.job.task import run_task
+
+STAMP = ".usdbrdf/stamps/20-toy.json"
+
+
+@pytest.fixture
+def asset(tmp_path, toy):
+    toy.run_toy(tmp_path / "room")
+    return tmp_path / "room"
+
+
+def test_second_run_does_nothing_and_gives_the_same_summary(asset, toy):
+    first = toy.run_toy(asset, 2)
+    second = toy.run_toy(asset, 2)
+    assert first.reran
+    assert not second.reran
+    assert second.summary == first.summary
+
+
+def test_nothing_but_the_outputs_and_the_stamp_is_left(asset, hashes):
+    assert sorted(hashes(asset)) == [
+        ".usdbrdf/job.json",
+        ".usdbrdf/lock",
+        STAMP,
+        "edits.usda",
+        "layers/toy.usda",
+        "layers/toy_uv.usdc",
+        "textures/box0.lit.exr",
+        "textures/box1.lit.exr",
+        "textures/box2.lit.exr",
+    ]
+    assert list((asset / ".usdbrdf/work").iterdir()) == []
+
+
+def test_touched_times_rerun_nothing(asset, toy):
+    for path in asset.rglob("*"):
+        os.utime(path, (4e9, 4e9))
+    assert not toy.run_toy(asset).reran
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "list", "newer", "escape", "gone"])
+def test_damaged_stamp_is_an_absent_one(asset, toy, hashes, damage):
+    before = hashes(asset)
+    path = asset / STAMP
+    text = path.read_text()
+    damaged = {
+        "cut": text[: len(text) // 2],
+        "flip": text.replace('"textures": 3', '"textures": 2', 1),
+        "empty": "",
+        "list": "[]",
+        "newer": text.replace('"schema": 1', '"schema": 2'),
+        "escape": text.replace("layers/toy.usda", "../toy.usda"),
+        "gone": None,
+    }[damage]
+    assert damaged != text
+    path.unlink() if damaged is None else path.write_text(damaged)
+    result = toy.run_toy(asset)
+    assert result.reran
+    assert result.reason == "not done before"
+    assert hashes(asset) == before
+
+
+def test_changed_parameter_reruns_and_says_so(asset, toy):
+    assert toy.run_toy(asset, 2).reason == "parameters changed: seed"
+
+
+def test_changed_input_and_version_rerun(tmp_path, monkeypatch):
+    def run(sha256):
+        return run_task(
+            tmp_path,
+            "one",
+            order=1,
+            parameters={"size": np.float32(0.5), "names": ("a",)},
+            inputs={"scan": sha256},
+            work=lambda run: run.output("layers/a.usda").write_text("x") and {},
+        )
+
+    assert run("aa").reran
+    assert not run("aa").reran
+    assert run("bb").reason == "inputs changed: scan"
+    with monkeypatch.context() as another:
+        another.setattr(stamp_module, "tasks_identity", lambda: "another")
+        assert run("bb").reason == "code changed"
+    assert run("bb").reason == "code changed"
+    monkeypatch.setattr(stamp_module, "code_version", lambda: "9")
+    assert run("bb").reason.startswith("version 9 instead of ")
+
+
+@pytest.mark.parametrize("path", ["layers/toy.usda", "textures/box1.lit.exr", "edits.usda"])
+def test_deleted_output_is_made_again(asset, toy, hashes, path):
+    before = hashes(asset)
+    (asset / path).unlink()
+    assert toy.run_toy(asset).reason == f"output missing: {path}"
+    assert hashes(asset) == before
+
+
+def test_edited_output_reruns_but_the_artists_file_stays(asset, toy):
+    (asset / "edits.usda").write_text("#usda 1.0\n# mine\n")
+    (asset / "layers/toy.usda").write_text("#usda 1.0\n# mine\n")
+    assert toy.run_toy(asset).reason == "output changed: layers/toy.usda"
+    assert "mine" not in (asset / "layers/toy.usda").read_text()
+    assert "mine" in (asset / "edits.usda").read_text()
+
+
+def test_output_no_longer_made_is_deleted_unless_edited(asset, toy):
+    toy.run_toy(asset, textures=2)
+    assert not (asset / "textures/box2.lit.exr").exists()
+    toy.run_toy(asset, textures=3)
+    (asset / "textures/box2.lit.exr").write_bytes(b"mine")
+    toy.run_toy(asset, textures=2)
+    assert (asset / "textures/box2.lit.exr").read_bytes() == b"mine"
+
+
+def test_outputs_of_refused_work_are_not_published(tmp_path):
+    def work(run):
+        run.output("layers/a.usda").write_text("x")
+        raise InputRefused("no")
+
+    with pytest.raises(InputRefused):
+        run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    assert not (tmp_path / "layers").exists()
+    assert not (tmp_path / ".usdbrdf/stamps/1-one.json").exists()
+
+
+@pytest.mark.parametrize("relative", ["../a", "/a", ".usdbrdf/a", "", "a/../../b"])
+def test_output_outside_the_asset_is_our_bug(tmp_path, relative):
+    with pytest.raises(UsdBrdfError, match=r"not a path inside the asset. \[task.output\]"):
+        run_task(
+            tmp_path,
+            "one",
+            order=1,
+            parameters={},
+            inputs={},
+            work=lambda run: {"path": str(run.output(relative))},
+        )
+
+
+def test_output_that_was_not_written_is_our_bug(tmp_path):
+    with pytest.raises(UsdBrdfError, match=r"did not write layers/a\.usda"):
+        run_task(
+            tmp_path,
+            "one",
+            order=1,
+            parameters={},
+            inputs={},
+            work=lambda run: {"path": str(run.output("layers/a.usda"))},
+        )
+
+
+@pytest.mark.parametrize("error", [MemoryError(), OSError("1920000 requested and 524256 written")])
+def test_what_the_machine_lacks_is_an_environment_failure(tmp_path, error):
+    def work(run):
+        raise error
+
+    with pytest.raises(EnvironmentFailure, match=r"^one: .+ \[environment\.(memory|io)\]$"):
+        run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+
+
+def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
+    arrays = {
+        "file": np.array([np.nan, -0.0, np.inf]),
+        "fortran": np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)),
+        "scalar": np.array(3, dtype=np.uint8),
+        "empty": np.zeros((0, 3), dtype=np.float32),
+    }
+    loaded = {}
+
+    def work(run):
+        run.save("é/@0.x", arrays)
+        loaded.update(run.checkpoint_if("é/@0.x"))
+        assert run.checkpoint_if("é") is None
+        assert run.latest("é/@0.x") is None
+        return {}
+
+    run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    assert list(loaded) == list(arrays)
+    for key, array in arrays.items():
+        assert loaded[key].dtype == array.dtype
+        assert loaded[key].tobytes() == array.tobytes()
+
+
+def test_a_running_state_is_not_saved_all_the_time(tmp_path, monkeypatch):
+    clock, saved = [0.0], []
+    monkeypatch.setattr(task_module.time, "monotonic", lambda: clock[0])
+
+    def state():
+        saved.append(clock[0])
+        clock[0] += 1  # a second to save
+        return {"sum": np.zeros(3)}
+
+    def work(run):
+        for frame in range(120):
+            clock[0] += 1
+            run.save_latest_in_time("sum", frame, state)
+        return {}
+
+    run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    assert saved[0] == 1
+    assert np.diff(saved).min() >= 20
+    assert 3 <= len(saved) <= 6
+
+
+def test_stamp_has_no_time_and_no_absolute_path(asset):
+    text = (asset / STAMP).read_text()
+    assert str(asset.parent) not in text
+    assert set(json.loads(text)) == {
+        "check",
+        "code",
+        "earlier",
+        "inputs",
+        "once",
+        "outputs",
+        "parameters",
+        "schema",
+        "stage",
+        "summary",
+        "version",
+    }

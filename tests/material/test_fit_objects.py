@@ -1,0 +1,45 @@
+"""Objects are fitted together, each with one thread of BLAS."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from usdbrdf.material import fit_objects
+from usdbrdf.material.fit_objects import ObjectFit
+
+
+class _Run:
+    def __init__(self) -> None:
+        self.saved: dict[str, dict[str, np.ndarray]] = {}
+
+    def checkpoint_if(self, name: str) -> dict[str, np.ndarray] | None:
+        return ObjectFit(cost=-1.0).arrays() if name == "object-1" else None
+
+    def save(self, name: str, found: dict[str, np.ndarray]) -> None:
+        self.saved[name] = found
+
+
+def _fit_that_tells_the_threads(*_: object) -> ObjectFit:
+    (threads,) = set(_threads_of_blas().tolist())
+    return ObjectFit(cost=float(threads))
+
+
+def _threads_of_blas() -> np.ndarray:
+    return np.array([one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"])
+
+
+def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.MonkeyPatch):
+    before = _threads_of_blas()
+    assert len(before)
+    monkeypatch.setattr(fit_objects, "fit_object", _fit_that_tells_the_threads)
+    lit, run = SimpleNamespace(scene=SimpleNamespace(objects=range(4))), _Run()
+    found = fit_objects.fitted_objects(run, lit, None, None, None, fit_objects.FitOptions())  # type: ignore[arg-type]
+    assert found[1].cost == -1  # taken from an interrupted run
+    assert sorted(run.saved) == ["object-0", "object-2", "object-3"]
+    for i in (0, 2, 3):
+        assert found[i].cost == 1
+    np.testing.assert_array_equal(_threads_of_blas(), before)

@@ -1,0 +1,417 @@
+"""The fit takes the specular light off again that was added to frames of a diffuse room."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from pxr import Usd, UsdShade
+from scipy import stats
+
+import usdbrdf
+from tests.scenes import MadeCapture, make_capture, poses_down_and_up
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.objects import read_aovs, read_shading
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.job import task as task_module
+from usdbrdf.job.progress import set_quiet
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material import refine
+from usdbrdf.material.refine import Refined, refined_light
+from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
+from usdbrdf.model.capture import Frames
+from usdbrdf.shading import irradiance_map
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
+from usdbrdf.transport.lobe_radiance import lobe_radiance
+from usdbrdf.transport.rays import lift_from_surface
+
+Float = npt.NDArray[np.float32]
+
+# Dim enough, in the light of the others, not to be taken for a lamp itself.
+CEILING = {"ceiling": (0.125, 0.125, 0.125)}
+# phi, psi. The lamp reflects nothing.
+LOBE = {"floor": (0.2, 0.8), "ceiling": (0.6, 0.4), "walls": (0.3, 0.6), "box": (0.15, 0.9)}
+NUM_FRAMES, INTERRUPTED = 18, 15
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quiet():
+    set_quiet(True)
+    yield
+    set_quiet(False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """clean, glossy: the same room with diffuse radiance alone and with lobes, both shaded."""
+
+    folder: Path
+    clean: AssetMaps
+    glossy: Asset
+
+
+def _shaded(capture: MadeCapture, folder: Path) -> Asset:
+    options = usdbrdf.TextureOptions(texel_size=0.2)
+    sampling = usdbrdf.Sampling(standard_error=0.0, max_rays=64)
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.ingest(capture.folder, asset, usdbrdf.IngestOptions())
+        usdbrdf.texture(asset, options)
+        usdbrdf.shade(asset, usdbrdf.ShadeOptions(sampling=sampling))
+        return asset
+
+
+def _atlas(asset: Asset) -> AssetMaps:
+    return AssetMaps(open_measured(asset))
+
+
+def _lobes(atlas: AssetMaps) -> Lobes:
+    rows = [LOBE.get(item.label, (1.0, 0.0)) for item in atlas.scene.objects]
+    phi, psi = np.array(rows, np.float32).T
+    return Lobes(phi=phi, psi=psi)
+
+
+def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
+    return refined_light(run, lit, atlas.texels, frames, atlas, _lobes(atlas), "none", None, 0)
+
+
+def _irradiance(
+    run: TaskRun, atlas: AssetMaps, lit: LitScene, diffuse: Float, lobes: Lobes
+) -> Float:
+    """S of the asset, with the diffuse radiance and the lobes as the light instead of its L_d."""
+    change = np.where(atlas.emissive[:, None], 0, diffuse - atlas.lit).astype(np.float32)
+    traced = atlas.irradiance
+    return refined_irradiance(run, lit, atlas.texels, traced, change, lobes, "none", 0)
+
+
+def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, seed: int) -> Float:
+    """What the lobes reflect of the diffuse room, (R, 3); nothing from the lamp."""
+    own = lit.owner(points.face)
+    lamp = [item.label for item in lit.scene.objects].index("lamp")
+    reflects = np.flatnonzero((own >= 0) & (own != lamp))
+    result = np.zeros((len(own), 3), np.float32)
+    result[reflects] = lobe_radiance(
+        lit, points.take(reflects), lobes.phi[own[reflects]], lobes.psi[own[reflects]], rays, seed
+    )
+    return result
+
+
+def _add_specular(capture: MadeCapture, atlas: AssetMaps, frames: Frames) -> None:
+    """To the photographs of the diffuse room."""
+    lit, lobes = atlas.lit_scene(black_environment()), _lobes(atlas)
+    for i, path in enumerate(sorted((capture.folder / "frames").iterdir())):
+        image = read_exr(path)
+        height, width = image.shape[:2]
+        camera = frames.camera(i).at_size(width, height)
+        points = visible_points(lit, camera, camera.pixels())
+        image += _specular(lit, lobes, points, 64, 100 + i).reshape(image.shape)
+        write_exr(path, image)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Room:
+    folder = tmp_path_factory.mktemp("refine")
+    made = {
+        name: make_capture(
+            folder / name,
+            size=(40, 30),
+            subdivisions=1,
+            poses=poses_down_and_up(12, 6),
+            radiance=CEILING,
+        )
+        for name in ("clean", "glossy")
+    }
+    clean = _shaded(made["clean"], folder / "assets" / "clean")
+    atlas = _atlas(clean)
+    _add_specular(made["glossy"], atlas, frames_from_stage(open_measured(clean)))
+    glossy = _shaded(made["glossy"], folder / "assets" / "glossy")
+    return Room(folder=folder, clean=atlas, glossy=glossy)
+
+
+def _fitted(room: Room, name: str, options: usdbrdf.FitOptions) -> Asset:
+    """A copy of the glossy room, as far from its photographs, with a fit."""
+    folder = room.folder / "assets" / name
+    shutil.copytree(room.glossy.folder, folder)
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.fit(asset, options)
+        return asset
+
+
+@pytest.fixture(scope="module")
+def fitted(room: Room) -> Asset:
+    return _fitted(room, "fitted", usdbrdf.FitOptions())
+
+
+def _reflecting(room: Room, atlas: AssetMaps) -> np.ndarray:
+    """(T,): measured and no lamp."""
+    owner = np.array([item.label for item in atlas.scene.objects])[atlas.texels.object_index()]
+    measured = atlas.coverage.measured & room.clean.coverage.measured
+    return measured & (owner != "lamp")
+
+
+def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+    """Median relative error."""
+    return float(np.median(np.abs(found - wanted).sum(axis=1) / wanted.sum(axis=1)))
+
+
+def _true_irradiance(clean: AssetMaps, which: np.ndarray) -> np.ndarray:
+    """S of some texels in the glossy room: that of the diffuse one, and pi times the mean specular
+    radiance that arrives along 64 cosine-distributed rays."""
+    lit, texels = clean.lit_scene(black_environment()), clean.texels
+    normal = texels.normal[which].astype(np.float64)
+    u = stats.qmc.Sobol(2, rng=0).random(64)
+    height = np.sqrt(1 - u[:, 0])
+    tangent = np.cross(normal, [0.3, 0.5, 0.8])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
+    angle = 2 * np.pi * u[:, 1]
+    local = np.stack([np.sqrt(u[:, 0]) * np.cos(angle), np.sqrt(u[:, 0]) * np.sin(angle), height])
+    directions = np.einsum("ck,tcd->tkd", local, frame).reshape(-1, 3).astype(np.float32)
+    origin = lift_from_surface(texels.position[which], texels.normal[which], lit.diagonal_m)
+    origin = np.repeat(origin, 64, axis=0)
+    hits = lit.rays.closest(origin, directions)
+    points = SurfacePoints(
+        face=hits.face, u=hits.u, v=hits.v, position=origin + hits.distance[:, None] * directions,
+        normal=clean.scene.corner_normals[np.maximum(hits.face, 0), 0], to_camera=-directions,
+    )  # fmt: skip
+    arriving = _specular(lit, _lobes(clean), points, 32, 1)
+    return clean.map("irradiance")[which] + np.pi * arriving.reshape(-1, 64, 3).mean(axis=1)
+
+
+def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
+    stage = open_measured(room.glossy)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    lit = atlas.lit_scene(black_environment())
+    found = _refined_light(run, atlas, lit, frames)
+    which = _reflecting(room, atlas)
+    truth = room.clean.map("lit")[which]
+    before = _off(atlas.map("lit")[which], truth)
+    assert before > 0.05
+    assert _off(found.diffuse[which], truth) < 0.1 * before
+
+
+def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset):
+    atlas = _atlas(fitted)
+    which, owner = _reflecting(room, atlas), atlas.texels.object_index()
+    for i, item in enumerate(atlas.scene.objects):
+        own = which & (owner == i)
+        if item.label == "lamp":
+            continue
+        assert own.sum() > 20
+        wanted = room.clean.map("lit")[own]
+        assert _off(atlas.map("diffuse")[own], wanted) < 0.5 * _off(atlas.map("lit")[own], wanted)
+    wanted = np.pi * room.clean.map("lit")[which] / _true_irradiance(room.clean, which)
+    found, before = (
+        float(np.median(np.abs(atlas.map(name)[which] / wanted - 1)))
+        for name in ("base_color", "albedo")
+    )
+    assert before > 0.02
+    # Not better, because this room glows as it likes where nobody looked.
+    assert found < 0.55 * before
+
+
+def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Path):
+    """From S of the glossy room's lit texture to that of its diffuse radiance and lobes."""
+    atlas = AssetMaps(open_measured(room.glossy))
+    some = np.flatnonzero(_reflecting(room, atlas))
+    some = np.random.default_rng(1).choice(some, 400, replace=False)
+    wanted = _true_irradiance(room.clean, some)
+    lit, diffuse = room.clean.lit_scene(black_environment()), room.clean.map("lit")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    found = _irradiance(run, atlas, lit, diffuse, _lobes(atlas))[some]
+    before = atlas.map("irradiance")[some]
+    off = [(some.sum() / wanted.sum() - 1, _off(some, wanted)) for some in (before, found)]
+    assert abs(off[0][0]) > 0.008
+    assert abs(off[1][0]) < 0.3 * abs(off[0][0])
+    assert off[1][1] < 0.02
+
+
+def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
+    atlas = _atlas(fitted)
+    unseen = ~atlas.coverage.observed
+    unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
+    assert unseen.sum() > 50
+    wanted = (atlas.map("base_color") * atlas.map("refined_irradiance") / np.pi)[unseen]
+    np.testing.assert_allclose(atlas.map("diffuse")[unseen], wanted, rtol=4e-3, atol=1e-4)
+
+
+def _refined(room: Room, folder: Path) -> np.ndarray:
+    """Refined irradiance of the glossy room in its own lit texture."""
+    atlas = AssetMaps(open_measured(room.glossy))
+    run = TaskRun(folder, "fit", folder / "work")
+    lit, diffuse = atlas.lit_scene(black_environment()), 0.8 * atlas.map("lit")
+    return _irradiance(run, atlas, lit, diffuse, _lobes(atlas))
+
+
+def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: Path, monkeypatch):
+    atlas = AssetMaps(open_measured(room.glossy))
+    frames, lit = frames_from_stage(atlas.stage), atlas.lit_scene(black_environment())
+    given = []
+
+    def spied(run, lit, texels, traced, change, *others):
+        given.append(atlas.lit + change)
+        return refined_irradiance(run, lit, texels, traced, change, *others)
+
+    monkeypatch.setattr(refine, "refined_irradiance", spied)
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    found = _refined_light(run, atlas, lit, frames)
+    unseen = ~atlas.coverage.observed
+    unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
+    # The base colour is filled in alike, whichever irradiance it is made with.
+    share = given[0][unseen] / found.diffuse[unseen]
+    change = atlas.map("irradiance")[unseen] / found.irradiance[unseen]
+    assert np.median(np.abs(share / change - 1)) < 0.05
+    lit_there = atlas.map("lit")[unseen]
+    assert np.median(np.abs(given[0][unseen] / lit_there - 1)) > 0.1
+
+
+def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):
+    whole = _refined(room, tmp_path / "whole")
+    monkeypatch.setattr(irradiance_map, "_TILE", 300)
+    np.testing.assert_array_equal(_refined(room, tmp_path / "tiles"), whole)
+
+
+def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
+    """A lamp of which more is known than the lit texture shows has lit S already."""
+    by_name = AssetMaps.map_where_present
+
+    def brighter(atlas: AssetMaps, aov: str, channels: int) -> Float:
+        return by_name(atlas, aov, channels) * (2 if aov == "emission" else 1)
+
+    monkeypatch.setattr(AssetMaps, "map_where_present", brighter)
+    lobes = Lobes(phi=np.ones(5, np.float32), psi=np.zeros(5, np.float32))
+    atlas = AssetMaps(open_measured(room.glossy))
+    emission = atlas.map_where_present("emission", 3)
+    diffuse = np.where(emission > 0, emission, atlas.map("lit"))
+    run, lit = TaskRun(tmp_path, "fit", tmp_path / "work"), atlas.lit_scene(black_environment())
+    found = _irradiance(run, atlas, lit, diffuse, lobes)
+    traced = atlas.map("irradiance")
+    reflects = _reflecting(room, atlas)
+    # No lobe but its grazing part, so nothing is added but a few per cent.
+    assert np.median(found[reflects] / traced[reflects]) < 1.1
+
+
+def test_the_base_colour_is_the_refined_radiance_over_the_refined_irradiance(fitted: Asset):
+    atlas = _atlas(fitted)
+    base_color = atlas.map("base_color")
+    assert base_color.min() >= 0
+    assert base_color.max() <= 1
+    measured = atlas.coverage.measured
+    dark = measured & (atlas.map_where_present("emission", 3) == 0).all(axis=1)
+    wanted = np.pi * atlas.map("diffuse") / atlas.map("refined_irradiance")
+    np.testing.assert_allclose(base_color[dark], np.clip(wanted, 0, 1)[dark], atol=2e-3)
+
+
+def test_the_lamp_keeps_its_radiance(room: Room, fitted: Asset):
+    atlas = _atlas(fitted)
+    index = [item.label for item in atlas.scene.objects].index("lamp")
+    own = atlas.texels.of_object(index)
+    assert read_shading(atlas.stage, atlas.scene.objects[index].prim_path).emitter
+    emission = atlas.map_where_present("emission", 3)[own]
+    shines = (emission > 0).any(axis=1)
+    assert shines.sum() > 10
+    np.testing.assert_array_equal(atlas.map("diffuse")[own][shines], emission[shines])
+    np.testing.assert_array_equal(atlas.map("base_color")[own][shines], 0)
+
+
+def _diffuse_color(asset: Asset, label: str) -> str:
+    """The file that a renderer reads an object's colour from."""
+    stage = Usd.Stage.Open(str(asset.root_layer))
+    prim = stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{label}")
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0]
+    sources, _ = shader.GetInput("diffuseColor").GetConnectedSources()
+    texture = UsdShade.Shader(sources[0].source.GetPrim())
+    return Path(texture.GetInput("file").Get().path).name
+
+
+def test_the_material_shows_the_base_colour(fitted: Asset):
+    assert _diffuse_color(fitted, "floor") == "floor.base_color.exr"
+    assert (fitted.folder / "previews" / "base_color.png").is_file()
+
+
+def test_other_fits_leave_the_albedo(room: Room):
+    paper = _fitted(room, "paper", usdbrdf.FitOptions(method="paper", max_pixels=60))
+    stage = open_measured(paper)
+    for item in AssetMaps(stage).scene.objects:
+        names = {aov.name for aov in read_aovs(stage, item.prim_path)}
+        assert "lit" in names
+        assert not names & {"diffuse", "refined_irradiance", "base_color"}
+    assert _diffuse_color(paper, "floor") == "floor.albedo.exr"
+
+
+def _contents(folder: Path) -> dict[str, str]:
+    """SHA-256 of every texture."""
+    files = sorted((folder / "textures").iterdir())
+    return {path.name: sha256_of(path) for path in files if path.is_file()}
+
+
+def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatch):
+    starts = []
+    through_all = refine.samples_from_frames
+
+    def interrupted(*arguments, **options):
+        starts.append(NUM_FRAMES - len(arguments[4]))
+        for done, samples in enumerate(through_all(*arguments, **options)):
+            yield samples
+            if len(starts) == 1 and done == INTERRUPTED:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(refine, "samples_from_frames", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _fitted(room, "again", usdbrdf.FitOptions())
+    folder = room.folder / "assets" / "again"
+    assert not list((folder / "textures").glob("*.diffuse.exr"))
+    with usdbrdf.working_on(folder) as asset:
+        usdbrdf.fit(asset, usdbrdf.FitOptions())
+    assert starts == [0, INTERRUPTED + 1]
+    assert _contents(folder) == _contents(fitted.folder)
+
+
+def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, monkeypatch, capsys):
+    def three(texels, *_):
+        ends = [0, len(texels) // 3, len(texels) // 2, len(texels)]
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    monkeypatch.setattr(refine, "groups_of_texels", three)
+    set_quiet(False)
+    thrice = _fitted(room, "thrice", usdbrdf.FitOptions(memory=1.0))
+    set_quiet(True)
+    assert "3 passes over the frames" in capsys.readouterr().err
+    assert _contents(thrice.folder) == _contents(fitted.folder)
+
+
+def test_too_little_memory_is_no_reason_to_stop_at_the_end(room: Room, fitted: Asset, capsys):
+    set_quiet(False)
+    narrow = _fitted(room, "narrow", usdbrdf.FitOptions(memory=0.01))
+    set_quiet(True)
+    assert "warning: " in (said := capsys.readouterr().err)
+    assert "the limit is 0.0" in said
+    assert _contents(narrow.folder) == _contents(fitted.folder)
+
+
+def test_of_texels_that_many_frames_see_some_samples_are_enough():
+    texel = np.arange(40_000, dtype=np.int32)
+    samples = np.repeat(np.float32([5, 24, 48, 96]), 10_000)
+    frames = [refine._subsample(texel, samples, frame, 7) for frame in range(48)]
+    share = np.mean(frames, axis=0).reshape(4, -1)
+    assert (share[:2] == 1).all()
+    np.testing.assert_allclose(share[2:].mean(axis=1), [0.5, 0.25], atol=0.005)
+    # Independent from frame to frame, and of what else is asked for.
+    np.testing.assert_allclose(share[2:].std(axis=1), np.sqrt([0.25 / 48, 0.1875 / 48]), rtol=0.05)
+    some = np.arange(25_000, 40_000, 7)
+    np.testing.assert_array_equal(
+        refine._subsample(texel[some], samples[some], 3, 7), frames[3][some]
+    )

@@ -1,0 +1,94 @@
+"""A room of known albedo whose lamps clip in every frame: the lamps, and S from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import World, quad, room, world_of
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.options import Sampling
+from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
+from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.tile_draws import independent_tiles
+
+ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]
+ALBEDO += [(0.6, 0.6, 0.6)]
+LAMPS = [(12.0, 10.0, 7.0), (5.0, 5.5, 6.5)]
+SATURATION = 3.0
+
+
+def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) -> np.ndarray:
+    """L_d (T, 3) after some bounces, with noise of each texel's own, as pictures have it."""
+    order, _ = tiles_of_texels(world.texels)
+    tile = independent_tiles(len(order))
+    lit = emitted
+    for bounce in range(bounces):
+        found = irradiance_at(
+            world.rays, world.texture(lit), world.lights(lit), black_environment(),
+            world.texels.position[order], world.texels.normal[order], tile,
+            Sampling(standard_error=0.01, max_rays=512, seed=bounce), world.size,
+        )  # fmt: skip
+        irradiance = np.empty_like(lit)
+        irradiance[order] = found.mean
+        lit = (emitted + albedo * irradiance / np.pi).astype(np.float32)
+    return lit
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    """A room with a lamp under the ceiling, object 6, and one before a wall, object 7."""
+    lamps = (
+        quad((1, 1, 2.3), (0, 0.4, 0), (0.4, 0, 0)),
+        quad((3.9, 1, 1), (0, 0, 0.4), (0, 0.4, 0)),
+    )
+    return world_of([*room((0, 0, 0), (4, 3, 2.5), size=(20, 20)), *lamps])
+
+
+@pytest.fixture(scope="module")
+def truth(world: World) -> np.ndarray:
+    emitted = world.per_object([(0, 0, 0)] * 6 + LAMPS)
+    rng = np.random.default_rng(5)
+    albedo = world.per_object(ALBEDO + [(0, 0, 0)] * 2)
+    albedo *= np.exp(0.03 * rng.standard_normal((len(albedo), 1))).astype(np.float32)
+    return _shone(world, albedo, emitted, bounces=5)
+
+
+def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    run = TaskRun(folder, "shade", folder / "work")
+    coverage = CoverageMap.of(~clipped, clipped)
+    return estimate_clipped_light(run, surface, lit, coverage, black_environment(), 0)
+
+
+def test_the_lamps_are_as_bright_as_their_light_says(
+    world: World, truth: np.ndarray, tmp_path: Path
+):
+    clipped = (truth >= SATURATION).any(axis=1)
+    assert 128 <= clipped.sum() < 300
+    lit = np.where(clipped[:, None], np.float32(SATURATION), truth)
+    before = lit.copy()
+    light = _estimated(world, lit, clipped, tmp_path)
+    np.testing.assert_array_equal(lit, before)
+    np.testing.assert_array_equal(light.lit[~clipped], lit[~clipped])
+    assert light.estimate.determined.all()
+    assert light.least_of_lamps() == 0
+    for lamp, expected in zip((6, 7), LAMPS, strict=True):
+        found = light.lit[world.texels.of_object(lamp)].mean(axis=0)
+        error = light.error_of_object(lamp)
+        assert error < 0.1
+        assert np.abs(np.log(found / expected)).max() < 2.5 * error
+
+
+def test_light_that_did_not_clip_stays_as_it_is(world: World, truth: np.ndarray, tmp_path: Path):
+    nothing = np.zeros(len(truth), bool)
+    light = _estimated(world, truth, nothing, tmp_path)
+    assert light.lit is truth
+    assert light.least_of_lamps() == 0
+    assert np.isnan(light.error_of_object(6))
+    assert not light.may_shine(nothing).any()

@@ -1,0 +1,251 @@
+"""L_d without the specular light that its frames hold, and the base colour that follows.
+
+The median of the frames keeps the specular reflection that is seen from everywhere: by 2 to 130 %
+it made albedos too large. With the lobes known it can be taken off every single sample, by ray
+tracing. What is left are samples of one number with known errors: so their robust mean takes the
+place of the median, and what the pixels blurred is restored where it stands above the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.frames import read_frames
+from usdbrdf.job.progress import progress, say
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import Texels
+from usdbrdf.shading.albedo import albedo_map
+from usdbrdf.shading.denoise import OIDN
+from usdbrdf.texturing.footprints import footprints, restored, widest
+from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.observe import samples_from_frames, spread_order
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
+from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
+from usdbrdf.transport.lobe_radiance import lobe_radiance
+from usdbrdf.transport.warps import shifts_of
+
+# Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
+# see needs fewer of each.
+_RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
+
+# Of a texel that more frames see than this, so many are taken on the average, spread over all: what
+# is left of their noise is far below the other errors.
+_MOST_SAMPLES = 24
+
+# Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
+# sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
+_OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
+
+_RELATIVE_ERROR = calibration.number("refine.relative_error")
+_OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
+
+_DARKEST = calibration.number("refine.darkest")
+
+
+class LightBefore(Protocol):
+    """What texturing and shading know of T texels; each is read when it is needed.
+
+    lit         (T, 3) W/(m^2 sr): L_d with the specular light in it
+    samples     (T,): how many frames measured each texel
+    emission    (T, 3) W/(m^2 sr): what shines by itself, zero elsewhere; emissive (T,): it does
+    irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced_irradiance: before the lightmap
+                filter, where there was one
+    """
+
+    @property
+    def lit(self) -> Float: ...
+    @property
+    def samples(self) -> Float: ...
+    @property
+    def coverage(self) -> CoverageMap: ...
+    @property
+    def emission(self) -> Float: ...
+    @property
+    def emissive(self) -> Bool: ...
+    @property
+    def irradiance(self) -> Float: ...
+    @property
+    def traced_irradiance(self) -> Float: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
+    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two."""
+
+    diffuse: Float
+    irradiance: Float
+    base_color: Float
+
+
+def refined_light(
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    before: LightBefore,
+    lobes: Lobes,
+    lightmap_filter: str,
+    memory: float | None,
+    seed: int,
+) -> Refined:
+    """What the frames show of T texels without the specular light of the ``lobes``: L_d, S and base
+    colour; in as many passes over the frames as ``memory`` (GiB) asks for.
+
+    Where no frame measured a texel the base colour is filled in from its object's measured ones,
+    and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
+    """
+    found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
+    emissive, observed = before.emissive, before.coverage.observed
+    known = np.isfinite(found.mean[:, 0]) & ~emissive
+    restored_light = _restored(texels, found, known, _level(before.lit))
+    diffuse = np.where(emissive[:, None], before.emission, restored_light)
+    # What clips in every frame is at least as bright as that.
+    clipped = before.coverage.clipped[:, None]
+    diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
+    filled = ~(observed | emissive)[:, None]
+
+    def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
+        """Base colour, and L_d with what it reflects where nobody looked."""
+        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive)
+        return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
+
+    _, diffuse = reflected(diffuse, before.irradiance)
+    change = np.where(emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
+    traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
+    irradiance = refined_irradiance(run, lit, texels, traced, change, lobes, lightmap_filter, seed)
+    base_color, diffuse = reflected(diffuse, irradiance)
+    return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
+
+
+def _restored(texels: Texels, found: RobustMean, known: Bool, level: Float) -> Float:
+    """(T, 3), W/(m^2 sr), from the means in units of ``level``; filled in where not ``known``."""
+    filled = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
+    variance = found.variance * level**2
+    return np.maximum(restored(texels, filled, known, variance, found.footprint), 0)
+
+
+def _level(lit: Float) -> Float:
+    """Of each texel, (T,), W/(m^2 sr): its lit radiance (T, 3), and no less than a little."""
+    mean = lit.mean(axis=1)
+    level: Float = np.maximum(mean, max(_DARKEST * float(np.median(mean)), 1e-30))
+    return level
+
+
+def _means_without_lobes(
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    before: LightBefore,
+    lobes: Lobes,
+    memory: float | None,
+    seed: int,
+) -> RobustMean:
+    """Of T texels the mean over all frames without their specular light, relative to ``_level`` of
+    their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
+    textures = _bytes_of(lit) // len(texels)
+    need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
+    try:
+        groups = groups_of_texels(texels, lit.scene, frames, memory, need)
+    except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
+        say(f"warning: {short}")
+        groups = smallest_groups(texels)
+
+    def means(part: slice) -> dict[str, Float]:
+        observed = _observed(run, lit, texels, frames, before, lobes, seed, part)
+        return robust_mean(observed)._asdict()
+
+    return RobustMean(**in_passes(run, "means", groups, means))
+
+
+def _bytes_of(lit: LitScene) -> int:
+    """What the light takes beside scene and texels."""
+    return lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+
+
+def _observed(
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    before: LightBefore,
+    lobes: Lobes,
+    seed: int,
+    part: slice,
+) -> MeanState:
+    """Some texels in all frames, going on from the last saved state of an interrupted run."""
+    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
+    name = f"refined-{part.start}-{part.stop}"
+    saved = run.latest(name)
+    start, observed = 0, MeanState.empty(part.stop - part.start)
+    if saved is not None:
+        start, observed = saved[0] + 1, MeanState(**saved[1])
+    # The mean starts from its first samples, which must not all show one highlight.
+    order = spread_order(len(frames))[start:]
+    images = read_frames(frames, order)
+    sampled = samples_from_frames(texels, lit.scene, lit.rays, frames, images, part)
+    bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
+    for done, some in enumerate(bar, start):
+        taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
+        texel, radiance = some.texel[taken], some.radiance[taken]
+        camera = frames.camera(some.frame)
+        specular = np.empty_like(radiance)
+        often = samples[texel] >= _MANY_FRAMES
+        for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
+            own = texel[which]
+            specular[which] = lobe_radiance(
+                lit, _seen_from(texels, own, camera.eye), lobes.phi[owner[own]],
+                lobes.psi[owner[own]], rays, seed + len(frames) + some.frame, own.astype(np.int64),
+            )  # fmt: skip
+        unit, covered = level[texel], footprints(texels, texel, camera)
+        deviation = _deviation(unit, covered, float(frames.noise_floor_radiance[some.frame]))
+        values = (radiance - specular) / unit[:, None]
+        update(observed, texel - np.int32(part.start), values, deviation, covered)
+        run.save_latest_in_time(name, done, observed.arrays)
+    return observed
+
+
+def _deviation(unit: Float, covered: Float, noise_floor: float) -> Float:
+    """Of the errors of samples, (M,), in units of their texels' ``unit``, with footprints
+    ``covered`` (M, 3)."""
+    noise = np.float32(_OF_NOISE_FLOOR * noise_floor) / unit
+    # A wide view of a texel says less of it than its noise tells.
+    wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
+    return np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+
+
+def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
+    """Which of the texels (M,), which so many frames show as ``samples`` (M,) says, are taken from
+    this frame: what becomes of a texel depends on nothing but its number."""
+    taken: Bool = samples <= _MOST_SAMPLES
+    many = np.flatnonzero(~taken)
+    chance = shifts_of(texel[many].astype(np.int64), 1, seed + frame)[:, 0]
+    taken[many] = chance * samples[many] < _MOST_SAMPLES
+    return taken
+
+
+def _seen_from(texels: Texels, which: Int, eye: Double) -> SurfacePoints:
+    """Texels as surface points that a camera at ``eye`` sees."""
+    position = texels.position[which]
+    to_camera = (eye - position).astype(np.float32)
+    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+    barycentric = texels.barycentric[which]
+    return SurfacePoints(
+        face=texels.face[which],
+        u=barycentric[:, 1],
+        v=barycentric[:, 2],
+        position=position,
+        normal=texels.normal[which],
+        to_camera=to_camera,
+    )
