@@ -241,7 +241,7 @@ def fit_target_frame(
     # Highlights count for more than their share of pixels. Errors of L_d and of the frame grow with
     # the radiance; the floor keeps the noise of dark pixels small.
     level = diffuse.mean(axis=1, keepdims=True)
-    floor = max(0.1 * float(np.median(level)), 1e-9)
+    floor = max(0.1 * float(np.median(level)), 1e-30)
     weight = (1 / (level + floor) ** 2).astype(np.float32)
     return fit_grid(observed, weight, basis, multiple_of(diffuse * np.sqrt(weight))), len(chosen)
 

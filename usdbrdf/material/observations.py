@@ -270,7 +270,7 @@ class Follower:
         for seen, light in zip(self._seen, self._light, strict=True):
             np.maximum(contrast, np.abs(light - mean), out=contrast, where=seen)
         level = self._radiance.sum(axis=(0, 2)) / np.maximum(3 * views, 1)
-        return np.where(views >= _MIN_VIEWS, contrast / (level + level.mean() + 1e-9), -1)
+        return np.where(views >= _MIN_VIEWS, contrast / np.maximum(level + level.mean(), 1e-30), -1)
 
     def _mirrored_light(self, which: npt.NDArray[np.int64], eye: Double) -> Float:
         """Mean L_d about the mirror direction, (len(which),): what a highlight would show."""

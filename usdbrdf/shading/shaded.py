@@ -146,7 +146,7 @@ def shade_surface(
         surface.texels, light.lit, irradiance, coverage.measured, emitters.emissive
     )
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / np.maximum(
-        traced.mean.mean(axis=1), 1e-12
+        traced.mean.mean(axis=1), 1e-30
     )
     return Shaded(
         light=light,

@@ -10,7 +10,6 @@ cannot be known; their median is 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import say
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Frames
 
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
@@ -33,6 +32,9 @@ _MOST_CONTRADICTING = 0.2
 
 # Samples further off than this, in logarithms, lose weight; and steps of the reweighting.
 _OUTLYING, _STEPS = 0.1, 8
+
+# Frames that are named.
+_LISTED = 6
 
 # What draws a gain to 0 that nothing else decides, in samples.
 _TIE = 1e-3
@@ -81,36 +83,42 @@ def gains_of_frames(logarithm: Float) -> Gains:
 
     logarithm  (P, N) as in ``Probes``
     """
-    known: Bool = np.isfinite(logarithm)
+    known = np.isfinite(logarithm)
     known &= (known.sum(axis=1) > 1)[:, None]
     weight = known.astype(np.float64)
     value = np.where(known, logarithm, 0).astype(np.float64)
     gain = np.zeros(value.shape[1])
-    off = value
     for _ in range(_STEPS):
-        total = np.maximum(weight.sum(axis=1), 1e-12)
-        own = weight.sum(axis=0) + _TIE
-
-        def without_radiance(
-            gain: Double, weight: Double = weight, total: Double = total, own: Double = own
-        ) -> Double:
-            return np.asarray(own * gain - weight.T @ ((weight @ gain) / total))
-
-        said = (weight * value).sum(axis=0)
-        said -= weight.T @ ((weight * value).sum(axis=1) / total)
-        equations = LinearOperator((len(gain), len(gain)), matvec=without_radiance)
-        gain, _ = cg(equations, said, x0=gain, rtol=1e-3, maxiter=200)
-        off = value - gain
-        off -= ((weight * off).sum(axis=1) / total)[:, None]
+        gain = _least_squares(value, weight, gain)
+        radiance = _mean(value - gain, weight)
+        off = value - gain - radiance[:, None]
         weight = known * np.minimum(1, _OUTLYING / np.maximum(np.abs(off), 1e-9))
     count = known.sum(axis=0).astype(np.float64)
-    off = np.where(known, np.abs(off), np.nan)
-    off[0] = np.where(count > 0, off[0], 0)  # a column of NaN has no median
-    scatter = 1.4826 * np.nanmedian(off, axis=0)
+    spreads = [
+        np.median(np.abs(o[k])) if k.any() else 0 for o, k in zip(off.T, known.T, strict=True)
+    ]
     enough = count >= _FEWEST
     if enough.any():
         gain -= np.median(gain[enough])
-    return Gains(gain, scatter, count)
+    return Gains(gain, 1.4826 * np.array(spreads, np.float64), count)
+
+
+def _least_squares(value: Double, weight: Double, start: Double) -> Double:
+    """The gains (N,) that fit values (P, N) best, each row with a radiance of its own."""
+    own, total = weight.sum(axis=0) + _TIE, np.maximum(weight.sum(axis=1), 1e-12)
+
+    def normal(gain: Double) -> Double:
+        return np.asarray(own * gain - weight.T @ ((weight @ gain) / total))
+
+    said = (weight * (value - _mean(value, weight)[:, None])).sum(axis=0)
+    equations = LinearOperator((len(own), len(own)), matvec=normal, dtype=np.float64)
+    gain: Double = cg(equations, said, x0=start, rtol=1e-3, maxiter=200)[0]
+    return gain
+
+
+def _mean(value: Double, weight: Double) -> Double:
+    """(P,) weighted means of the rows."""
+    return np.asarray((weight * value).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
 def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
@@ -122,30 +130,23 @@ def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
     gains = gains_of_frames(logarithm)
     compared = gains.samples >= _FEWEST
     size = np.abs(gains.logarithm)
-    off = compared & (size > _HALF_STOP) & (size > _STANDING_OUT * gains.scatter)
-    found = {
-        frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2)
-        for i in np.flatnonzero(off)
-    }
-    if not found:
+    off = np.flatnonzero(compared & (size > _HALF_STOP) & (size > _STANDING_OUT * gains.scatter))
+    factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
+    if not factor:
         return {}
-    names = [f"{name} ({gain:.2f} x)" for name, gain in found.items()]
+    names = [f"{name} ({gain:.2f} x)" for name, gain in factor.items()]
     what = (
-        f"{len(found)} of {int(compared.sum())} frames show the same surfaces brighter or darker "
-        f"than the other frames do, {_listed(names)}"
+        f"{len(off)} of {int(compared.sum())} frames show the same surfaces brighter or darker "
+        f"than the other frames do, {', '.join(names[:_LISTED])}"
+        f"{f' and {len(names) - _LISTED} more' if len(names) > _LISTED else ''}"
     )
     cause = (
         "Likely their exposure_time was not divided out of the pixels, or the images are not linear"
     )
-    if frames.radiometric and len(found) > _MOST_CONTRADICTING * compared.sum():
+    if frames.radiometric and len(off) > _MOST_CONTRADICTING * compared.sum():
         raise InputRefused(
             f"{what} (limits: half a stop, {_MOST_CONTRADICTING:.0%} of the frames). {cause}. "
             "Export radiance in one unit for all frames. [texturing.exposure]"
         )
     say(f"warning: {what}. {cause}. Correct them or leave them out. [texturing.exposure]")
-    return found
-
-
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    return factor

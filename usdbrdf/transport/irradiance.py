@@ -222,7 +222,7 @@ def _noisy(tile: Int, mean: Double, error: Double, target: float, dark: Double) 
     points = np.maximum(np.bincount(index), 1)
     level = np.bincount(index, mean.sum(axis=1) / 3) / points
     square = np.bincount(index, (error**2).sum(axis=1) / 3) / points
-    floor = np.maximum(np.bincount(index, dark) / points, 1e-12)
+    floor = np.maximum(np.bincount(index, dark) / points, 1e-30)
     return (np.sqrt(square) > target * np.maximum(level, floor))[index]
 
 

@@ -1,0 +1,117 @@
+"""Frames that contradict each other in brightness are found, and good ones are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.texturing.exposures import Probes, contradicting_frames, gains_of_frames
+
+FRAMES, TEXELS = 40, 600
+
+
+def _logarithm(
+    factors: dict[int, float] | None = None, *, reach: int = 6, seed: int = 0
+) -> np.ndarray:
+    """(TEXELS, FRAMES): each texel is seen by 2 x ``reach`` frames in a row, with 8 % of noise, and
+    every tenth sample is a highlight, up to 20 times as bright."""
+    rng = np.random.default_rng(seed)
+    found = np.full((TEXELS, FRAMES), np.nan)
+    for t, middle in enumerate(rng.integers(FRAMES, size=TEXELS)):
+        own = np.arange(max(0, middle - reach), min(FRAMES, middle + reach))
+        noise = 0.08 * rng.standard_normal(len(own))
+        highlight = np.where(rng.random(len(own)) < 0.1, rng.uniform(0, 3, len(own)), 0)
+        found[t, own] = rng.uniform(-6, 2) + noise + highlight
+    for frame, factor in (factors or {}).items():
+        found[:, frame] += np.log(factor)
+    return found.astype(np.float32)
+
+
+def _frames(*, radiometric: bool = True) -> SimpleNamespace:
+    return SimpleNamespace(
+        image_paths=tuple(Path(f"{i:04d}.exr") for i in range(FRAMES)), radiometric=radiometric
+    )
+
+
+def test_gains_are_those_that_were_made_up():
+    rng = np.random.default_rng(4)
+    made = np.exp(0.5 * rng.standard_normal(FRAMES))
+    gains = gains_of_frames(_logarithm(dict(enumerate(made))))
+    expected = np.log(made) - np.median(np.log(made))
+    np.testing.assert_allclose(gains.logarithm, expected, atol=0.06)
+    assert (gains.samples > 50).all()
+
+
+def test_the_unit_does_not_matter():
+    one = gains_of_frames(_logarithm({3: 4.0})).logarithm
+    other = gains_of_frames(_logarithm({3: 4.0}) + np.float32(np.log(1e5))).logarithm
+    np.testing.assert_allclose(one, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_good_frames_raise_no_alarm(seed, capsys):
+    assert contradicting_frames(_frames(), _logarithm(seed=seed)) == {}
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("factor", [4.0, 1.6, 0.5])
+def test_a_few_wrong_exposures_are_named_with_their_gains(factor, capsys):
+    wrong = {5: factor, 6: factor, 31: factor}
+    found = contradicting_frames(_frames(), _logarithm(wrong))
+    assert found.keys() == {"0005.exr", "0006.exr", "0031.exr"}
+    np.testing.assert_allclose(list(found.values()), factor, rtol=0.1)
+    printed = capsys.readouterr().err
+    assert "3 of 40 frames" in printed
+    assert "0031.exr (" in printed
+    assert "exposure_time" in printed
+    assert printed.endswith("[texturing.exposure]\n")
+
+
+@pytest.mark.parametrize(
+    "wrong", [range(1, FRAMES, 2), range(FRAMES // 2), range(0, FRAMES, 3)], ids=str
+)
+def test_two_camps_are_refused_unless_they_are_photographs(wrong):
+    logarithm = _logarithm(dict.fromkeys(wrong, 4.0))
+    with pytest.raises(InputRefused, match=r"of 40 frames .*0\d+\.exr \(.*not linear.*exposure\]$"):
+        contradicting_frames(_frames(), logarithm)
+    assert contradicting_frames(_frames(radiometric=False), logarithm)
+
+
+def test_frames_that_share_nothing_are_not_judged():
+    logarithm = _logarithm()
+    logarithm[:, 7] = np.nan
+    logarithm[:10, 7] = 30
+    assert contradicting_frames(_frames(), logarithm) == {}
+    assert contradicting_frames(_frames(), np.full((0, FRAMES), np.nan, np.float32)) == {}
+
+
+def test_probes_are_the_same_however_the_texels_are_grouped():
+    rng = np.random.default_rng(1)
+    texel = rng.permutation(10_000)[:7000].astype(np.int32)
+    radiance = rng.random((7000, 3), np.float32)
+    radiance[::50] = 0
+    whole = Probes.empty(10_000, 3)
+    whole.add(1, texel, radiance)
+    assert len(whole.logarithm) <= 4096
+    assert np.isnan(whole.logarithm[:, [0, 2]]).all()
+    parts = []
+    for part in (slice(0, 1), slice(1, 4321), slice(4321, 10_000)):
+        own = Probes.empty(10_000, 3, part)
+        inside = (texel >= part.start) & (texel < part.stop)
+        own.add(1, texel[inside], radiance[inside])
+        parts.append(own.logarithm)
+    np.testing.assert_array_equal(np.concatenate(parts), whole.logarithm)
+    shown = texel % whole.every == 0
+    lit = shown & radiance.any(axis=1)
+    assert lit.sum() > 2000
+    found = whole.logarithm[texel[lit] // whole.every, 1]
+    np.testing.assert_array_equal(found, np.log(radiance[lit].mean(axis=1)))
+    assert np.isfinite(whole.logarithm).sum() == lit.sum()
+
+
+def test_many_frames_take_no_more_memory():
+    assert Probes.empty(1_000_000, 50_000).logarithm.nbytes <= 9 << 20
