@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
 
 # The layers that the stages write, weakest first; each sees only those before it.
@@ -37,6 +37,19 @@ class Asset:
         made_with = _default_prim(folder / "layers" / "scan.usdc")
         return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
 
+    @staticmethod
+    def made(place: Path) -> Asset:
+        """The asset of a folder, or of the root layer in it; InputRefused where there is none."""
+        place = Path(place)
+        asset = Asset.at(place.parent if place.is_file() else place)
+        root = asset.root_layer
+        if not root.is_file() or (place.is_file() and not place.samefile(root)):
+            raise InputRefused(
+                f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or "
+                "the NAME.usda in it. [asset.missing]"
+            )
+        return asset
+
     @property
     def root_layer(self) -> Path:
         return self.folder / f"{self.name}.usda"
@@ -64,6 +77,14 @@ class Asset:
         """Path of a stage's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
         return self.folder / "layers" / f"{role}{suffix[role]}"
+
+    def refuse_output(self, output: Path, rule: str) -> None:
+        """UsageError for a place inside the folder: what reads an asset leaves it as it is."""
+        if output.resolve().is_relative_to(self.folder.resolve()):
+            raise UsageError(
+                f"{output}: lies inside the asset {self.folder}, which stays as it is. Name "
+                f"another place with -o. [{rule}]"
+            )
 
     def texture(self, identifier: str, aov: str) -> str:
         """Path of an object's map, relative to the asset folder."""

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from usdbrdf.delivery.package import ARKIT, DEFAULT, PackageOptions
-from usdbrdf.delivery.textures import EXR, PNG
+from usdbrdf.delivery.packaged_files import EXR, PNG
 
 
 def add_package_options(parser: argparse.ArgumentParser) -> None:

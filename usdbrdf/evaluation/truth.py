@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,15 +17,25 @@ from scipy.spatial import cKDTree
 
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.metrics import finite, median_relative, nrmse
+from usdbrdf.evaluation.metrics import finite, map_error, nrmse
+from usdbrdf.evaluation.viewed_asset import Atlas
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Float
-from usdbrdf.tasks.atlas import Atlas
-
-Known: TypeAlias = Mapping[str, Mapping[str, Any]]
 
 # Fewer observations than this are no median.
 MIN_SAMPLES = 3
+
+
+class KnownObject(NamedTuple):
+    """An object of the truth: its number in the capture's mesh, its lobe, whether it emits."""
+
+    number: int
+    phi: float
+    psi: float
+    emits: bool
+
+
+Known: TypeAlias = Mapping[str, KnownObject]
 
 
 def compare_with_truth(
@@ -49,11 +59,13 @@ def compare_with_truth(
 def known_objects(folder: Path, atlas: Atlas) -> Known:
     """The truth's objects by name; InputRefused where it lacks one of the asset's."""
     path = folder / "objects.json"
-    listed = read_json(path)
     try:
-        known = {o["name"]: o for o in listed}
-        for o in listed:
-            float(o["phi"]), float(o["psi"]), max(o["emission"]), int(o["id"])
+        known = {
+            o["name"]: KnownObject(
+                int(o["id"]), float(o["phi"]), float(o["psi"]), max(o["emission"]) > 0
+            )
+            for o in read_json(path)
+        }
     except (TypeError, KeyError, ValueError) as error:
         raise InputRefused(
             f"{path}: not a list of objects with id, name, phi, psi and emission ({error!r}). "
@@ -70,7 +82,7 @@ def known_objects(folder: Path, atlas: Atlas) -> Known:
 
 def emitters(atlas: Atlas, known: Known) -> Bool:
     """(num_objects,) bool, objects that truly emit."""
-    return np.array([max(known[obj.label]["emission"]) > 0 for obj in atlas.scene.objects])
+    return np.array([known[obj.label].emits for obj in atlas.scene.objects])
 
 
 def scored_texels(atlas: Atlas, shines: Bool) -> Bool:
@@ -81,24 +93,15 @@ def scored_texels(atlas: Atlas, shines: Bool) -> Bool:
 
 
 def albedo_error(atlas: Atlas, scored: Bool, found: Float, known: Float) -> dict[str, Any]:
-    """NRMSE, area-weighted, and median relative errors of maps (T, 3) over the texels scored."""
-    area = atlas.texels.area
-    owner = atlas.texels.object_index()
-
-    def over(part: Bool) -> float:
-        return nrmse(found[part], known[part], area[part])
-
-    absolute, signed = median_relative(found[scored], known[scored])
-    return {
-        "nrmse": finite(over(scored)),
-        "median_abs_relative": finite(absolute),
-        "median_signed": finite(signed),
-        "objects": {
-            obj.identifier: finite(over(scored & (owner == i)), 4)
-            for i, obj in enumerate(atlas.scene.objects)
-            if (scored & (owner == i)).any()
-        },
-    }
+    """NRMSE, area-weighted, and median relative errors of maps (T, 3) over the texels scored; NRMSE
+    per object too."""
+    area, owner = atlas.texels.area, atlas.texels.object_index()
+    objects = {}
+    for i, obj in enumerate(atlas.scene.objects):
+        own = scored & (owner == i)
+        if own.any():
+            objects[obj.identifier] = finite(nrmse(found[own], known[own], area[own]), 4)
+    return {**map_error(found, known, area, scored)._asdict(), "objects": objects}
 
 
 def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
@@ -119,12 +122,12 @@ def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
             f"{path}: albedo is {per_vertex.shape}, but {mesh} has {len(source.vertices)} "
             "vertices. Name the mesh that it belongs to with --mesh. [evaluate.truth]"
         )
-    names = {o["id"]: o["name"] for o in read_json(folder / "objects.json")}
+    known = known_objects(folder, atlas)
     corners = np.asarray(source.vertices, np.float32)[source.faces]
     result = np.zeros((len(atlas.texels), 3), np.float32)
     for i, obj in enumerate(atlas.scene.objects):
         own = atlas.texels.of_object(i)
-        theirs = np.flatnonzero([names.get(int(label)) == obj.label for label in labels])
+        theirs = np.flatnonzero(labels == known[obj.label].number)
         if not len(theirs):
             raise InputRefused(
                 f"{mesh}: no face belongs to the object {obj.label!r}. Name the mesh of the same "
@@ -154,41 +157,47 @@ def _labelled_mesh(mesh: Path) -> tuple[Any, npt.NDArray[Any]]:
     return source, labels
 
 
+class _MaterialError(NamedTuple):
+    """|found - true| of an object that does not emit, and whether its values were measured."""
+
+    phi: float
+    psi: float
+    measured: bool
+
+
 def material_error(atlas: Atlas, known: Known, shines: Bool) -> dict[str, Any]:
     """Errors of phi and psi of each object that does not emit, and their means by status."""
     rows: dict[str, dict[str, Any]] = {}
+    errors = []
     for obj, emits in zip(atlas.scene.objects, shines, strict=True):
         fit = read_fit(atlas.stage, obj.prim_path)
         if emits or fit is None:
             continue
         truth = known[obj.label]
+        phi, psi = (round(abs(a - b), 3) for a, b in ((fit.phi, truth.phi), (fit.psi, truth.psi)))
+        errors.append(_MaterialError(phi, psi, fit.status == "measured"))
         rows[obj.identifier] = {
-            "truth": [truth["phi"], truth["psi"]],
+            "truth": [truth.phi, truth.psi],
             "found": [round(fit.phi, 3), round(fit.psi, 3)],
             "status": fit.status,
             "evidence": finite(fit.evidence, 3),
             "confidence": [fit.phi_confidence, fit.psi_confidence],
             "stated_error": [finite(fit.phi_error, 3), finite(fit.psi_error, 3)],
-            "error": [round(abs(fit.phi - truth["phi"]), 3), round(abs(fit.psi - truth["psi"]), 3)],
+            "error": [phi, psi],
         }
-
-    def mean(status: str | None, k: int) -> float | None:
-        errors = [r["error"][k] for r in rows.values() if status in (None, r["status"])]
-        return float(np.mean(errors)) if errors else None
-
-    def largest(k: int) -> float | None:
-        return max(
-            (r["error"][k] for r in rows.values() if r["status"] == "measured"), default=None
-        )
-
+    measured = [error for error in errors if error.measured]
     return {
         "objects": len(rows),
-        "mean_abs_phi": mean(None, 0),
-        "mean_abs_psi": mean(None, 1),
-        "measured": sum(r["status"] == "measured" for r in rows.values()),
-        "measured_mean_abs_phi": mean("measured", 0),
-        "measured_mean_abs_psi": mean("measured", 1),
-        "measured_largest_phi": largest(0),
-        "measured_largest_psi": largest(1),
+        "mean_abs_phi": _mean([error.phi for error in errors]),
+        "mean_abs_psi": _mean([error.psi for error in errors]),
+        "measured": len(measured),
+        "measured_mean_abs_phi": _mean([error.phi for error in measured]),
+        "measured_mean_abs_psi": _mean([error.psi for error in measured]),
+        "measured_largest_phi": max((error.phi for error in measured), default=None),
+        "measured_largest_psi": max((error.psi for error in measured), default=None),
         "rows": rows,
     }
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -29,6 +29,11 @@ def say(line: str) -> None:
     tqdm.write(printable(line), file=sys.stderr)
 
 
+def warn(sentence: str) -> None:
+    """Say what was left out or may be wrong, and go on."""
+    say(f"warning: {sentence}")
+
+
 def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Iterator[T]:
     """The same items; ``unit`` is a plural noun ("frames"). stdout is never touched."""
     if _quiet or sys.stderr is None:

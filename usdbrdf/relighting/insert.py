@@ -62,15 +62,6 @@ class Insert:
         return self.drop is not None and len(self.drop) == 2
 
 
-def turned_up(model_up: str, scene_up: str) -> Double:
-    """(4, 4) rotation about x that brings one up axis to the other."""
-    turn = np.eye(4)
-    if model_up != scene_up:
-        sign = 1.0 if scene_up == "Z" else -1.0
-        turn[1:3, 1:3] = [[0.0, -sign], [sign, 0.0]]
-    return turn
-
-
 def rotation_about(up_axis: str, degrees: float) -> Double:
     """(4, 4) counter-clockwise seen from the tip of the axis."""
     x, y, z = _UP[up_axis]

@@ -12,10 +12,10 @@ import numpy as np
 from usdbrdf.asset.readers.lights import sky_of_picture
 from usdbrdf.asset.readers.render_scene import Published, published_file
 from usdbrdf.errors import InputRefused
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
-from usdbrdf.model.material import Surface
-from usdbrdf.relighting.insert import Insert, placed, turned_up, with_material
+from usdbrdf.model.material import Surface, turned_up
+from usdbrdf.relighting.insert import Insert, placed, with_material
 from usdbrdf.relighting.inserted_models import surfaces_from_model
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their
@@ -93,14 +93,14 @@ def relit_scene(
         )
     scene = RelitScene(surfaces=(*scene.surfaces, *inserted), lights=scene.lights)
     if not emits_light(scene):
-        _warn("nothing in the scene emits light; the picture will be black.")
+        warn("nothing in the scene emits light; the picture will be black.")
     return scene
 
 
 def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
         return (), (sky_of_picture(file, up_axis),)
-    found = published_file(file, _warn)
+    found = published_file(file, warn)
     if not found.lights and not any(surface.material.emits for surface in found.surfaces):
         raise InputRefused(
             f"{file}: no light in it, and no mesh that glows. Add UsdLux lights or an "
@@ -115,9 +115,9 @@ def _model(insert: Insert, asset: Published) -> tuple[Surface, ...]:
     """In metres, with the asset's up axis."""
     suffix = insert.model.suffix.lower()
     if suffix in USD_SUFFIXES:
-        found = published_file(insert.model, _warn)
+        found = published_file(insert.model, warn)
         if found.lights:
-            _warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
+            warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
         surfaces, model_up, scale = found.surfaces, found.up_axis, 1.0
     else:
         # glTF says metres and y up; the others say nothing and are taken to be as the asset is.
@@ -128,7 +128,3 @@ def _model(insert: Insert, asset: Published) -> tuple[Surface, ...]:
         raise InputRefused(f"{insert.model}: no mesh in it. Export the surface. [relight.model]")
     turn = turned_up(insert.up or model_up, asset.up_axis) @ np.diag([scale, scale, scale, 1.0])
     return tuple(surface.moved(turn) for surface in surfaces)
-
-
-def _warn(sentence: str) -> None:
-    say(f"warning: {sentence}")

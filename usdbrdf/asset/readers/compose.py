@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import ROLES, Asset
@@ -68,6 +68,21 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             "back the file that it names. [stage.open]"
         )
     return stage
+
+
+def named_files(layer: Sdf.Layer) -> set[str]:
+    """Asset paths as written: sublayers, references, payloads, clips, attributes, metadata, of all
+    variants. The layer is not changed."""
+    copy = Sdf.Layer.CreateAnonymous()
+    copy.TransferContent(layer)
+    found: set[str] = set()
+
+    def collected(path: str) -> str:
+        found.add(path)
+        return path
+
+    UsdUtils.ModifyAssetPaths(copy, collected)
+    return found - {""}
 
 
 def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:

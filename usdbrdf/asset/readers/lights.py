@@ -20,7 +20,7 @@ from usdbrdf.asset.readers.materials import read_texture
 from usdbrdf.asset.readers.surfaces import metres_from_units
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.light import DistantLight, Light, ShapeLight, SkyLight
-from usdbrdf.model.material import constant_map
+from usdbrdf.model.material import constant_map, turned_up
 
 _SHAPES = ("RectLight", "DiskLight", "SphereLight")
 
@@ -63,9 +63,8 @@ def lights_from_stage(
 def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
     """A latitude-longitude picture about the stage's up axis, as ``shade --environment`` has it:
     in a world with z up it is the y-up one turned by 90 degrees about x."""
-    turned = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     image = np.maximum(read_texture(file, "raw"), 0)
-    return SkyLight(image=image, world_from_here=turned if up_axis == "Z" else np.eye(3))
+    return SkyLight(image=image, world_from_here=turned_up("Y", up_axis)[:3, :3])
 
 
 def up_axis(stage: Usd.Stage) -> str:
