@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from measure import Lit, timed
 
-from usdbrdf.shading.denoise import OIDN, chosen_filter
 from usdbrdf.tasks.trace import denoised_irradiance
 from usdbrdf.transport import irradiance
+from usdbrdf.transport.denoise import OIDN, chosen_filter
 from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
 
 PAPERS_RAYS = 10_000

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
-from usdbrdf.shading.denoise import CHOICES
 from usdbrdf.tasks.shade import ShadeOptions
 from usdbrdf.tasks.texture import TextureOptions
+from usdbrdf.transport.denoise import CHOICES
 from usdbrdf.transport.irradiance import Sampling
 
 # The paper's number of independent directions per texel.

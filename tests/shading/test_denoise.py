@@ -14,8 +14,8 @@ import pytest
 from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import give_back_freed, resident_bytes
-from usdbrdf.shading.denoise import CHOICES, chosen_filter, denoise_lightmaps, denoise_picture
 from usdbrdf.tasks.trace import denoised_irradiance
+from usdbrdf.transport.denoise import CHOICES, chosen_filter, denoise_lightmaps, denoise_picture
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
-import trimesh
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.readers.objects import read_fit
@@ -21,6 +19,7 @@ from usdbrdf.evaluation.metrics import finite, map_error, nrmse
 from usdbrdf.evaluation.viewed_asset import Atlas
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 # Fewer observations than this are no median.
 MIN_SAMPLES = 3
@@ -107,7 +106,12 @@ def albedo_error(atlas: Atlas, scored: Bool, found: Float, known: Float) -> dict
 def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
     """(T, 3), linear between the vertices of the capture's mesh, a PLY with ``object_id``: each
     face of ours is found in it by its centre, among those of the object of the same name."""
-    source, labels = _labelled_mesh(mesh)
+    source = mesh_from_file(mesh)
+    if source.face_label is None:
+        raise InputRefused(
+            f"{mesh}: its faces have no property object_id. Name the capture's mesh with --mesh. "
+            "[evaluate.truth]"
+        )
     path = folder / "albedo_vertex.npz"
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -117,17 +121,17 @@ def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
             f"{path}: no array 'albedo' can be read from it ({error}). Check --truth. "
             "[evaluate.truth]"
         ) from error
-    if per_vertex.shape != (len(source.vertices), 3):
+    if per_vertex.shape != (len(source.points), 3):
         raise InputRefused(
-            f"{path}: albedo is {per_vertex.shape}, but {mesh} has {len(source.vertices)} "
+            f"{path}: albedo is {per_vertex.shape}, but {mesh} has {len(source.points)} "
             "vertices. Name the mesh that it belongs to with --mesh. [evaluate.truth]"
         )
     known = known_objects(folder, atlas)
-    corners = np.asarray(source.vertices, np.float32)[source.faces]
+    corners = source.points[source.triangles]
     result = np.zeros((len(atlas.texels), 3), np.float32)
     for i, obj in enumerate(atlas.scene.objects):
         own = atlas.texels.of_object(i)
-        theirs = np.flatnonzero(labels == known[obj.label].number)
+        theirs = np.flatnonzero(source.face_label == known[obj.label].number)
         if not len(theirs):
             raise InputRefused(
                 f"{mesh}: no face belongs to the object {obj.label!r}. Name the mesh of the same "
@@ -139,22 +143,9 @@ def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
         match = theirs[nearest]
         distance = np.linalg.norm(ours[:, :, None] - corners[match][:, None], axis=-1)
         corner = distance.argmin(axis=2)
-        values = per_vertex[source.faces[match[:, None], corner]]
+        values = per_vertex[source.triangles[match[:, None], corner]]
         result[own] = np.einsum("tc,tcd->td", atlas.texels.barycentric[own], values)
     return result
-
-
-def _labelled_mesh(mesh: Path) -> tuple[Any, npt.NDArray[Any]]:
-    try:
-        # Unprocessed, because merged vertices would no longer be the truth's.
-        source = trimesh.load(mesh, process=False)
-        labels = np.asarray(source.metadata["_ply_raw"]["face"]["data"]["object_id"]).ravel()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputRefused(
-            f"{mesh}: not a readable PLY with the face property object_id ({error!r}). Name the "
-            "capture's mesh with --mesh. [evaluate.truth]"
-        ) from error
-    return source, labels
 
 
 class _MaterialError(NamedTuple):

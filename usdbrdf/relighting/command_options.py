@@ -14,7 +14,7 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import finite_number, seed_number
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.relight import MIN_BOUNCES, RelightOptions
-from usdbrdf.shading.denoise import CHOICES
+from usdbrdf.transport.denoise import CHOICES
 
 _INSERT_HELP = """put a model in (USD, OBJ, PLY, GLB); may be given again. at=X,Y,Z, or
 drop=X,Y[,Z]: let it fall there (from the height Z; default: from that of the highest capture

@@ -25,7 +25,7 @@ from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
 from usdbrdf.relighting.render import mitsuba_variant, render_view
-from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter, denoise_picture
+from usdbrdf.transport.denoise import AUTO, OIDN, chosen_filter, denoise_picture
 
 MIN_BOUNCES = 4
 

@@ -18,7 +18,6 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.material.verdict import NEUTRAL, class_prior, verdict_on_frame, verdict_on_views
 from usdbrdf.model.capture import Frames
-from usdbrdf.shading.denoise import NONE
 from usdbrdf.tasks.atlas import Atlas, MapWriter, atlas_from_stage
 from usdbrdf.tasks.fit_objects import FitOptions, fitted_objects, survey_frames
 from usdbrdf.tasks.lit import lit_scene
@@ -28,6 +27,7 @@ from usdbrdf.tasks.refined_irradiance import Lobes, filter_of
 from usdbrdf.tasks.step import Step, hash_of_files, hash_of_maps, weaker_layers
 from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
 from usdbrdf.tasks.texture import FILLED
+from usdbrdf.transport.denoise import NONE
 from usdbrdf.transport.lit_scene import LitScene
 
 

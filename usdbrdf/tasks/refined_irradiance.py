@@ -20,9 +20,9 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Float
-from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.tasks.trace import denoised_irradiance, tiles_of_patches
+from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
 from usdbrdf.transport.lights import lights_from_radiance

@@ -20,7 +20,6 @@ from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.model.arrays import Bool, Float
-from usdbrdf.shading.denoise import AUTO, OIDN, chosen_filter
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.lamp_shapes import LampShape, lamp_shapes
 from usdbrdf.tasks.albedo_map import albedo_map
@@ -31,6 +30,7 @@ from usdbrdf.tasks.step import Step, hash_of_maps, weaker_layers
 from usdbrdf.tasks.surroundings import environment_from_file, environment_hash
 from usdbrdf.tasks.texture import CLIPPED, MEASURED
 from usdbrdf.tasks.trace import denoised_irradiance, trace_irradiance
+from usdbrdf.transport.denoise import AUTO, OIDN, chosen_filter
 from usdbrdf.transport.irradiance import Irradiance, Sampling
 from usdbrdf.transport.rays import RayScene
 

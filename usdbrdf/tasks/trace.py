@@ -12,8 +12,8 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import StageRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.texels import Texels
-from usdbrdf.shading.denoise import denoise_lightmaps
 from usdbrdf.tasks.atlas import Atlas
+from usdbrdf.transport.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.incoming_light import whole_patches
 from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
