@@ -40,7 +40,7 @@ from usdbrdf.files.frames import read_frame
 from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -86,7 +86,7 @@ def main() -> int:
 
 def some_patches(atlas: Atlas, share: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels of every ``share``-th patch, and their patch numbers."""
-    order, patch = patches_of_texels(atlas.texels)
+    order, patch = tiles_of_texels(atlas.texels)
     keep = patch % share == 0
     return order[keep], patch[keep]
 
@@ -103,11 +103,10 @@ def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, flo
     store: list[list[np.ndarray]] = [[] for _ in chosen]
     for i in range(len(frames)):
         pixels = read_frame(frames, i)
-        pose, lens = frames.world_from_camera[i], frames.intrinsics[i]
-        surfaces = first_surfaces(rays, scene.face_object, pose, lens, frames.resolution[i])
+        surfaces = first_surfaces(rays, scene.face_object, frames.camera(i))
         kind, radiance = samples_from_frame(
             texels, texels.object_index(), surfaces, np.nan_to_num(pixels.radiance), pixels.valid,
-            pixels.clipped, pose, lens,
+            pixels.clipped, frames.camera(i),
         )  # fmt: skip
         for t in np.flatnonzero((kind == SAMPLE) & (place >= 0)):
             store[place[t]].append(radiance[t])

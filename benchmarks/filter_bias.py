@@ -32,7 +32,7 @@ from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.tasks.lit import lit_scene
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
 
 REFERENCE = Sampling(standard_error=0.0, max_rays=4096, seed=977)
 
@@ -96,7 +96,7 @@ def errors(
     atlas: Atlas, raw: Array, filtered: Array, scored: Array, contact: Array, share: int
 ) -> dict[str, Any]:
     """Relative errors of S raw and filtered against a converged S of the same light."""
-    order, patch = patches_of_texels(atlas.texels)
+    order, patch = tiles_of_texels(atlas.texels)
     keep = patch % share == 0
     order, patch = order[keep], patch[keep]
     position, normal = atlas.texels.position[order], atlas.texels.normal[order]

@@ -28,7 +28,7 @@ from usdbrdf.material.fit_views import MIXTURE
 from usdbrdf.model.capture import Frames
 from usdbrdf.tasks import fit, fit_objects
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.lobe_samples import LOBE_ALPHAS, Mixture
+from usdbrdf.transport.lobe_radiance import LOBE_ALPHAS, Mixture
 
 T = TypeVar("T")
 

@@ -27,7 +27,6 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
-from usdbrdf.model.camera import View
 from usdbrdf.model.capture import Frames
 from usdbrdf.relighting.render import pinhole
 
@@ -95,18 +94,11 @@ def compared(
 
 
 def pinhole_of(frames: Frames, i: int) -> mi.Sensor:
-    width, height = (int(size) for size in frames.resolution[i])
-    lens = tuple(float(number) for number in frames.intrinsics[i])
-    if abs(lens[0] - lens[1]) > 1e-6 * lens[0]:
+    camera = frames.camera(i)
+    fx, fy, _, cy = camera.intrinsics
+    if abs(fx - fy) > 1e-6 * fx:
         raise SystemExit(f"frame {i}: its pixels are not square, which is not provided for here")
-    view = View(
-        name=str(i),
-        world_from_camera=frames.world_from_camera[i],
-        intrinsics=lens,
-        width=width,
-        height=height,
-    )
-    return pinhole(mi, view, height, lens[3])
+    return pinhole(mi, camera, camera.height, cy)
 
 
 def squares(image: Array) -> Array:

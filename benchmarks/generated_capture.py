@@ -25,7 +25,7 @@ from numba import prange
 
 from usdbrdf.files.images import write_exr
 from usdbrdf.kernel import parallel_kernel
-from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import RayScene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
@@ -170,20 +170,21 @@ def pose(k: int, frames: int) -> Array:
 def write_frames(folder: Path, scene: Scene, options: argparse.Namespace) -> None:
     """All images, and transforms.json last."""
     width, height = options.width, options.height
-    lens = np.array([FOCAL * width, FOCAL * width, width / 2, height / 2])
+    lens = (FOCAL * width, FOCAL * width, width / 2, height / 2)
     rays = RayScene(scene.points, scene.triangles)
     poses = [pose(k, options.frames) for k in range(options.frames)]
     names = [f"frames/{k:04d}.exr" for k in range(options.frames)]
     with ThreadPoolExecutor(max_workers=options.threads) as pool:
         writing = []
-        for k, (name, camera) in enumerate(zip(names, poses, strict=True)):
-            image = photograph(scene, rays, camera, lens, width, height, np.random.default_rng(k))
+        for k, (name, there) in enumerate(zip(names, poses, strict=True)):
+            camera = Camera(world_from_camera=there, intrinsics=lens, width=width, height=height)
+            image = photograph(scene, rays, camera, np.random.default_rng(k))
             while len(writing) > options.threads:
                 writing.pop(0).result()
             writing.append(pool.submit(write_exr, folder / name, image))
         for job in writing:
             job.result()
-    camera = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens.tolist(), strict=True))
+    camera = dict(zip(("fl_x", "fl_y", "cx", "cy"), lens, strict=True))
     document = {
         "camera_model": "PINHOLE", "w": width, "h": height, **camera,
         "mesh": "mesh.ply", "objects": "objects.json",
@@ -200,21 +201,18 @@ def write_frames(folder: Path, scene: Scene, options: argparse.Namespace) -> Non
 def photograph(
     scene: Scene,
     rays: RayScene,
-    camera: Array,
-    lens: Array,
-    width: int,
-    height: int,
+    camera: Camera,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """(H, W, 3) float32 radiance, cut at the saturation."""
-    origins, directions = camera_rays(camera, lens, pixel_centres(width, height))
+    origins, directions = camera.rays(camera.pixels())
     hits = rays.closest(origins, directions)
     # As a sensor's noise: what a coder cannot compress.
-    image = rng.standard_normal((height * width, 3), np.float32)
+    image = rng.standard_normal((len(hits.face), 3), np.float32)
     lamp = scene.names.index("lamp")
     shade(scene.points, scene.triangles, scene.owner, hits.face, hits.distance, directions,
-          camera[:3, 3].copy(), LIGHT, lamp, image)  # fmt: skip
-    return image.reshape(height, width, 3)
+          camera.eye.copy(), LIGHT, lamp, image)  # fmt: skip
+    return image.reshape(camera.height, camera.width, 3)
 
 
 @parallel_kernel

@@ -17,7 +17,7 @@ from measure import Lit, timed
 from usdbrdf.tasks.trace import denoised_irradiance
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.denoise import OIDN, chosen_filter
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
 
 PAPERS_RAYS = 10_000
 COUNTS = (16, 32, 64, 100, 128)
@@ -38,7 +38,7 @@ class Sizes(NamedTuple):
 def some_texels(lit: Lit, count: int) -> tuple[np.ndarray, np.ndarray]:
     """About ``count`` scored texels, evenly spread in the order of their patches, and the numbers
     of these: a few of each patch."""
-    order, patch = patches_of_texels(lit.atlas.texels)
+    order, patch = tiles_of_texels(lit.atlas.texels)
     usable = np.flatnonzero(scored(lit)[order])
     chosen = usable[np.linspace(0, len(usable) - 1, min(count, len(usable))).astype(int)]
     return order[chosen], patch[chosen]
@@ -80,7 +80,7 @@ def first_round_of(rays: int) -> Iterator[None]:
 def noise(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     """Relative RMSE and seconds per texel of each way; rays and time for equal noise."""
     order, patch = some_texels(lit, sizes.texels)
-    every, every_patch = patches_of_texels(lit.atlas.texels)
+    every, every_patch = tiles_of_texels(lit.atlas.texels)
     converged = Sampling(standard_error=0, max_rays=sizes.reference_rays, seed=977)
     reference = shaded(lit, order, patch, converged).mean.mean(axis=1)
     good = reference > 0

@@ -63,7 +63,7 @@ from peer_optimiser import Check, Course, Settings, optimised
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.evaluation.truth import known_objects
 from usdbrdf.relighting.render import mitsuba_variant
-from usdbrdf.transport.lobe_samples import Mixture
+from usdbrdf.transport.lobe_radiance import Mixture
 
 SETTINGS = Settings()
 QUICK = Settings(most_checks=1, limit_s=60.0)

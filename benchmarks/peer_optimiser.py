@@ -16,7 +16,6 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.files.frames import read_frame
-from usdbrdf.model.camera import View, camera_rays, pixel_centres
 from usdbrdf.model.light import RelitScene
 from usdbrdf.model.material import Material, Surface, constant_map
 from usdbrdf.relighting import mitsuba_scene, render
@@ -257,11 +256,8 @@ def targets_of(mi: Any, asset: Path, lit: Lit, labels: list[str]) -> Targets:
     for k in range(len(frames)):
         pixels = read_frame(frames, k)
         height, width = pixels.valid.shape
-        pose, lens = frames.world_from_camera[k], frames.intrinsics[k]
-        view = View(
-            name=str(k), world_from_camera=pose, intrinsics=lens, width=width, height=height
-        )
-        rays = camera_rays(pose, lens, pixel_centres(width, height))
+        camera = frames.camera(k)
+        rays = camera.rays(camera.pixels())
         owner = lit.scene.owner(lit.scene.rays.closest(*rays).face).reshape(height, width)
         good = pixels.valid & (owner >= 0) & fitted[owner] & ~outlines(owner)
         radiance = np.where(good[..., None], np.nan_to_num(pixels.radiance), 0).astype(np.float32)
@@ -270,7 +266,7 @@ def targets_of(mi: Any, asset: Path, lit: Lit, labels: list[str]) -> Targets:
         level = (uniform_filter(radiance.mean(axis=2), 5) / share)[..., None]
         floor = 0.1 * float(np.median(level[good])) if good.any() else 1.0
         weight = good[..., None] / (level + floor) ** 2 / max(int(good.sum()), 1)
-        sensors.append(render._sensor(mi, view, height, float(lens[3])))
+        sensors.append(render.pinhole(mi, camera, height, camera.intrinsics[3]))
         radiances.append(radiance)
         weights.append(weight.astype(np.float32))
     return Targets(sensors, np.stack(radiances), np.stack(weights))

@@ -45,15 +45,21 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.transport import incoming_light
+from usdbrdf.transport import irradiance
 from usdbrdf.transport.cosine_sampling import cosine_directions, frames_of
-from usdbrdf.transport.embree import closest_hits, closest_hits_of_groups
-from usdbrdf.transport.incoming_light import whole_patches
-from usdbrdf.transport.irradiance import Sampling, patches_of_texels
-from usdbrdf.transport.light_sampling import empty_room, empty_segments, light_segments, turns
-from usdbrdf.transport.patch_draws import groups_of
+from usdbrdf.transport.embree import closest_hits, closest_hits_of_groups, empty_hits
+from usdbrdf.transport.irradiance import Sampling, tiles_of_texels, whole_tiles
+from usdbrdf.transport.light_sampling import (
+    Met,
+    Receivers,
+    empty_picked,
+    empty_segments,
+    light_segments,
+    turns,
+)
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import AHEAD
+from usdbrdf.transport.tile_draws import groups_of
 
 THREADS = os.cpu_count() or 1
 # Places of the scene that throughput is measured at.
@@ -97,7 +103,7 @@ def measure(asset: Path, quick: bool) -> dict[str, Any]:
 
 
 def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
-    order, patch = spread(*patches_of_texels(lit.atlas.texels), sizes.traced)
+    order, patch = spread(*tiles_of_texels(lit.atlas.texels), sizes.traced)
     sampling = Sampling(standard_error=0, max_rays=64, seed=1)
     calls, scene = rays_of(lit, order, patch, sampling), embreex_scene(lit.scene.rays)
     ours, embree = side_by_side(
@@ -125,7 +131,7 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
 
 def spread(order: np.ndarray, patch: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """About ``count`` texels of the whole scene: RUNS runs of whole patches, evenly spaced."""
-    parts = whole_patches(patch, count // RUNS)
+    parts = whole_tiles(patch, count // RUNS)
     evenly = np.linspace(0, len(parts), RUNS, endpoint=False).astype(int)
     kept = np.concatenate([np.arange(len(patch))[parts[k]] for k in np.unique(evenly)])
     return order[kept], patch[kept]
@@ -135,31 +141,33 @@ def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) 
     """All rays that the estimator traces, in its order: a call for each of its loops' calls."""
     calls: list[Call] = []
 
-    def by_direction(*arguments: Any) -> None:
-        origin, normal, draws, start, block = arguments[4:9]
-        frames, room, found = frames_of(normal), np.empty((3, AHEAD), np.float32), []
-        groups = groups_of(draws[3])
+    def by_cosine(_: Met, receivers: Receivers, start: int, block: np.ndarray, *sums: Any) -> None:
+        origin, draws, groups = (
+            receivers.origin,
+            receivers.draws,
+            groups_of(receivers.draws.identity),
+        )
+        frames, scratch = frames_of(receivers.normal), np.empty((3, AHEAD), np.float32)
+        found = []
         for first, last, sample in turns(groups, len(block)):
             origins = origin[first:last]
             directions = np.empty_like(origins)
-            cosine_directions(frames, draws, start + sample, first, directions, room)
+            cosine_directions(frames, draws, start + sample, first, directions, scratch)
             found.append((origins, directions, groups[first:last]))
         origins, directions, group = (np.concatenate(parts) for parts in zip(*found, strict=True))
         calls.append(Call(origins, directions, group=group))
 
-    def by_picks(*arguments: Any) -> None:
-        picks, origin, normal, draws, start, block = arguments[2:8]
-        room, segments, found = empty_room(), empty_segments(), []
-        for first, last, sample in turns(groups_of(draws[3]), len(block)):
-            count = light_segments(
-                picks, origin, normal, draws, start + sample, first, last, room, segments
-            )
-            found.append((origin[segments[0][:count]], segments[-1][:count].copy()))
+    def by_lights(_: Met, receivers: Receivers, start: int, block: np.ndarray, *sums: Any) -> None:
+        scratch, segments, found = empty_picked(), empty_segments(), []
+        for first, last, sample in turns(groups_of(receivers.draws.identity), len(block)):
+            count = light_segments(receivers, start + sample, first, last, scratch, segments)
+            ways = segments.direction[:count].copy()
+            found.append((receivers.origin[segments.point[:count]], ways))
         origins, ways = (np.concatenate(parts) for parts in zip(*found, strict=True))
         calls.append(Call(origins, ways, np.full(len(ways), 0.9999, np.float32)))
 
-    instead = {"add_light_by_direction": by_direction, "add_light_by_picks": by_picks}
-    with mock.patch.multiple(incoming_light, **instead):
+    instead = {"add_cosine_samples": by_cosine, "add_light_samples": by_lights}
+    with mock.patch.multiple(irradiance, **instead):
         shaded(lit, order, patch, sampling)
     return [call for call in calls if len(call.origins)]
 
@@ -191,11 +199,12 @@ def traced(lit: Lit, calls: list[Call]) -> None:
 
     def one(call: Call) -> None:
         count = len(call.origins)
-        found = np.empty(count, np.int32), *np.empty((3, count), np.float32)
         if call.group is None:
-            closest_hits(scene, call.origins, call.directions, *found)
+            closest_hits(scene, call.origins, call.directions, empty_hits(count))
         else:
-            closest_hits_of_groups(scene, call.origins, call.directions, call.group, *found)
+            closest_hits_of_groups(
+                scene, call.origins, call.directions, call.group, empty_hits(count)
+            )
 
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         list(pool.map(one, calls))

@@ -141,14 +141,14 @@ def by_parts(
     observed = Observation.empty(len(texels))
     samples = []
     for i in range(count):
-        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
+        camera = frames.camera(i)
         pixels = timed("read", read_frame, frames, i)
-        which = timed("cull", blocks.texels_in_view, pose, lens, size, MIN_COSINE)
+        which = timed("cull", blocks.texels_in_view, camera, MIN_COSINE)
         face_object = atlas.scene.face_object
-        surfaces = timed("occlusion", first_surfaces, rays, face_object, pose, lens, size)
+        surfaces = timed("occlusion", first_surfaces, rays, face_object, camera)
         kind, radiance = timed(
             "sample", samples_of_texels, texels, which, owner, surfaces, pixels.radiance,
-            pixels.valid, pixels.clipped, pose, lens,
+            pixels.valid, pixels.clipped, camera,
         )  # fmt: skip
         taken = which[kind == SAMPLE], radiance[kind == SAMPLE]
         timed("psquare", psquare.update, observed.quantiles, *taken, QUANTILE)

@@ -33,7 +33,7 @@ from pxr import Usd, UsdGeom, UsdShade
 from usdbrdf.asset.layout import Asset
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import read_radiance, write_exr
-from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import triangulate
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.usd_meshes import UsdMeshes, meshes_from_usd
@@ -208,7 +208,9 @@ def radiance(
     size: tuple[int, int], up: Array,
 ) -> Array:  # fmt: skip
     """(H, W, 3): albedo / pi times the irradiance of sky and sun; black where nothing is."""
-    origins, directions = camera_rays(camera, lens, pixel_centres(*size))
+    width, height = size
+    view = Camera(world_from_camera=camera, intrinsics=tuple(lens), width=width, height=height)
+    origins, directions = view.rays(view.pixels())
     hits = rays.closest(origins, directions)
     seen = hits.face >= 0
     image = np.zeros((len(hits.face), 3))

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.files.images import write_exr
-from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import RayScene
 
 Float = npt.NDArray[np.float32]
@@ -103,8 +103,8 @@ def make_capture(
     rng = np.random.default_rng(seed)
     entries = []
     for i, pose in enumerate(poses):
-        rays = camera_rays(pose, intrinsics, pixel_centres(width, height))
-        face = scene.closest(*rays).face
+        camera = camera_at(pose, intrinsics, width, height)
+        face = scene.closest(*camera.rays(camera.pixels())).face
         seen = np.where(face >= 0, face_object[face], len(names))
         image = table[seen].reshape(height, width, 3)
         image = image * (1 + noise * rng.standard_normal(image.shape))
@@ -177,6 +177,11 @@ def room_mesh(
         owner.astype(np.int32),
         names,
     )
+
+
+def camera_at(pose: Double, intrinsics: Any, width: int, height: int) -> Camera:
+    """fx, fy, cx, cy in pixels of a picture so wide and high."""
+    return Camera(world_from_camera=pose, intrinsics=tuple(intrinsics), width=width, height=height)
 
 
 def ring_of_poses(count: int, *, radius: float = 1.2, height: float = 1.4) -> Double:

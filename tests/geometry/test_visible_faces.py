@@ -6,18 +6,18 @@ import numba
 import numpy as np
 import pytest
 
-from tests.scenes import look_at, ring_of_poses, room_mesh
+from tests.scenes import camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf.geometry import visible_faces as module
 from usdbrdf.geometry.visible_faces import visible_faces
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.transport.rays import BOX_FACES, RayScene
 
-SIZE = np.array([160, 120], np.int32)
+SIZE = (160, 120)
 LENS = np.array([90.0, 110.0, 77.3, 61.9])
 
 
 def _traced(rays: RayScene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    origins, directions = camera_rays(pose, LENS, pixel_centres(*SIZE))
+    camera = camera_at(pose, LENS, *SIZE)
+    origins, directions = camera.rays(camera.pixels())
     hits = rays.closest(origins, directions)
     met = hits.face >= 0
     point = np.where(met[:, None], origins + directions * hits.distance[:, None], 0)
@@ -25,7 +25,7 @@ def _traced(rays: RayScene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _agree(rays: RayScene, pose: np.ndarray, atol: float = 1e-4) -> np.ndarray:
-    face, point = visible_faces(rays, pose, LENS, SIZE)
+    face, point = visible_faces(rays, camera_at(pose, LENS, *SIZE))
     expected, where = _traced(rays, pose)
     np.testing.assert_array_equal(face, expected)
     np.testing.assert_allclose(point, where, atol=atol)
@@ -74,7 +74,7 @@ def test_edges_through_pixel_centres_are_left_to_rays(monkeypatch):
     monkeypatch.setattr(
         rays, "closest", lambda *arguments: asked.append(len(arguments[0])) or trace(*arguments)
     )
-    face, _ = visible_faces(rays, pose, LENS, SIZE)
+    face, _ = visible_faces(rays, camera_at(pose, LENS, *SIZE))
     np.testing.assert_array_equal(face, _traced(rays, pose)[0])
     assert (face >= 0).sum() > 10_000
     # Every eighth row and column, and the diagonals: a few thousand pixels, not all.
@@ -91,7 +91,8 @@ def test_one_surface_on_another_is_left_to_rays():
 
 def test_nothing_to_see():
     rays = RayScene(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
-    face, point = visible_faces(rays, look_at(np.full(3, 4.0), np.full(3, 9.0)), LENS, SIZE)
+    away = look_at(np.full(3, 4.0), np.full(3, 9.0))
+    face, point = visible_faces(rays, camera_at(away, LENS, *SIZE))
     assert (face == -1).all()
     np.testing.assert_array_equal(point, 0)
 
@@ -102,10 +103,10 @@ def test_the_number_of_threads_changes_nothing(monkeypatch):
     rays = _soup(3000, 2.0, 0.2)
     pose = look_at(np.zeros(3), np.array([1.0, 2, 0.5]))
     threads = numba.get_num_threads()
-    many = visible_faces(rays, pose, LENS, SIZE)
+    many = visible_faces(rays, camera_at(pose, LENS, *SIZE))
     try:
         numba.set_num_threads(1)
-        one = visible_faces(rays, pose, LENS, SIZE)
+        one = visible_faces(rays, camera_at(pose, LENS, *SIZE))
     finally:
         numba.set_num_threads(threads)
     np.testing.assert_array_equal(one[0], many[0])

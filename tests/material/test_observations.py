@@ -7,10 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.material import observations
 from usdbrdf.material.observations import SIDE, Follower
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, View
@@ -35,16 +34,17 @@ def _lit(world: World, lamp: int | None = None, size: float | None = None) -> Li
     return LitScene(
         scene=world.scene, rays=world.rays, radiance=texture,
         lights=lights_from_radiance(world.scene, world.texels, lit), emission=texture,
-        environment=black_environment(), size=size or world.size,
+        environment=black_environment(), diagonal_m=size or world.size,
     )  # fmt: skip
 
 
 def _view(i: int) -> View:
     pose = look_at(np.array([0.1 * i, -0.5, 2.0]), np.zeros(3))
-    hit = camera_rays(pose, LENS, pixel_centres(SIZE, SIZE))[1][:, 2] < 0
+    camera = camera_at(pose, LENS, SIZE, SIZE)
+    hit = camera.rays(camera.pixels())[1][:, 2] < 0
     return View(
         radiance=np.full((SIZE, SIZE, 3), 1 + i, np.float32), valid=hit.reshape(SIZE, SIZE),
-        world_from_camera=pose, intrinsics=LENS,
+        camera=camera,
     )  # fmt: skip
 
 
@@ -81,8 +81,9 @@ def test_on_a_plane_a_sample_is_the_mean_over_a_square(floor: World):
     view = View(
         radiance=np.random.default_rng(0).random((pixels, pixels, 3)).astype(np.float32),
         valid=np.ones((pixels, pixels), bool),
-        world_from_camera=look_at(np.array([0.0, -0.01, 2.0]), np.zeros(3)),
-        intrinsics=np.array([24.0, 24.0, 24.0, 24.0]),
+        camera=camera_at(
+            look_at(np.array([0.0, -0.01, 2.0]), np.zeros(3)), (24.0,) * 4, pixels, pixels
+        ),
     )
     hall = _lit(floor, size=20.0)
     follower = Follower(hall, floor.texels, np.ones(len(floor.texels), bool), 1, 0)
@@ -118,7 +119,7 @@ def test_the_frames_noise_tells_how_far_they_were_smoothed(floor: World, blur: f
         shown[:, width // 2 :] *= 3  # a bias of a whole object is no noise
         view = View(
             radiance=np.repeat(shown[..., None], 3, axis=2).astype(np.float32),
-            valid=np.ones((height, width), bool), world_from_camera=pose, intrinsics=lens,
+            valid=np.ones((height, width), bool), camera=camera_at(pose, lens, width, height),
         )  # fmt: skip
         follower.add(view, np.zeros((height, width), bool), 0.0)
     assert follower.smoothing == pytest.approx(blur, rel=0.15)
@@ -147,10 +148,10 @@ def test_the_target_frame_shows_the_highlight():
     ])  # fmt: skip
     usable = room.texels.object_index() != 2
     follower = Follower(_lit(room, lamp=2), room.texels, usable, 6, 0)
-    for camera in (0.0, 1.0, 2.0, -2.5, 0.5, 1.5):
+    for x in (0.0, 1.0, 2.0, -2.5, 0.5, 1.5):
         view = View(
             radiance=np.ones((SIZE, SIZE, 3), np.float32), valid=np.ones((SIZE, SIZE), bool),
-            world_from_camera=look_at(np.array([camera, -0.1, 2.0]), np.zeros(3)), intrinsics=LENS,
+            camera=camera_at(look_at(np.array([x, -0.1, 2.0]), np.zeros(3)), LENS, SIZE, SIZE),
         )  # fmt: skip
         follower.add(view, np.zeros((SIZE, SIZE), bool), 0.0)
     np.testing.assert_array_equal(follower.target_frames(room.texels), [3, -1, -1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.material.target_frames import (
     FrameCounts,
     choose_target_frames,
@@ -15,7 +15,6 @@ from usdbrdf.material.target_frames import (
     object_pixels,
 )
 from usdbrdf.material.verdict import class_prior
-from usdbrdf.model.camera import pixel_centres
 from usdbrdf.transport.lit_scene import visible_points
 
 WIDTH, HEIGHT = 80, 60
@@ -48,7 +47,8 @@ def _mirrored(position: np.ndarray) -> np.ndarray:
 
 
 def test_what_a_camera_sees(world: World, pose: np.ndarray):
-    points = visible_points(world.rays, world.scene, pose, LENS, pixel_centres(WIDTH, HEIGHT))
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    points = visible_points(world.rays, world.scene, camera, camera.pixels())
     floor = points.face >= 0
     floor &= points.face < 2
     assert floor.sum() > 2000
@@ -62,14 +62,16 @@ def test_what_a_camera_sees(world: World, pose: np.ndarray):
 def test_normals_are_turned_to_the_camera(world: World):
     # From below the floor: its normal points away and is turned round.
     below = look_at(np.array([0, -1.0, -1.0]), np.zeros(3))
-    points = visible_points(world.rays, world.scene, below, LENS, np.array([[40.0, 30.0]]))
+    camera = camera_at(below, LENS, WIDTH, HEIGHT)
+    points = visible_points(world.rays, world.scene, camera, np.array([[40.0, 30.0]]))
     assert points.face[0] in (0, 1)
     np.testing.assert_allclose(points.normal[0], [0, 0, -1], atol=1e-6)
     assert (points.normal * points.to_camera).sum() > 0
 
 
 def test_the_mirror_image_of_the_lamp_is_where_geometry_says(world: World, pose: np.ndarray):
-    points = visible_points(world.rays, world.scene, pose, LENS, pixel_centres(WIDTH, HEIGHT))
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    points = visible_points(world.rays, world.scene, camera, camera.pixels())
     emission = world.texture(world.per_object([(0, 0, 0), (1, 1, 1)]))
     found = mirror_hits_emitter(world.rays, points, emission, world.size)
     floor = (points.face >= 0) & (points.face < 2)
@@ -83,12 +85,13 @@ def test_the_mirror_image_of_the_lamp_is_where_geometry_says(world: World, pose:
 def test_a_frame_counts_highlights_and_valid_pixels(world: World, pose: np.ndarray):
     emission = world.texture(world.per_object([(0, 0, 0), (1, 1, 1)]))
     valid = np.ones((HEIGHT, WIDTH), bool)
-    pixels = pixel_centres(WIDTH, HEIGHT)
-    points = visible_points(world.rays, world.scene, pose, LENS, pixels)
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    pixels = camera.pixels()
+    points = visible_points(world.rays, world.scene, camera, pixels)
     floor = (points.face >= 0) & (points.face < 2)
 
     def count(valid: np.ndarray, stride: int = 1) -> FrameCounts:
-        return count_frame(world.rays, world.scene, emission, valid, pose, LENS, world.size, stride)
+        return count_frame(world.rays, world.scene, emission, valid, camera, world.size, stride)
 
     whole = count(valid)
     assert whole.valid[0] == floor.sum()

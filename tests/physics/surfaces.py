@@ -19,9 +19,9 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at
 from usdbrdf.transport.lights import Lights, lights_from_radiance
-from usdbrdf.transport.patch_draws import independent_patches
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
+from usdbrdf.transport.tile_draws import independent_tiles
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]
@@ -200,7 +200,7 @@ def estimates(
         environment or black_environment(),
         np.tile(np.asarray(points, np.float32), (repeat, 1)),
         np.tile(np.asarray(normals, np.float32), (repeat, 1)),
-        independent_patches(count * repeat),
+        independent_tiles(count * repeat),
         Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=seed),  # type: ignore[arg-type]
         world.size,
     )

@@ -14,7 +14,7 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import unwrap
 from usdbrdf.shading.albedo import albedo_from_irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
 
 RHO = np.array([0.2, 0.5, 0.8])
 EMITTED = np.array([1.0, 0.5, 0.25])
@@ -40,7 +40,7 @@ def _shade(
     world: World, lights: np.ndarray, estimator: str, rays: int, lit: np.ndarray | None = None
 ) -> Irradiance:
     lit = _lit(world) if lit is None else lit
-    order, patch = patches_of_texels(world.texels)
+    order, patch = tiles_of_texels(world.texels)
     found = irradiance_at(
         world.rays, world.texture(lit), world.lights(lights), black_environment(),
         world.texels.position[order], world.texels.normal[order], patch,
@@ -78,7 +78,7 @@ def test_no_ray_leaves_a_closed_room_with_real_charts():
     uv, resolution = unwrap(scene, 0.07)
     scene = replace(scene, corner_uv=uv)
     world = World(scene=scene, texels=texels_from_atlas(scene, resolution))
-    order, patch = patches_of_texels(world.texels)
+    order, patch = tiles_of_texels(world.texels)
     ones = np.ones((len(order), 3), np.float32)
     found = irradiance_at(
         world.rays, world.texture(ones), world.lights(ones), black_environment(),

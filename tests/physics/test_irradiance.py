@@ -9,7 +9,7 @@ from scipy import stats
 from tests.physics.chi2 import sidak
 from tests.physics.surfaces import World, box, estimates, room, world_of
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import Lights
 
 # Quads of the room and its two boxes; those of the lamp follow.
@@ -72,9 +72,9 @@ def test_seeds_matter_and_repetition_does_not(furnished):
         assert (runs[0] != runs[2]).mean() > 0.99
 
 
-def test_a_tile_of_whole_patches_gives_the_bits_of_the_whole(furnished):
+def test_a_tile_of_whole_tiles_gives_the_bits_of_the_whole(furnished):
     world, _, _ = furnished
-    order, patch = patches_of_texels(world.texels)
+    order, patch = tiles_of_texels(world.texels)
     cut = int(np.searchsorted(patch, patch[len(patch) // 2]))
     sampling = {"estimator": "mis", "standard_error": 0.1, "max_rays": 256}
     whole = _shade(furnished, order, patch, **sampling)
@@ -85,7 +85,7 @@ def test_a_tile_of_whole_patches_gives_the_bits_of_the_whole(furnished):
 
 def test_patches_are_blocks_of_one_object(furnished):
     texels = furnished[0].texels
-    order, patch = patches_of_texels(texels)
+    order, patch = tiles_of_texels(texels)
     assert sorted(order) == list(range(len(texels)))
     assert (np.diff(patch) >= 0).all()
     assert (np.diff(patch) <= 1).all()
@@ -126,7 +126,7 @@ def test_the_standard_error_of_independent_rays_is_unbiased(furnished):
 
 
 def test_rays_double_until_the_error_that_was_asked_for(furnished):
-    order, patch = patches_of_texels(furnished[0].texels)
+    order, patch = tiles_of_texels(furnished[0].texels)
     reached = _shade(furnished, order, patch, standard_error=0.05, max_rays=4096)
     exact = _shade(furnished, order, patch, standard_error=0.0, max_rays=4096, seed=77)
     assert exact.mean.min() > 1e-3

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from tests.physics.brdf import directional_albedo, f_nd
-from usdbrdf.transport.brdf import alpha_of_phi, distribution, grazing, lobe, masking
+from usdbrdf.transport.brdf import (
+    alpha_of_phi,
+    clamped,
+    distribution,
+    fresnel,
+    grazing,
+    lobe,
+    masking,
+    masking_width,
+)
 
 # Directional albedo at psi = 1 for light leaving at 10, 45 and 75 degrees, by an independent
 # quadrature of the paper's equations (three digits).
@@ -73,10 +82,12 @@ def test_masking_at_its_ends():
     # G1(1, y) = 1 / (1 + sqrt(1 + y^2 - y^2)) = 1/2: at normal incidence nothing is masked, and
     # G1^2 = 1 / (4 n.w n.wo). At y = 1 (phi = 1) G1(x) = 1 / (x + 1). phi = 0: y = 1/4.
     for phi in (0.0, 0.3, 1.0):
-        assert masking(1.0, phi) == pytest.approx(0.5)
+        assert masking(1.0, masking_width(phi)) == pytest.approx(0.5)
     for x in (0.01, 0.4, 0.9):
-        assert masking(x, 1.0) == pytest.approx(1 / (1 + x))
-        assert masking(x, 0.0) == pytest.approx(1 / (x + np.sqrt(x * x + (1 - x * x) / 16)))
+        assert masking(x, masking_width(1.0)) == pytest.approx(1 / (1 + x))
+        assert masking(x, masking_width(0.0)) == pytest.approx(
+            1 / (x + np.sqrt(x * x + (1 - x * x) / 16))
+        )
 
 
 def test_schlick_at_its_ends():
@@ -84,7 +95,9 @@ def test_schlick_at_its_ends():
     assert grazing(0.0) == 1
     assert grazing(0.5) == pytest.approx(1 / 32)
     # Rounding may give a cosine just above 1.
-    assert grazing(1 + 1e-9) == 0
+    assert grazing(clamped(1 + 1e-9)) == 0
+    assert fresnel(0.04, 1.0) == pytest.approx(0.04)
+    assert fresnel(0.04, 0.0) == 1
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.02, 0.3, 1.0])

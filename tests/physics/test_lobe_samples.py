@@ -10,10 +10,11 @@ import pytest
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, quad, room, world_of
+from usdbrdf.transport.brdf import grazing, half_vector, lobe
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import SurfacePoints
-from usdbrdf.transport.lobe_samples import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
+from usdbrdf.transport.lobe_radiance import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
 
 PHIS = (0.0, 0.02, 0.1, 0.3, 0.7, 1.0)
 RGB = np.array([3.0, 2.0, 1.0])
@@ -178,3 +179,28 @@ def test_points_of_a_group_share_the_work():
     together = np.array([_of_copies(seed, 64, mixture=few)[0] for seed in range(48)])
     assert np.mean(together) == pytest.approx(np.mean(alone), rel=0.02)
     assert together.std(axis=0).mean() < 0.5 * alone.std(axis=0).mean()
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.02, 0.3, 1.0])
+def test_sums_in_single_precision_are_those_of_the_lobe(phi: float):
+    # Each direction alone, with light such that the sum is f_nd itself.
+    rng = np.random.default_rng(5)
+    n, w, wo = np.array([0.0, 0, 1]), rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    w[:100] = 1e-3 * w[:100] + wo[:100] * [-1, -1, 1]  # near the mirror direction
+    w[:, 2], wo[:, 2] = np.abs(w[:, 2]), np.abs(wo[:, 2])
+    w, wo = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (w, wo))
+    half = np.array([half_vector(n, a, b) for a, b in zip(w, wo, strict=True)], np.float32)
+    samples = LobeSamples(
+        cos_in=w[:, 2:].astype(np.float32),
+        sin2_half=half[:, :1].copy(),
+        grazing=grazing(half[:, 1:].astype(np.float64)).astype(np.float32),
+        weighted=np.ones((500, 1, 3), np.float32),
+        cos_out=wo[:, 2].astype(np.float32),
+    )
+    base, slope = non_diffuse(samples, np.full((500, 8), phi, np.float32))
+    phi = float(np.float32(phi))
+    expected = np.array([lobe(n, a, b, phi) for a, b in zip(w, wo, strict=True)])
+    # Rounded: sin^2 of the half vector (twice in D), cosines, and some ten operations.
+    found = np.stack([base[:, 1, 3], slope[:, 1, 3]], axis=1)
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=2e-6)
+    np.testing.assert_allclose(found.sum(axis=1), expected.sum(axis=1), rtol=2e-6)

@@ -13,7 +13,7 @@ from tests.physics.surfaces import World, quad, room, world_of
 from usdbrdf.transport import lobe_radiance as predict
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
-from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.lobe_radiance import lobe_radiance
 
 RGB = np.array([3.0, 2.0, 1.0])
 # (degrees, phi, psi) of points that are asked for in one call.
@@ -45,7 +45,7 @@ def _lit(
     return LitScene(
         scene=world.scene, rays=world.rays, radiance=world.texture(radiance),
         lights=world.lights(bright), emission=world.texture(0 * radiance),
-        environment=environment, size=world.size,
+        environment=environment, diagonal_m=world.size,
     )  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def _furnace() -> LitScene:
 def _predicted(lit: LitScene, rays: int, repeat: int, seed: int = 0) -> np.ndarray:
     """(repeat, len(LOBES), 3), all in one call."""
     degrees, phi, psi = (np.tile(np.array(values), repeat) for values in zip(*LOBES, strict=True))
-    found = non_diffuse_radiance(
+    found = lobe_radiance(
         lit, _points(degrees), phi.astype(np.float32), psi.astype(np.float32), rays, seed
     )
     return found.reshape(repeat, len(LOBES), 3)
@@ -95,7 +95,7 @@ def test_one_mirror_shows_the_wall_that_it_faces():
                black_environment())  # fmt: skip
     degrees = np.full(256, 45.0)
     one = np.ones(256, np.float32)
-    found = non_diffuse_radiance(lit, _points(degrees), 0 * one, one, 64, 0).mean(axis=0)
+    found = lobe_radiance(lit, _points(degrees), 0 * one, one, 64, 0).mean(axis=0)
     mirror = directional_albedo(np.radians(45), 0.0, 1.0)
     np.testing.assert_allclose(found, mirror * walls[4], rtol=0.02)
 
@@ -119,4 +119,4 @@ def test_the_seed_decides():
 
 def test_no_points_are_no_light():
     empty = np.zeros(0, np.float32)
-    assert non_diffuse_radiance(_open_sky(), _points([]), empty, empty, 16, 0).shape == (0, 3)
+    assert lobe_radiance(_open_sky(), _points([]), empty, empty, 16, 0).shape == (0, 3)

@@ -5,6 +5,7 @@ The target frame is rendered here, by NumPy alone: exact sphere, exact box, prin
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +13,11 @@ import pytest
 
 from tests.physics.brdf import f_nd
 from tests.physics.surfaces import World, box, room, sphere, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.material.fit_target import fit_target_frame
 from usdbrdf.material.fit_views import fit_views
 from usdbrdf.material.observations import Follower
-from usdbrdf.model.camera import camera_rays, pixel_centres
+from usdbrdf.model.camera import Camera, pixel_centres
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, View
 
@@ -35,8 +36,7 @@ SPHERE = 12  # index of the object after six walls and the lamp's six sides
 
 class Studio(NamedTuple):
     world: World
-    pose: np.ndarray
-    intrinsics: np.ndarray
+    camera: Camera
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def studio() -> Studio:
     pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
     pose[:3, 3] = [0, -1.6, 1.0]
     focal = 0.42 * SIZE / np.tan(np.arcsin(RADIUS / 1.6))  # the sphere fills 84 % of the height
-    return Studio(world_of(parts), pose, np.array([focal, focal, SIZE / 2, SIZE / 2]))
+    return Studio(world_of(parts), camera_at(pose, (focal, focal, SIZE / 2, SIZE / 2), SIZE, SIZE))
 
 
 def _diffuse(position: np.ndarray) -> np.ndarray:
@@ -79,9 +79,7 @@ def _incident(origin: np.ndarray, w: np.ndarray) -> np.ndarray:
 
 def _sphere_points(studio: Studio, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance along the rays through pixels (R, 2) (NaN: past the sphere) and directions."""
-    origin, direction = (
-        a.astype(np.float64) for a in camera_rays(studio.pose, studio.intrinsics, pixels)
-    )
+    origin, direction = (a.astype(np.float64) for a in studio.camera.rays(pixels))
     b = ((origin - CENTRE) * direction).sum(axis=-1)
     c = ((origin - CENTRE) ** 2).sum(axis=-1) - RADIUS**2
     with np.errstate(invalid="ignore"):
@@ -103,7 +101,7 @@ def _render(studio: Studio, phi: float, psi: float, samples: int = 96) -> np.nda
     for shift in offsets:
         distance, direction = _sphere_points(studio, centres + shift)
         on = np.isfinite(distance)
-        x = studio.pose[:3, 3] + distance[on, None] * direction[on]
+        x = studio.camera.eye + distance[on, None] * direction[on]
         n = (x - CENTRE) / RADIUS
         wo = -direction[on]
         t = np.cross(n, [0.3, 0.5, 0.8])
@@ -144,7 +142,7 @@ def _lit_scene(world: World, radiance: np.ndarray) -> LitScene:
         lights=world.lights(radiance),
         emission=world.texture(emission),
         environment=black_environment(),
-        size=world.size,
+        diagonal_m=world.size,
     )
 
 
@@ -163,8 +161,7 @@ def test_the_material_of_a_sphere_comes_back(studio: Studio, phi: float, psi: fl
     view = View(
         radiance=image,
         valid=_whole(studio),
-        world_from_camera=studio.pose,
-        intrinsics=studio.intrinsics,
+        camera=studio.camera,
     )
     exact = _true_radiance(studio.world)
     lit = _lit_scene(studio.world, exact)
@@ -197,22 +194,23 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
     usable = np.zeros(len(wrong), bool)
     usable[own] = True
     angles = np.radians(np.linspace(-60, 60, 9))
-    views = []
+    cameras = []
     follower = Follower(lit, studio.world.texels, usable, len(angles), 0)
     for angle in angles:
         eye = np.array([1.6 * np.sin(angle), -1.6 * np.cos(angle), 1.0 + 0.3 * np.sin(3 * angle)])
-        there = studio._replace(pose=look_at(eye, CENTRE))
+        there = studio._replace(
+            camera=replace(studio.camera, world_from_camera=look_at(eye, CENTRE))
+        )
         view = View(
             radiance=_render(there, phi, psi, samples=32),
             valid=_whole(there),
-            world_from_camera=there.pose,
-            intrinsics=studio.intrinsics,
+            camera=there.camera,
         )
         follower.add(view, np.zeros_like(view.valid), 1e-3)
-        views.append(view)
+        cameras.append(view.camera)
     texels = studio.world.texels
     observed, smoothing = follower.chosen(texels, 0).of_texels(own), follower.smoothing
-    found, used = fit_views(lit, texels, observed, smoothing, views.__getitem__, SPHERE, 0)
+    found, used = fit_views(lit, texels, observed, smoothing, cameras.__getitem__, SPHERE, 0)
     assert found is not None
     assert used > 500
     assert found.phi == pytest.approx(phi, abs=0.04)
@@ -226,8 +224,7 @@ def test_a_sphere_without_specular_gets_none(studio: Studio):
     view = View(
         radiance=image,
         valid=_whole(studio),
-        world_from_camera=studio.pose,
-        intrinsics=studio.intrinsics,
+        camera=studio.camera,
     )
     lit = _lit_scene(studio.world, _true_radiance(studio.world))
     found, _ = fit_target_frame(lit, view, SPHERE, "paper", 800, 0)
@@ -241,8 +238,7 @@ def test_an_object_of_a_few_pixels_is_not_fitted(studio: Studio):
     view = View(
         radiance=np.ones((SIZE, SIZE, 3), np.float32),
         valid=nothing,
-        world_from_camera=studio.pose,
-        intrinsics=studio.intrinsics,
+        camera=studio.camera,
     )
     lit = _lit_scene(studio.world, _true_radiance(studio.world))
     found, used = fit_target_frame(lit, view, SPHERE, "paper", 800, 0)

@@ -18,7 +18,7 @@ from usdbrdf.transport.brdf import distribution, half_vector, reflected_density,
 from usdbrdf.transport.warps import (
     cosine_direction,
     hashed_uniform,
-    patch_shifts,
+    shifts_of,
     sobol_points,
     tangent_frame,
     triangle_point,
@@ -229,11 +229,11 @@ def test_the_first_number_of_all_is_no_special_one():
     assert len({hashed_uniform(s, i, d) for s in (0, 1) for i in (0, 1) for d in (0, 1)}) == 8
 
 
-def test_shifts_of_different_seeds_and_patches_differ():
-    first, second = patch_shifts(50, 5, 1), patch_shifts(50, 5, 2)
+def test_shifts_of_different_seeds_and_numbers_differ():
+    first, second = shifts_of(np.arange(50), 5, 1), shifts_of(np.arange(50), 5, 2)
     assert len(np.unique(np.concatenate([first, second]))) == 500
-    np.testing.assert_array_equal(first, patch_shifts(50, 5, 1))
-    counts = np.histogram(patch_shifts(4000, 5, 3), 100, (0, 1))[0]
+    np.testing.assert_array_equal(first, shifts_of(np.arange(50), 5, 1))
+    counts = np.histogram(shifts_of(np.arange(4000), 5, 3), 100, (0, 1))[0]
     assert_distributed([chi_square_p(counts, np.full(100, 200.0))])
 
 

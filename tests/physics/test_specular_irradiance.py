@@ -29,7 +29,7 @@ def _lit(world: World, emits: int | None = None) -> LitScene:
     return LitScene(
         scene=world.scene, rays=world.rays, radiance=world.texture(radiance),
         lights=world.lights(radiance), emission=world.texture(mask),
-        environment=black_environment(), size=world.size,
+        environment=black_environment(), diagonal_m=world.size,
     )  # fmt: skip
 
 

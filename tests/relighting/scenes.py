@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import Light, RelitScene
 from usdbrdf.model.material import Material, Surface, constant_map
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
@@ -62,7 +62,7 @@ def cube(stuff: Material, *, inside: bool = False, side: float = 1.0) -> Surface
     return surface((np.array(corners) - 0.5) * side, faces, stuff)
 
 
-def looking(eye: Any, target: Any, *, width: int = 4, height: int = 4, fov: float = 0.01) -> View:
+def looking(eye: Any, target: Any, *, width: int = 4, height: int = 4, fov: float = 0.01) -> Camera:
     """A camera with ``fov`` radians across."""
     eye, target = np.array(eye, np.float64), np.array(target, np.float64)
     back = (eye - target) / np.linalg.norm(eye - target)
@@ -73,7 +73,7 @@ def looking(eye: Any, target: Any, *, width: int = 4, height: int = 4, fov: floa
     pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
     pose[:3, 3] = eye
     focal = width / 2 / np.tan(fov / 2)
-    return View(
+    return Camera(
         name="view",
         world_from_camera=pose,
         intrinsics=(focal, focal, width / 2, height / 2),
@@ -85,7 +85,7 @@ def looking(eye: Any, target: Any, *, width: int = 4, height: int = 4, fov: floa
 def photograph(
     mi: Any,
     surfaces: list[Surface],
-    view: View,
+    view: Camera,
     *,
     lights: list[Light] | None = None,
     samples: int = 64,

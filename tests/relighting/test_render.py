@@ -11,12 +11,11 @@ import pytest
 
 from tests.physics.brdf import directional_albedo
 from tests.relighting.scenes import cube, looking, material, photograph, plate
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.light import DistantLight, ShapeLight, SkyLight
 from usdbrdf.model.material import constant_map
-from usdbrdf.relighting.matched_lobe import matching_factor
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 from usdbrdf.transport.environment import environment_at
+from usdbrdf.transport.renderer_match import matching_factor
 
 
 @pytest.fixture(params=VARIANTS)
@@ -148,7 +147,7 @@ def test_pixels_are_where_the_projects_cameras_have_them(scalar: Any) -> None:
     lamp = plate(material(0.0, emission=1.0), half=0.3)
     lamp = lamp.moved(np.array([[1.0, 0, 0, 0.1], [0, 1, 0, -0.15], [0, 0, 1, 0], [0, 0, 0, 1]]))
     seen = photograph(scalar, [lamp], view, samples=256).mean(axis=2)
-    origins, ways = camera_rays(view.world_from_camera, np.array(lens), pixel_centres(24, 16))
+    origins, ways = view.rays(view.pixels())
     hit = origins + ways * (-origins[:, 2:] / ways[:, 2:])
     position = (seen.ravel()[:, None] * hit[:, :2]).sum(axis=0) / seen.sum()
     assert position == pytest.approx([0.1, -0.15], abs=0.01)

@@ -17,7 +17,7 @@ from usdbrdf.job.memory import give_back_freed, resident_bytes
 from usdbrdf.tasks.trace import denoised_irradiance
 from usdbrdf.transport.denoise import CHOICES, chosen_filter, denoise_lightmaps, denoise_picture
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
 
 SIDE = 1.28  # m
 TEXELS = 64  # of the floor, along each side: 2 cm
@@ -64,7 +64,7 @@ def floor() -> Floor:
 def _irradiance(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray:
     """S (T, 3) on the floor, 0 elsewhere."""
     texels = world.texels
-    order, patch = patches_of_texels(texels)
+    order, patch = tiles_of_texels(texels)
     on_floor = texels.object_index()[order] == 0
     order, patch = order[on_floor], patch[on_floor]
     found = np.zeros_like(lit)

@@ -12,8 +12,8 @@ from usdbrdf.job.task import StageRun
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.tasks.clipped import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.transport.patch_draws import independent_patches
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.tile_draws import independent_tiles
 
 ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]
 ALBEDO += [(0.6, 0.6, 0.6)]
@@ -23,8 +23,8 @@ SATURATION = 3.0
 
 def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) -> np.ndarray:
     """L_d (T, 3) after some bounces, with noise of each texel's own, as pictures have it."""
-    order, _ = patches_of_texels(world.texels)
-    patch = independent_patches(len(order))
+    order, _ = tiles_of_texels(world.texels)
+    patch = independent_tiles(len(order))
     lit = emitted
     for bounce in range(bounces):
         found = irradiance_at(

@@ -24,7 +24,6 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import task as stage_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import StageRun
-from usdbrdf.model.camera import pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.tasks import refine, trace
 from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
@@ -34,7 +33,7 @@ from usdbrdf.tasks.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.tasks.texture import MEASURED
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
-from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.rays import lift_from_surface
 
 Float = npt.NDArray[np.float32]
@@ -88,7 +87,7 @@ def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, see
     lamp = [item.label for item in lit.scene.objects].index("lamp")
     reflects = np.flatnonzero((own >= 0) & (own != lamp))
     result = np.zeros((len(own), 3), np.float32)
-    result[reflects] = non_diffuse_radiance(
+    result[reflects] = lobe_radiance(
         lit, points.take(reflects), lobes.phi[own[reflects]], lobes.psi[own[reflects]], rays, seed
     )
     return result
@@ -100,10 +99,8 @@ def _add_specular(capture: MadeCapture, atlas: Atlas, frames: Frames) -> None:
     for i, path in enumerate(sorted((capture.folder / "frames").iterdir())):
         image = read_exr(path)
         height, width = image.shape[:2]
-        points = visible_points(
-            lit.rays, lit.scene, frames.world_from_camera[i], frames.intrinsics[i],
-            pixel_centres(width, height),
-        )  # fmt: skip
+        camera = frames.camera(i).at_size(width, height)
+        points = visible_points(lit.rays, lit.scene, camera, camera.pixels())
         image += _specular(lit, lobes, points, 64, 100 + i).reshape(image.shape)
         write_exr(path, image)
 
@@ -167,7 +164,7 @@ def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
     angle = 2 * np.pi * u[:, 1]
     local = np.stack([np.sqrt(u[:, 0]) * np.cos(angle), np.sqrt(u[:, 0]) * np.sin(angle), height])
     directions = np.einsum("ck,tcd->tkd", local, frame).reshape(-1, 3).astype(np.float32)
-    origin = lift_from_surface(texels.position[which], texels.normal[which], lit.size)
+    origin = lift_from_surface(texels.position[which], texels.normal[which], lit.diagonal_m)
     origin = np.repeat(origin, 64, axis=0)
     hits = lit.rays.closest(origin, directions)
     points = SurfacePoints(

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import Part, World, quad, world_of
-from tests.scenes import RADIANCE, ROOM, look_at, ring_of_poses, room_mesh
+from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.observe import Observation, radiance_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
@@ -42,7 +41,8 @@ def room(tmp_path_factory) -> Room:
     poses = np.array([*ring_of_poses(6), *up])
     shown = np.array([RADIANCE[name] for name in names], np.float32)
     for i, pose in enumerate(poses):
-        hits = world.rays.closest(*camera_rays(pose, LENS, pixel_centres(WIDTH, HEIGHT)))
+        camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+        hits = world.rays.closest(*camera.rays(camera.pixels()))
         image = shown[world.scene.face_object[hits.face]].reshape(HEIGHT, WIDTH, 3)
         write_exr(folder / f"{i}.exr", np.minimum(image, np.float32(SATURATION)))
     frames = Frames(

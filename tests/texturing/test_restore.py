@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.texturing.footprints import SAMPLE_BLUR, blurred, footprints, restored, widest
 
 SIDE, TEXEL = 64, 0.02
@@ -39,7 +39,7 @@ def _columns(world: World) -> tuple[np.ndarray, np.ndarray]:
 def test_pixel_from_above_covers_what_a_pinhole_says(floor: World):
     which = np.flatnonzero(_middle(floor)).astype(np.int32)
     pose = look_at(np.array([0, 1e-6, 3.0]), np.zeros(3))
-    found = footprints(floor.texels, which, pose, LENS)
+    found = footprints(floor.texels, which, camera_at(pose, LENS, 80, 60))
     # A pixel is 3 m / 100 wide, a texel 2 cm; the plane is parallel to the image.
     np.testing.assert_allclose(found[:, [0, 2]], 1.5**2, rtol=1e-3)
     np.testing.assert_allclose(found[:, 1], 0, atol=2e-3)
@@ -52,7 +52,7 @@ def test_slanted_view_smears_along_the_line_of_sight(floor: World):
     eye = 3 * np.array([np.sin(angle), 0, np.cos(angle)])
     point = floor.texels.position[centre].astype(np.float64)
     pose = look_at(eye + point, point)
-    found = footprints(floor.texels, np.array([centre], np.int32), pose, LENS)
+    found = footprints(floor.texels, np.array([centre], np.int32), camera_at(pose, LENS, 80, 60))
     assert widest(found)[0] == pytest.approx(1.5 / np.cos(angle), rel=0.02)
     # Across it nothing is foreshortened.
     assert found[0, [0, 2]].sum() == pytest.approx(1.5**2 * (1 + 1 / np.cos(angle) ** 2), rel=0.03)
@@ -161,6 +161,6 @@ def test_a_view_along_the_surface_has_a_finite_footprint(floor: World):
     # The eye lies in the plane: both steps of a texel project onto one line.
     pose = look_at(np.array([-3.0, 0.001, 0.0]), np.zeros(3))
     which = np.arange(len(floor.texels), dtype=np.int32)
-    found = footprints(floor.texels, which, pose, LENS)
+    found = footprints(floor.texels, which, camera_at(pose, LENS, 80, 60))
     assert np.isfinite(found).all()
     assert np.isfinite(widest(found)).all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.texturing.samples import CLIPPED, NOTHING, SAMPLE, first_surfaces, samples_from_frame
 
 WIDTH, HEIGHT = 80, 60
@@ -35,9 +35,8 @@ def _shoot(
     valid: np.ndarray | None = None,
     clipped: np.ndarray | None = None,
 ) -> Shot:
-    surfaces = first_surfaces(
-        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
-    )
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    surfaces = first_surfaces(world.rays, world.scene.face_object, camera)
     nowhere = np.zeros((HEIGHT, WIDTH), bool)
     kind, radiance = samples_from_frame(
         world.texels,
@@ -46,8 +45,7 @@ def _shoot(
         image.astype(np.float32),
         ~nowhere if valid is None else valid,
         nowhere if clipped is None else clipped,
-        pose,
-        LENS,
+        camera,
     )
     return Shot(kind, radiance)
 
@@ -149,7 +147,7 @@ def test_an_occluder_leaves_no_samples_behind_it_or_near_its_edge(plane: World):
     image = _picture_of_plane(pose, _pattern)
     # The occluder's pixels are red: a sample that took any of it would show.
     first = first_surfaces(
-        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
+        world.rays, world.scene.face_object, camera_at(pose, LENS, WIDTH, HEIGHT)
     )
     image[first.object == 1] = (2, 0, 0)
     shot = _shoot(world, image, pose)
@@ -181,14 +179,14 @@ def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
     world = world_of(parts)
     pose = _camera((0.3, -1e-3, 2.0))
     one = World(scene=replace(world.scene, face_object=np.zeros(4, np.int32)), texels=world.texels)
-    size = np.array([WIDTH, HEIGHT], np.int32)
-    surfaces = first_surfaces(one.rays, one.scene.face_object, pose, LENS, size)
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    surfaces = first_surfaces(one.rays, one.scene.face_object, camera)
     upper = surfaces.point[..., 2] > 0.1
     image = np.where(upper[..., None], 9.0, 1.0) * np.ones(3)
     everywhere = np.ones((HEIGHT, WIDTH), bool)
     kind, radiance = samples_from_frame(
         one.texels, np.zeros(len(one.texels), np.int32), surfaces, image.astype(np.float32),
-        everywhere, ~everywhere, pose, LENS,
+        everywhere, ~everywhere, camera,
     )  # fmt: skip
     seen = kind == SAMPLE
     high = one.texels.position[:, 2] > 0.1
@@ -269,7 +267,7 @@ def test_beside_a_glaring_lamp_no_sample_is_taken():
     world = world_of([floor, quad((-0.1, -0.1, 0.5), (0.2, 0, 0), (0, 0.2, 0), size=(8, 8))])
     pose = _camera()
     first = first_surfaces(
-        world.rays, world.scene.face_object, pose, LENS, np.array([WIDTH, HEIGHT], np.int32)
+        world.rays, world.scene.face_object, camera_at(pose, LENS, WIDTH, HEIGHT)
     )
     own = world.texels.of_object(0)
     kinds = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import look_at
+from tests.scenes import camera_at, look_at
 from usdbrdf.texturing.texel_blocks import blocks_of_texels
 
 LENS, SIZE, MIN_COSINE = np.array([80.0, 80.0, 40.0, 30.0]), np.array([80, 60], np.int32), 0.1
@@ -44,7 +44,7 @@ def test_no_texel_that_is_seen_is_passed_over(corner: World):
     shares = []
     for _ in range(200):
         pose = look_at(rng.uniform(0.05, 3, 3), rng.uniform(-1, 4, 3))
-        which = blocks.texels_in_view(pose, LENS, SIZE, MIN_COSINE)
+        which = blocks.texels_in_view(camera_at(pose, LENS, *SIZE), MIN_COSINE)
         assert len(np.unique(which)) == len(which)
         assert np.isin(_visible(corner, pose), which).all()
         shares.append((len(which) - len(_visible(corner, pose))) / len(corner.texels))
@@ -67,7 +67,7 @@ def test_blocks_of_a_part_are_the_parts(corner: World):
     blocks = blocks_of_texels(corner.texels, part)
     np.testing.assert_array_equal(np.sort(blocks.order), np.arange(part.start, part.stop))
     pose = look_at(np.array([2.0, 1.5, 1.5]), np.zeros(3))
-    which = blocks.texels_in_view(pose, LENS, SIZE, MIN_COSINE)
+    which = blocks.texels_in_view(camera_at(pose, LENS, *SIZE), MIN_COSINE)
     visible = _visible(corner, pose)
     assert np.isin(visible[(visible >= part.start) & (visible < part.stop)], which).all()
     assert len(which) > 500

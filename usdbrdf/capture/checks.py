@@ -15,7 +15,6 @@ from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import image_size
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
-from usdbrdf.model.camera import camera_rays
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
@@ -280,8 +279,8 @@ def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]
         steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
         x, y = np.meshgrid(steps * frames.resolution[i, 0], steps * frames.resolution[i, 1])
         pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
-        pose = read(frames.world_from_camera[i])
-        origins, directions = camera_rays(pose, frames.intrinsics[i], pixels)
-        hits += int((scene.closest(origins, directions).face >= 0).sum())
+        camera = frames.camera(i)
+        camera = replace(camera, world_from_camera=read(camera.world_from_camera))
+        hits += int((scene.closest(*camera.rays(pixels)).face >= 0).sum())
         rays += len(pixels)
     return hits / rays

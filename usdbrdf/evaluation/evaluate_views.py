@@ -45,7 +45,6 @@ from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Byte, Float
-from usdbrdf.model.camera import View
 from usdbrdf.model.capture import Frames
 
 DOCUMENT = "evaluation.json"
@@ -198,17 +197,9 @@ def _batches(
     waiting: list[_Scored] = []
     frames = views.frames
     for i in progress(range(len(frames)), total=len(frames), label="evaluate", unit="views"):
-        width, height = (int(n) for n in frames.resolution[i])
-        fx, fy, cx, cy = frames.intrinsics[i]
-        view = View(
-            name=views.names[i],
-            world_from_camera=frames.world_from_camera[i],
-            intrinsics=(fx, fy, cx, cy),
-            width=width,
-            height=height,
-        )
-        predicted = predict_view(seen, view, quality._replace(seed=quality.seed + (i << 16)))
-        waiting.append(_scored(i, view.name, predicted, read_frame(frames, i), exposure))
+        seeded = quality._replace(seed=quality.seed + (i << 16))
+        predicted = predict_view(seen, frames.camera(i), seeded)
+        waiting.append(_scored(i, views.names[i], predicted, read_frame(frames, i), exposure))
         if sum(scored.counted.size for scored in waiting) >= _WAITING_PIXELS:
             yield waiting
             waiting = []

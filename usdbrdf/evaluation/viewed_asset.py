@@ -19,14 +19,14 @@ from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Double, Float
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.tasks.atlas import Atlas as Atlas
 from usdbrdf.tasks.atlas import atlas_from_stage
 from usdbrdf.tasks.lit import lit_scene
 from usdbrdf.tasks.preview import camera_hits as camera_hits
 from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
-from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # Surface points of a picture at once: what bounds the memory.
@@ -99,22 +99,17 @@ def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> Viewed
     )
 
 
-def predict_view(seen: ViewedAsset, view: View, quality: Quality) -> PredictedView:
+def predict_view(seen: ViewedAsset, camera: Camera, quality: Quality) -> PredictedView:
     """One picture by both models, box-filtered over ``per_side``^2 points per pixel."""
     per_pixel = quality.per_side**2
-    rows = max(1, _POINTS_AT_ONCE // (view.width * per_pixel))
+    width, height = camera.width, camera.height
+    rows = max(1, _POINTS_AT_ONCE // (width * per_pixel))
     bands = []
-    for top in range(0, view.height, rows):
-        pixels = _sub_pixels(view.width, top, min(top + rows, view.height), quality.per_side)
-        points = visible_points(
-            seen.lit.rays,
-            seen.lit.scene,
-            view.world_from_camera,
-            np.array(view.intrinsics),
-            pixels,
-        )
+    for top in range(0, height, rows):
+        pixels = _sub_pixels(width, top, min(top + rows, height), quality.per_side)
+        points = visible_points(seen.lit.rays, seen.lit.scene, camera, pixels)
         values = _radiance_at(seen, points, max(1, quality.rays // per_pixel), quality.seed + top)
-        bands.append(values.reshape(-1, view.width, per_pixel, values.shape[1]).mean(axis=2))
+        bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
     picture = np.concatenate(bands).astype(np.float32)
     return PredictedView(
         baseline=picture[..., :3],
@@ -146,7 +141,7 @@ def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int)
     known = np.isfinite(seen.phi) & np.isfinite(seen.psi)
     reflects = np.flatnonzero(hit & ~lamp & known[owner])
     owner = owner[reflects]
-    values[reflects, 3:6] += non_diffuse_radiance(
+    values[reflects, 3:6] += lobe_radiance(
         seen.lit, points.take(reflects), seen.phi[owner], seen.psi[owner], rays, seed
     )
     return values

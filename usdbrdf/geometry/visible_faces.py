@@ -11,12 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
-from usdbrdf.model.arrays import Double, Float, Int
-from usdbrdf.model.camera import camera_rays
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import BOX_FACES, RayScene
 
 Vector = tuple[float, float, float]
@@ -31,69 +30,84 @@ _BANDS = 32
 _BEHIND = 1e-9
 
 
-class Camera(NamedTuple):
-    """eye (3,); rotation (3, 3), world to x right, y down, z ahead; intrinsics fx, fy, cx, cy."""
+class _Pinhole(NamedTuple):
+    """A camera as the kernels take it: eye (3,); rotation (3, 3), world to x right, y down, z
+    ahead; fx, fy, cx, cy, width and height in pixels."""
 
     eye: Double
     rotation: Double
-    intrinsics: Double
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
 
 
-def visible_faces(
-    rays: RayScene, world_from_camera: Double, intrinsics: Double, resolution: Int
-) -> tuple[Int, Float]:
+class _Mesh(NamedTuple):
+    """points (V, 3), triangles (F, 3) of a RayScene."""
+
+    points: Float
+    triangles: Int
+
+
+class _Picture(NamedTuple):
+    """What is drawn into, (H, W) each: triangle, 1 / depth of its point, and the greatest 1 / depth
+    in doubt there."""
+
+    face: Int
+    nearness: Float
+    doubt: Float
+
+
+def visible_faces(rays: RayScene, camera: Camera) -> tuple[Int, Float]:
     """(H, W) int32 triangle, -1 where there is none, and (H, W, 3) float32 the point on it (zero
     where there is none), seen through each pixel's centre."""
-    width, height = int(resolution[0]), int(resolution[1])
-    axes = np.asarray(world_from_camera, np.float64)[:3, :3]
-    camera = Camera(
-        eye=np.array(world_from_camera[:3, 3], np.float64),
-        rotation=np.ascontiguousarray((axes * [1.0, -1.0, -1.0]).T),
-        intrinsics=np.asarray(intrinsics, np.float64),
-    )
-    boxes = np.flatnonzero(_boxes_in_view(rays.boxes, camera, width, height))
+    fx, fy, cx, cy = (float(number) for number in camera.intrinsics)
+    axes = np.asarray(camera.world_from_camera, np.float64)[:3, :3]
+    pinhole = _Pinhole(
+        np.array(camera.eye, np.float64),
+        np.ascontiguousarray((axes * [1.0, -1.0, -1.0]).T),
+        fx, fy, cx, cy, camera.width, camera.height,
+    )  # fmt: skip
+    mesh = _Mesh(rays.points, rays.triangles)
+    boxes = np.flatnonzero(_boxes_in_view(rays.boxes, pinhole))
     faces = np.full((len(boxes), BOX_FACES), -1, np.int32)
     rows = np.zeros((len(boxes), BOX_FACES, 2), np.int32)
-    _faces_in_view(rays.points, rays.triangles, boxes, camera, width, height, faces, rows)
+    _faces_in_view(mesh, boxes, pinhole, faces, rows)
     kept = faces >= 0
-    face = np.full((height, width), -1, np.int32)
-    nearness, doubt = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    _draw(rays.points, rays.triangles, faces[kept], rows[kept], camera, face, nearness, doubt)
-    point = np.empty((height, width, 3), np.float32)
-    _points(camera, nearness, point)
-    _trace_doubtful(rays, world_from_camera, intrinsics, nearness, doubt, face, point)
-    return face, point
+    size = camera.height, camera.width
+    picture = _Picture(
+        np.full(size, -1, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    )
+    _draw(mesh, faces[kept], rows[kept], pinhole, picture)
+    point = np.empty((*size, 3), np.float32)
+    _points(pinhole, picture.nearness, point)
+    _trace_doubtful(rays, camera, picture, point)
+    return picture.face, point
 
 
-def _trace_doubtful(
-    rays: RayScene,
-    world_from_camera: Double,
-    intrinsics: Double,
-    nearness: Float,
-    doubt: Float,
-    face: Int,
-    point: Float,
-) -> None:
+def _trace_doubtful(rays: RayScene, camera: Camera, picture: _Picture, point: Float) -> None:
+    doubt, nearness = picture.doubt, picture.nearness
     row, column = np.nonzero((doubt > 0) & (doubt >= nearness * np.float32(1 - _DEPTH)))
     if not len(row):
         return
-    pixels = np.stack([column + 0.5, row + 0.5], axis=-1)
-    origins, directions = camera_rays(world_from_camera, intrinsics, pixels)
+    origins, directions = camera.rays(np.stack([column + 0.5, row + 0.5], axis=-1))
     hits = rays.closest(origins, directions)
     reached = origins + directions * hits.distance[:, None]
-    face[row, column] = hits.face
+    picture.face[row, column] = hits.face
     point[row, column] = np.where(hits.face[:, None] >= 0, reached, 0)
 
 
 @parallel_kernel
-def _boxes_in_view(boxes: Float, camera: Camera, width: int, height: int) -> npt.NDArray[np.bool_]:
+def _boxes_in_view(boxes: Float, camera: _Pinhole) -> Bool:
     """Does any part of a box (low, high) lie ahead of the camera, between its image's borders?"""
     inside = np.zeros(len(boxes), np.bool_)
-    fx, fy, cx, cy = camera.intrinsics
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     # Inward normals of the planes through the image's borders, and of the one through the eye.
     sides = np.array([
-        [fx, 0.0, cx + 1], [-fx, 0.0, width - cx + 1],
-        [0.0, fy, cy + 1], [0.0, -fy, height - cy + 1],
+        [fx, 0.0, cx + 1], [-fx, 0.0, camera.width - cx + 1],
+        [0.0, fy, cy + 1], [0.0, -fy, camera.height - cy + 1],
         [0.0, 0.0, 1.0],
     ])  # fmt: skip
     planes = sides @ camera.rotation
@@ -110,7 +124,7 @@ def _boxes_in_view(boxes: Float, camera: Camera, width: int, height: int) -> npt
 
 
 @kernel
-def _in_camera(points: Float, vertex: int, camera: Camera) -> Vector:
+def _in_camera(points: Float, vertex: int, camera: _Pinhole) -> Vector:
     x = points[vertex, 0] - camera.eye[0]
     y = points[vertex, 1] - camera.eye[1]
     z = points[vertex, 2] - camera.eye[2]
@@ -123,17 +137,11 @@ def _in_camera(points: Float, vertex: int, camera: Camera) -> Vector:
 
 
 @kernel
-def _extent(
-    a: Vector,
-    b: Vector,
-    c: Vector,
-    camera: Camera,
-    width: int,
-    height: int,
-) -> tuple[int, int, int, int]:
+def _extent(a: Vector, b: Vector, c: Vector, camera: _Pinhole) -> tuple[int, int, int, int]:
     """First and last column and row whose pixels' centres a triangle can cover; first > last if
     there are none."""
-    fx, fy, cx, cy = camera.intrinsics
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    width, height = camera.width, camera.height
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     corners = (a, b, c)
     for k in range(3):
@@ -159,43 +167,34 @@ def _extent(
 
 
 @parallel_kernel
-def _faces_in_view(
-    points: Float,
-    triangles: Int,
-    boxes: npt.NDArray[np.int64],
-    camera: Camera,
-    width: int,
-    height: int,
-    faces: Int,
-    rows: Int,
-) -> None:
+def _faces_in_view(mesh: _Mesh, boxes: Long, camera: _Pinhole, faces: Int, rows: Int) -> None:
     """Of each box the triangles that can cover a pixel's centre, and in which rows."""
     for i in prange(len(boxes)):
         first = boxes[i] * BOX_FACES
-        for k in range(min(BOX_FACES, len(triangles) - first)):
+        for k in range(min(BOX_FACES, len(mesh.triangles) - first)):
             f = first + k
-            a = _in_camera(points, triangles[f, 0], camera)
-            b = _in_camera(points, triangles[f, 1], camera)
-            c = _in_camera(points, triangles[f, 2], camera)
-            left, right, top, bottom = _extent(a, b, c, camera, width, height)
+            a, b, c = _corners(mesh, f, camera)
+            left, right, top, bottom = _extent(a, b, c, camera)
             if left <= right and top <= bottom:
                 faces[i, k] = f
                 rows[i, k, 0] = top
                 rows[i, k, 1] = bottom
 
 
+@kernel
+def _corners(mesh: _Mesh, f: int, camera: _Pinhole) -> tuple[Vector, Vector, Vector]:
+    """Of triangle f, as the camera sees them."""
+    points, triangles = mesh.points, mesh.triangles
+    return (
+        _in_camera(points, triangles[f, 0], camera),
+        _in_camera(points, triangles[f, 1], camera),
+        _in_camera(points, triangles[f, 2], camera),
+    )
+
+
 @parallel_kernel
-def _draw(
-    points: Float,
-    triangles: Int,
-    faces: Int,
-    rows: Int,
-    camera: Camera,
-    face: Int,
-    nearness: Float,
-    doubt: Float,
-) -> None:
-    height = len(face)
+def _draw(mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole, picture: _Picture) -> None:
+    height = camera.height
     for i in prange(_BANDS):
         # Neighbouring bands, which are similarly full, go to different threads.
         band = i * 13 % _BANDS
@@ -203,7 +202,7 @@ def _draw(
         high = (band + 1) * height // _BANDS
         for j in range(len(faces)):
             if rows[j, 0] < high and rows[j, 1] >= low:
-                _draw_face(points, triangles, faces[j], low, high, camera, face, nearness, doubt)
+                _draw_face(mesh, faces[j], low, high, camera, picture)
 
 
 @kernel
@@ -212,16 +211,15 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 @kernel
-def _on_image(n: Vector, camera: Camera, scale: float) -> Vector:
+def _on_image(n: Vector, camera: _Pinhole, scale: float) -> Vector:
     """n . d of the ray d through pixel (column, row), as coefficients of column, row and 1."""
-    fx, fy, cx, cy = camera.intrinsics
-    a = scale * n[0] / fx
-    b = scale * n[1] / fy
-    return a, b, scale * n[2] + a * (0.5 - cx) + b * (0.5 - cy)
+    a = scale * n[0] / camera.fx
+    b = scale * n[1] / camera.fy
+    return a, b, scale * n[2] + a * (0.5 - camera.cx) + b * (0.5 - camera.cy)
 
 
 @kernel
-def _side(p: Vector, q: Vector, camera: Camera, sign: float) -> Vector:
+def _side(p: Vector, q: Vector, camera: _Pinhole, sign: float) -> Vector:
     """Distance in pixels from the edge p q, positive inside."""
     a, b, c = _on_image(_cross(p, q), camera, sign)
     length = np.sqrt(a * a + b * b)
@@ -232,22 +230,12 @@ def _side(p: Vector, q: Vector, camera: Camera, sign: float) -> Vector:
 
 @kernel
 def _draw_face(
-    points: Float,
-    triangles: Int,
-    f: int,
-    low: int,
-    high: int,
-    camera: Camera,
-    face: Int,
-    nearness: Float,
-    doubt: Float,
+    mesh: _Mesh, f: int, low: int, high: int, camera: _Pinhole, picture: _Picture
 ) -> None:
-    """One triangle into the rows low to high. nearness is 1 / depth."""
-    height, width = face.shape
-    a = _in_camera(points, triangles[f, 0], camera)
-    b = _in_camera(points, triangles[f, 1], camera)
-    c = _in_camera(points, triangles[f, 2], camera)
-    left, right, top, bottom = _extent(a, b, c, camera, width, height)
+    """One triangle into the rows low to high."""
+    face, nearness, doubt = picture.face, picture.nearness, picture.doubt
+    a, b, c = _corners(mesh, f, camera)
+    left, right, top, bottom = _extent(a, b, c, camera)
     n = _cross((b[0] - a[0], b[1] - a[1], b[2] - a[2]), (c[0] - a[0], c[1] - a[1], c[2] - a[2]))
     volume = n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
     sign = 1.0 if volume >= 0 else -1.0
@@ -281,14 +269,13 @@ def _draw_face(
 
 
 @parallel_kernel
-def _points(camera: Camera, nearness: Float, point: Float) -> None:
+def _points(camera: _Pinhole, nearness: Float, point: Float) -> None:
     """The world points at 1 / nearness ahead; zero where that is zero."""
-    fx, fy, cx, cy = camera.intrinsics
     m = camera.rotation
     for row in prange(len(nearness)):
-        y = (row + 0.5 - cy) / fy
+        y = (row + 0.5 - camera.cy) / camera.fy
         for column in range(nearness.shape[1]):
-            x = (column + 0.5 - cx) / fx
+            x = (column + 0.5 - camera.cx) / camera.fx
             w = nearness[row, column]
             for k in range(3):
                 d = m[0, k] * x + m[1, k] * y + m[2, k]

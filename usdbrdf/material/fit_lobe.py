@@ -20,7 +20,7 @@ from usdbrdf.material.lobe_posterior import (
 from usdbrdf.material.verdict import SOME_EVIDENCE
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.transport.lobe_samples import Basis
+from usdbrdf.transport.lobe_radiance import Basis
 
 Pair = tuple[Float, Float]
 

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from usdbrdf.material.target_frames import mirror_hits_emitter, object_pixels
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.model.camera import pixel_centres
 from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
@@ -20,7 +19,7 @@ from usdbrdf.transport.lit_scene import (
     sub_pixel_points,
     visible_points,
 )
-from usdbrdf.transport.lobe_samples import lobe_basis
+from usdbrdf.transport.lobe_radiance import lobe_basis
 
 Basis = Callable[[float], tuple[Float, Float]]
 
@@ -173,15 +172,14 @@ def _points_of_object(
 ) -> tuple[npt.NDArray[np.int64], Float, SurfacePoints]:
     """The pixels to fit (flat indices), how many pixels each stands for, and the four surface
     points of each, in order."""
-    height, width = view.valid.shape
-    pixels = pixel_centres(width, height)
-    seen = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, pixels)
-    owner = lit.owner(seen.face).reshape(height, width)
-    mirrored = mirror_hits_emitter(lit.rays, seen, lit.emission, lit.size)
-    highlight = mirrored.reshape(height, width) & view.valid
+    pixels = view.camera.pixels()
+    seen = visible_points(lit.rays, lit.scene, view.camera, pixels)
+    owner = lit.owner(seen.face).reshape(view.valid.shape)
+    mirrored = mirror_hits_emitter(lit.rays, seen, lit.emission, lit.diagonal_m)
+    highlight = mirrored.reshape(view.valid.shape) & view.valid
     random = np.random.default_rng([seed, index])
     chosen, stands_for = object_pixels(
         owner, view.valid, highlight, index, max_pixels, random.permutation
     )
-    whole, points = sub_pixel_points(lit, view, pixels[chosen], index, _SUB_PIXEL)
+    whole, points = sub_pixel_points(lit, view.camera, pixels[chosen], index, _SUB_PIXEL)
     return chosen[whole], stands_for[whole], points

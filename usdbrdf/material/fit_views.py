@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import reduce
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
 from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, View, sub_pixel_points
-from usdbrdf.transport.lobe_samples import Mixture, lobe_basis
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
+from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
 # A sample spreads over the pixels, by this many of standard deviation: half a pixel for a camera's
 # own blur, 0.4 for bilinear reading, 0.3 for the pixel's area.
@@ -66,28 +65,28 @@ def fit_views(
     texels: Texels,
     observed: Observations,
     smoothing: float,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
     seed: int,
     mixture: Mixture = MIXTURE,
 ) -> tuple[LobeEstimate | None, int]:
     """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
 
-    smoothing: of the pictures, in pixels, see ``smoothing_of``. view_of(frame) gives poses and
-    pinholes; the images themselves are not needed any more.
+    smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
+    themselves are not needed.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
     fifteen times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
         return None, 0
-    observed, footprints = _footprints(lit, texels, observed, view_of, index)
+    observed, footprints = _footprints(lit, texels, observed, camera_of, index)
     if len(observed.texel) < MIN_OBSERVATIONS:
         return None, len(observed.texel)
-    samples = _samples(lit, texels, observed, footprints[0], view_of)
+    samples = _samples(lit, texels, observed, footprints[0], camera_of)
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
-        mixture = replace(mixture, per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
+        mixture = mixture._replace(per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
         candidates = _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
@@ -124,18 +123,18 @@ def _footprints(
     lit: LitScene,
     texels: Texels,
     observed: Observations,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
 ) -> tuple[Observations, list[SurfacePoints]]:
     """The observations whose footprint lies on the object as a whole, of texels that several frames
     see; and the footprints' points, for the usual width and, on curved objects, for others."""
 
     def whole(some: Observations, width: float) -> tuple[Long, SurfacePoints]:
-        kept, points = _points(lit, texels, some, view_of, index, width * RINGS)
+        kept, points = _points(lit, texels, some, camera_of, index, width * RINGS)
         enough = _several_views(some.texel[kept])
         return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(RINGS))))
 
-    kept, points = whole(observed, _width(texels, observed, view_of))
+    kept, points = whole(observed, _width(texels, observed, camera_of))
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
@@ -159,12 +158,12 @@ def _likely(width: float, smoothing: float) -> float:
     return math.exp(-0.5 * (math.log(width / expected) / _SPREAD_OF_WIDTHS) ** 2)
 
 
-def _width(texels: Texels, observed: Observations, view_of: Callable[[int], View]) -> float:
+def _width(texels: Texels, observed: Observations, camera_of: Callable[[int], Camera]) -> float:
     """Standard deviation of what the samples spread over, in pixels: the footprint of a single
     texel's, and the square that others are the mean of."""
     if observed.side[0] <= 1:
         return _FOOTPRINT
-    pixel = _pixel_size(texels.position[observed.texel], observed.frame, view_of)
+    pixel = _pixel_size(texels.position[observed.texel], observed.frame, camera_of)
     square = observed.side[0] * math.sqrt(float(np.median(texels.area[observed.texel])) / 12)
     return math.hypot(_FOOTPRINT, square / pixel)
 
@@ -174,7 +173,7 @@ def _samples(
     texels: Texels,
     observed: Observations,
     points: SurfacePoints,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
 ) -> ViewSamples:
     position = texels.position[observed.texel]
     # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
@@ -187,7 +186,7 @@ def _samples(
         position=position,
         radiance=observed.radiance,
         noise=np.hypot(observed.noise[:, None], contrast),
-        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, view_of),
+        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, camera_of),
     )
 
 
@@ -206,13 +205,13 @@ def _several_views(texel: Int) -> Bool:
     return np.asarray(np.bincount(number)[number] >= _MIN_VIEWS, np.bool_)
 
 
-def _pixel_size(position: Float, frame: Int, view_of: Callable[[int], View]) -> float:
+def _pixel_size(position: Float, frame: Int, camera_of: Callable[[int], Camera]) -> float:
     """Median size of a pixel on the surface, in metres."""
     sizes = []
     for number in np.unique(frame):
-        view = view_of(int(number))
-        distance = np.linalg.norm(position[frame == number] - view.world_from_camera[:3, 3], axis=1)
-        sizes.append(distance / view.intrinsics[0])
+        camera = camera_of(int(number))
+        distance = np.linalg.norm(position[frame == number] - camera.eye, axis=1)
+        sizes.append(distance / camera.intrinsics[0])
     return float(np.median(np.concatenate(sizes)))
 
 
@@ -227,7 +226,7 @@ def _points(
     lit: LitScene,
     texels: Texels,
     observed: Observations,
-    view_of: Callable[[int], View],
+    camera_of: Callable[[int], Camera],
     index: int,
     offsets: Double,
 ) -> tuple[Long, SurfacePoints]:
@@ -236,21 +235,12 @@ def _points(
     kept, parts = [], []
     for frame in np.unique(observed.frame):
         which = np.flatnonzero(observed.frame == frame)
-        view = view_of(int(frame))
-        pixels = _project(texels.position[observed.texel[which]], view)
-        whole, points = sub_pixel_points(lit, view, pixels, index, offsets)
+        camera = camera_of(int(frame))
+        pixels = camera.project(texels.position[observed.texel[which]])
+        whole, points = sub_pixel_points(lit, camera, pixels, index, offsets)
         kept.append(which[whole])
         parts.append(points)
     unordered = np.concatenate(kept)
     order = np.argsort(unordered, kind="stable")
     each = (len(offsets) * order[:, None] + np.arange(len(offsets))).ravel()
     return unordered[order], SurfacePoints.joined(parts).take(each)
-
-
-def _project(position: Float, view: View) -> npt.NDArray[np.float64]:
-    """Pixel coordinates (P, 2) of world points (P, 3)."""
-    camera_from_world = np.linalg.inv(view.world_from_camera)
-    in_camera = position @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    fx, fy, cx, cy = view.intrinsics
-    depth = -in_camera[:, 2]
-    return np.stack([cx + fx * in_camera[:, 0] / depth, cy - fy * in_camera[:, 1] / depth], axis=-1)

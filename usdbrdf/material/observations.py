@@ -17,7 +17,7 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
 from usdbrdf.transport.lit_scene import LitScene, View, visible_points
 from usdbrdf.transport.rays import lift_from_surface
-from usdbrdf.transport.warps import patch_shifts
+from usdbrdf.transport.warps import shifts_of
 
 # Side of the squares in texels, which are about as large as pixels.
 SIDE = 4.0
@@ -30,12 +30,12 @@ _FLAT = 0.9998
 _MOST, _WIDEST = 0.5, 0.02
 
 
-def sides_of_samples(texels: Texels, usable: Bool, scene_size: float) -> tuple[Float, Bool]:
+def sides_of_samples(texels: Texels, usable: Bool, diagonal_m: float) -> tuple[Float, Bool]:
     """The side of what samples of each object average, (num_objects,), in texels: SIDE or 1; and
-    which of the ``usable`` texels (T,) have so much surface around them. scene_size in metres."""
+    which of the ``usable`` texels (T,) have so much surface around them. diagonal_m in metres."""
     owner = texels.object_index()
     objects = len(texels.resolution)
-    small = SIDE * np.sqrt(texels.area) <= _WIDEST * scene_size
+    small = SIDE * np.sqrt(texels.area) <= _WIDEST * diagonal_m
     flat = usable & small & on_flat_squares(texels, round(SIDE) // 2)
     share = np.bincount(owner, flat, objects) / np.maximum(np.bincount(owner, usable, objects), 1)
     in_squares = share >= _MOST
@@ -88,7 +88,7 @@ def noise_correlation(lit: LitScene, view: View) -> Double:
     within = np.moveaxis(np.indices((_TILE, _TILE)), 0, -1)
     place = np.array(corners)[chosen][:, None, None] + within
     pixels = place[..., ::-1].reshape(-1, 2) + 0.5
-    seen = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, pixels)
+    seen = visible_points(lit.rays, lit.scene, view.camera, pixels)
     diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _TILE, _TILE, 3)
     owner = lit.owner(seen.face).reshape(len(chosen), -1)
     alone = (owner[:, 0] >= 0) & (owner == owner[:, :1]).all(axis=1)
@@ -186,7 +186,7 @@ class Follower:
     def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
         self._lit = lit
-        side, usable = sides_of_samples(texels, usable, lit.size)
+        side, usable = sides_of_samples(texels, usable, lit.diagonal_m)
         self._index, rows = _texels_to_follow(texels, usable, frames, seed)
         self._owner = texels.object_index()[self._index]
         self._side = side[self._owner]
@@ -194,7 +194,7 @@ class Follower:
         across = self._side[:, None]
         self._texels = replace(own, step_x=across * own.step_x, step_y=across * own.step_y)
         # Offsets of the proxy's half vectors, the same for all texels so that views compare.
-        self._jitter = _PROXY_ALPHA * (2 * patch_shifts(_PROXY_RAYS, 3, seed) - 1)
+        self._jitter = _PROXY_ALPHA * (2 * shifts_of(np.arange(_PROXY_RAYS), 3, seed) - 1)
         # Row of a frame in the tables; what was not seen there is zero.
         self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
@@ -215,19 +215,15 @@ class Follower:
         self._added += 1
         if row is None or not len(self._index):
             return
-        height, width = view.valid.shape
-        surfaces = first_surfaces(
-            self._lit.rays, self._lit.scene.face_object, view.world_from_camera, view.intrinsics,
-            np.array([width, height], np.int32),
-        )  # fmt: skip
+        surfaces = first_surfaces(self._lit.rays, self._lit.scene.face_object, view.camera)
         kind, radiance = samples_from_frame(
-            self._texels, self._owner, surfaces, view.radiance, view.valid, clipped,
-            view.world_from_camera, view.intrinsics, beside_glare=True,
+            self._texels, self._owner, surfaces, view.radiance, view.valid, clipped, view.camera,
+            beside_glare=True,
         )  # fmt: skip
         seen = np.flatnonzero(kind == SAMPLE)
         self._seen[row, seen] = True
         self._radiance[row, seen] = radiance[seen]
-        self._light[row, seen] = self._mirrored_light(seen, view.world_from_camera[:3, 3])
+        self._light[row, seen] = self._mirrored_light(seen, view.camera.eye)
         self._noise[row] = noise_floor
 
     def chosen(self, texels: Texels, seed: int) -> Observations:
@@ -286,7 +282,7 @@ class Follower:
         position, normal = self._texels.position[which], self._texels.normal[which]
         to_eye = (eye - position).astype(np.float32)
         to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-12)
-        origin = lift_from_surface(position, normal, self._lit.size)
+        origin = lift_from_surface(position, normal, self._lit.diagonal_m)
         total = np.zeros(len(which), np.float32)
         for offset in self._jitter:
             half = (normal + offset).astype(np.float32)

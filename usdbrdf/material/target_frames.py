@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from usdbrdf.model.arrays import Bool, Double, Float, Int
-from usdbrdf.model.camera import pixel_centres
+from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.transport.lit_scene import SurfacePoints, visible_points
 from usdbrdf.transport.rays import RayScene, lift_from_surface
@@ -27,7 +27,7 @@ class FrameCounts:
 
 
 def mirror_hits_emitter(
-    rays: RayScene, points: SurfacePoints, emission: SurfaceTexture, scene_size: float
+    rays: RayScene, points: SurfacePoints, emission: SurfaceTexture, diagonal_m: float
 ) -> Bool:
     """A1 (R,): would a perfect mirror at the point show an emitter to the camera?
 
@@ -35,7 +35,7 @@ def mirror_hits_emitter(
     """
     along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
     reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
-    origin = lift_from_surface(points.position, points.normal, scene_size)
+    origin = lift_from_surface(points.position, points.normal, diagonal_m)
     hits = rays.closest(origin, reflected)
     shines = emission.at(hits.face, hits.u, hits.v)[:, 0] > 0.5
     return np.asarray(shines & (hits.face >= 0) & (points.face >= 0), np.bool_)
@@ -46,18 +46,15 @@ def count_frame(
     scene: Scene,
     emission: SurfaceTexture,
     valid: Bool,
-    world_from_camera: Double,
-    intrinsics: Double,
-    scene_size: float,
+    camera: Camera,
+    diagonal_m: float,
     stride: int,
 ) -> FrameCounts:
     """A1 and A2 counted per object over every ``stride``-th pixel of a frame, valid (H, W)."""
-    height, width = valid.shape
-    pixels = pixel_centres(width, height, stride)
-    points = visible_points(rays, scene, world_from_camera, intrinsics, pixels)
+    points = visible_points(rays, scene, camera, camera.pixels(stride))
     owner = np.where(points.face >= 0, scene.face_object[points.face], -1)
     good = valid[::stride, ::stride].ravel() & (owner >= 0)
-    mirrored = good & mirror_hits_emitter(rays, points, emission, scene_size)
+    mirrored = good & mirror_hits_emitter(rays, points, emission, diagonal_m)
     number = len(scene.objects)
     return FrameCounts(
         mirrored=np.bincount(owner[mirrored], minlength=number),

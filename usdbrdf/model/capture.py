@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 
 
@@ -39,6 +40,18 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.image_paths)
+
+    def camera(self, i: int) -> Camera:
+        """The camera of frame i, named after its image."""
+        fx, fy, cx, cy = self.intrinsics[i].tolist()
+        width, height = self.resolution[i].tolist()
+        return Camera(
+            world_from_camera=self.world_from_camera[i],
+            intrinsics=(fx, fy, cx, cy),
+            width=width,
+            height=height,
+            name=self.image_paths[i].name,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from usdbrdf.transport.brdf import MIN_ALPHA, distribution, fresnel, masking, masking_width
+
 NAME = "usdbrdf_lobe"
 
 _registered: set[str] = set()
@@ -13,10 +15,8 @@ def register(mi: Any) -> None:
     """Make the plugin ``usdbrdf_lobe`` known to the variant that is set.
 
     It takes the textures ``diffuse`` and ``f0`` (colours) and ``phi``, the roughness parameter of
-    the lobe: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h), with
-    D: GGX, alpha = max(0.001, phi); G1(x) = 1 / (x + sqrt(x^2 + y^2 - x^2 y^2)),
-    y = (phi / 2 + 1 / 2)^2, whose product holds 1 / (4 cos cos); F = f0 + (1 - f0) (1 - wo.h)^5.
-    The back is black. B. Haefner et al. 2021, eq. 2 to 6.
+    the lobe: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h), with the terms of ``brdf``. The back
+    is black. B. Haefner et al. 2021, eq. 2 to 6.
     """
     if mi.variant() not in _registered:
         mi.register_bsdf(NAME, _plugin_class(mi))
@@ -44,8 +44,7 @@ def _plugin_class(mi: Any) -> Any:
 
         def _glossy_share(self, si: Any, diffuse: Any, f0: Any) -> Any:
             # Depends on wi alone, so that pdf agrees with sample.
-            edge = dr.clip(1 - mi.Frame3f.cos_theta(si.wi), 0, 1) ** 5
-            glossy = dr.mean(f0) + (1 - dr.mean(f0)) * edge
+            glossy = fresnel(dr.mean(f0), dr.clip(mi.Frame3f.cos_theta(si.wi), 0, 1))
             return dr.clip(glossy / (glossy + 0.5 * dr.mean(diffuse)), 0.1, 0.9)
 
         def _value_and_density(self, si: Any, wo: Any, parameters: Any) -> tuple[Any, Any]:
@@ -54,24 +53,19 @@ def _plugin_class(mi: Any) -> Any:
             front = (cos_i > 0) & (cos_o > 0)
             h = dr.normalize(si.wi + wo)
             cos_h, wo_h = mi.Frame3f.cos_theta(h), dr.clip(dr.dot(wo, h), 0, 1)
-            a2 = dr.square(dr.maximum(phi, 0.001))
-            distribution = a2 / (dr.pi * dr.square(1 + (a2 - 1) * dr.square(cos_h)))
-            y2 = dr.square(dr.square(0.5 * phi + 0.5))
-            shadowing = 1.0
-            for x in (cos_i, cos_o):
-                x2 = dr.square(x)
-                shadowing /= x + dr.safe_sqrt(x2 + y2 - x2 * y2)
-            fresnel = f0 + (1 - f0) * (1 - wo_h) ** 5
-            value = (diffuse / dr.pi + shadowing * distribution * fresnel) * cos_o
+            d = distribution(mi.Frame3f.sin_theta_2(h), dr.maximum(phi, MIN_ALPHA))
+            y = masking_width(phi)
+            g = masking(cos_i, y, dr.safe_sqrt) * masking(cos_o, y, dr.safe_sqrt)
+            value = (diffuse / dr.pi + g * d * fresnel(f0, wo_h)) * cos_o
             share = self._glossy_share(si, diffuse, f0)
-            lobe = distribution * cos_h / (4 * dr.maximum(wo_h, 1e-8))
+            lobe = d * cos_h / (4 * dr.maximum(wo_h, 1e-8))
             density = share * lobe + (1 - share) * cos_o / dr.pi
             return dr.select(front, value, 0), dr.select(front, density, 0)
 
         def sample(self, ctx: Any, si: Any, one: Any, two: Any, active: Any = True) -> Any:
             parameters = diffuse, f0, phi = self._parameters(si, active)
             glossy = one < self._glossy_share(si, diffuse, f0)
-            tan2 = dr.square(dr.maximum(phi, 0.001)) * two.x / dr.maximum(1 - two.x, 1e-7)
+            tan2 = dr.square(dr.maximum(phi, MIN_ALPHA)) * two.x / dr.maximum(1 - two.x, 1e-7)
             cos_h = dr.rsqrt(1 + tan2)
             sin_h = dr.safe_sqrt(1 - dr.square(cos_h))
             sin_p, cos_p = dr.sincos(2 * dr.pi * two.y)

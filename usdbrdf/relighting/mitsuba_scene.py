@@ -11,7 +11,7 @@ from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight, SkyLight
 from usdbrdf.model.material import Surface
 from usdbrdf.relighting import lobe_plugin
-from usdbrdf.relighting.matched_lobe import matching_factor
+from usdbrdf.transport.renderer_match import matching_factor
 
 # Share of the samples that go to the lobe where Mitsuba mixes two BSDFs.
 _GLOSSY_SHARE = 0.3

@@ -20,7 +20,7 @@ from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
 from usdbrdf.job.progress import say, warn
 from usdbrdf.model.arrays import Float
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.relighting.insert import Insert
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
@@ -83,7 +83,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     time = time_code(stage, options.frame)
     captured = published(stage, time, warn)
     if options.views is None:
-        views: tuple[View, ...] = (published_camera(stage, options.camera, time),)
+        views: tuple[Camera, ...] = (published_camera(stage, options.camera, time),)
     else:
         views = cameras_of_views(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
@@ -116,7 +116,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
 def _photograph(
     mitsuba: Any,
     loaded: Any,
-    views: Sequence[View],
+    views: Sequence[Camera],
     targets: Sequence[Path],
     options: RelightOptions,
     *,
@@ -138,7 +138,7 @@ def _photograph(
 
 
 def _rendered(
-    mitsuba: Any, loaded: Any, views: Sequence[View], options: RelightOptions, *, denoise: bool
+    mitsuba: Any, loaded: Any, views: Sequence[Camera], options: RelightOptions, *, denoise: bool
 ) -> Iterator[Float]:
     """(H, W, 3) radiance of one view after the other."""
     for i, view in enumerate(views):
@@ -232,7 +232,7 @@ def _refuse_taken(path: Path, *, folder: bool) -> None:
         )
 
 
-def _targets(output: Path, views: Sequence[View], options: RelightOptions) -> list[Path]:
+def _targets(output: Path, views: Sequence[Camera], options: RelightOptions) -> list[Path]:
     if options.views is None:
         return [output]
     targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]

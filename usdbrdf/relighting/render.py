@@ -1,4 +1,4 @@
-"""A scene and a view -> mean radiance per pixel, by Mitsuba 3 (extra ``render``), imported only
+"""A scene and a camera -> mean radiance per pixel, by Mitsuba 3 (extra ``render``), imported only
 here."""
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 
 # Older ones abort the process while they compile Mitsuba's kernels.
 _MIN_LLVM = 17
@@ -61,29 +61,29 @@ class Rendered:
 
 
 def render_view(
-    mi: Any, scene: Any, view: View, *, samples: int, seed: tuple[int, ...], label: str
+    mi: Any, scene: Any, camera: Camera, *, samples: int, seed: tuple[int, ...], label: str
 ) -> Rendered:
     """``samples`` paths per pixel; equal seeds give equal noise."""
-    fx, fy, _, cy = view.intrinsics
+    fx, fy, _, cy = camera.intrinsics
     # Mitsuba's pixels are square: others are rendered so, and their rows gathered afterwards.
-    height = max(1, round(view.height * fx / fy))
-    stretch = height / view.height
-    sensor = pinhole(mi, view, height, cy * stretch)
+    height = max(1, round(camera.height * fx / fy))
+    stretch = height / camera.height
+    sensor = pinhole(mi, camera, height, cy * stretch)
     integrator = mi.load_dict(
         {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": scene.integrator()}
     )
-    at_a_time = max(1, min(samples, _PATHS_PER_PASS // (view.width * height)))
+    at_a_time = max(1, min(samples, _PATHS_PER_PASS // (camera.width * height)))
     counts = [at_a_time] * (samples // at_a_time)
     if samples % at_a_time:
         counts.append(samples % at_a_time)
     states = np.random.SeedSequence(seed).generate_state(len(counts))
-    total = np.zeros((height, view.width, 9))
+    total = np.zeros((height, camera.width, 9))
     for count, state in progress(
         list(zip(counts, states, strict=True)), total=len(counts), label=label, unit="passes"
     ):
         image = mi.render(scene, sensor=sensor, integrator=integrator, spp=count, seed=int(state))
         total += count * np.array(image, np.float64)[..., -9:]
-    mean = _rows_gathered(total / samples, view.height)
+    mean = _rows_gathered(total / samples, camera.height)
     if not np.isfinite(mean).all():
         raise EnvironmentFailure(
             f"{label}: the renderer returned values that are not finite. Look for extreme "
@@ -97,17 +97,17 @@ def render_view(
     )
 
 
-def pinhole(mi: Any, view: View, height: int, cy: float) -> Any:
+def pinhole(mi: Any, camera: Camera, height: int, cy: float) -> Any:
     """A sensor of square pixels, ``height`` rows of them with the principal point in row cy."""
-    fx, _, cx, _ = view.intrinsics
+    fx, _, cx, _ = camera.intrinsics
     # Mitsuba's cameras look down +z with x to the left.
-    pose = view.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    pose = camera.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
     return mi.load_dict(
         {
             "type": "perspective",
             "fov_axis": "x",
-            "fov": float(np.degrees(2 * np.arctan(view.width / 2 / fx))),
-            "principal_point_offset_x": float(0.5 - cx / view.width),
+            "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / fx))),
+            "principal_point_offset_x": float(0.5 - cx / camera.width),
             "principal_point_offset_y": float(0.5 - cy / height),
             "near_clip": _NEAR_M,
             "far_clip": _FAR_M,
@@ -115,7 +115,7 @@ def pinhole(mi: Any, view: View, height: int, cy: float) -> Any:
             "sampler": {"type": "multijitter"},
             "film": {
                 "type": "hdrfilm",
-                "width": view.width,
+                "width": camera.width,
                 "height": height,
                 "pixel_format": "rgb",
                 "component_format": "float32",

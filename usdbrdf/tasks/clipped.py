@@ -22,9 +22,9 @@ from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
-from usdbrdf.transport.patch_draws import independent_patches
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
+from usdbrdf.transport.tile_draws import independent_tiles
 
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
@@ -174,7 +174,7 @@ def _traced(
         environment,
         texels.position[chosen],
         texels.normal[chosen],
-        independent_patches(len(chosen)),
+        independent_tiles(len(chosen)),
         Sampling(standard_error=_SAMPLING.standard_error, max_rays=_SAMPLING.max_rays, seed=seed),
         float(np.linalg.norm(np.ptp(scene.points, axis=0))),
     )

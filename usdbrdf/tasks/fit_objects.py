@@ -27,7 +27,7 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.tasks.texture import MEASURED, check_memory
 from usdbrdf.transport.lit_scene import LitScene, View
-from usdbrdf.transport.lobe_samples import Mixture
+from usdbrdf.transport.lobe_radiance import Mixture
 
 # Objects that are fitted together: while rays of one are traced on all cores, another is at its
 # algebra, which takes one.
@@ -107,20 +107,14 @@ def survey_frames(
 
 
 def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
-    return View(
-        radiance=radiance,
-        valid=valid,
-        world_from_camera=frames.world_from_camera[i],
-        intrinsics=frames.intrinsics[i],
-    )
+    return View(radiance=radiance, valid=valid, camera=frames.camera(i))
 
 
 def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
     stride = max(1, round(math.sqrt(valid.size / _COUNTED_PIXELS)))
     return count_frame(
-        lit.rays, lit.scene, lit.emission, valid, frames.world_from_camera[i],
-        frames.intrinsics[i], lit.size, stride,
-    )  # fmt: skip
+        lit.rays, lit.scene, lit.emission, valid, frames.camera(i), lit.diagonal_m, stride
+    )
 
 
 def fitted_objects(
@@ -170,11 +164,9 @@ def fit_object(
     numbers, used, target = np.full(7, np.nan), 0, int(survey.target[index])
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
-        nothing = np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.bool_)
         lobe, used = fit_views(
-            lit, texels, own, survey.smoothing, lambda frame: _view(frames, frame, *nothing), index,
-            options.seed, mixture,
-        )  # fmt: skip
+            lit, texels, own, survey.smoothing, frames.camera, index, options.seed, mixture
+        )
         if lobe is not None:
             numbers[:] = (
                 lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,

@@ -32,5 +32,5 @@ def lit_scene(atlas: Atlas, environment: Environment) -> LitScene:
             texels, np.broadcast_to(emissive.astype(np.float32), (len(texels), 3))
         ),
         environment=environment,
-        size=float(np.linalg.norm(np.ptp(scene.points, axis=0))),
+        diagonal_m=float(np.linalg.norm(np.ptp(scene.points, axis=0))),
     )

@@ -10,7 +10,6 @@ import numpy as np
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.model.arrays import Float
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
@@ -74,11 +73,8 @@ def _objects_in_view(scene: Scene, rays: RayScene, frames: Frames, i: int) -> in
 
 def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int) -> Hits:
     """First surfaces behind the frame's pixels, were it ``width`` x ``height`` pixels."""
-    x, y = (width, height) / frames.resolution[i]
-    lens = frames.intrinsics[i] * (x, y, x, y)
-    return rays.closest(
-        *camera_rays(frames.world_from_camera[i], lens, pixel_centres(width, height))
-    )
+    camera = frames.camera(i).at_size(width, height)
+    return rays.closest(*camera.rays(camera.pixels()))
 
 
 def _exposure(surface: Float) -> float:

@@ -27,7 +27,7 @@ from usdbrdf.texturing.observe import samples_from_frames, spread_order
 from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, smallest_groups
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
-from usdbrdf.transport.lobe_radiance import non_diffuse_radiance
+from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.warps import shifts_of
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
@@ -172,16 +172,16 @@ def _observe(
     for done, some in enumerate(bar, start):
         taken = _taken(some.texel, samples[some.texel], some.frame, seed)
         texel, radiance = some.texel[taken], some.radiance[taken]
-        pose, lens = frames.world_from_camera[some.frame], frames.intrinsics[some.frame]
+        camera = frames.camera(some.frame)
         specular = np.empty_like(radiance)
         often = samples[texel] >= _MANY_FRAMES
         for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
             own = texel[which]
-            specular[which] = non_diffuse_radiance(
-                lit, _seen_from(texels, own, pose[:3, 3]), lobes.phi[owner[own]],
+            specular[which] = lobe_radiance(
+                lit, _seen_from(texels, own, camera.eye), lobes.phi[owner[own]],
                 lobes.psi[owner[own]], rays, seed + len(frames) + some.frame, own.astype(np.int64),
             )  # fmt: skip
-        unit, covered = level[texel], footprints(texels, texel, pose, lens)
+        unit, covered = level[texel], footprints(texels, texel, camera)
         deviation = _deviation(unit, covered, float(frames.noise_floor_radiance[some.frame]))
         values = (radiance - specular) / unit[:, None]
         update(observed, texel - np.int32(part.start), values, deviation, covered)

@@ -24,7 +24,7 @@ from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.tasks.trace import denoised_irradiance, tiles_of_patches
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import specular_irradiance
@@ -86,14 +86,14 @@ def _change(
     texture = lit.radiance.showing(texels, radiance)
     lights = lights_from_radiance(lit.scene, texels, np.abs(radiance))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED)
-    order, patch = patches_of_texels(texels)
+    order, patch = tiles_of_texels(texels)
 
     def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
         index = order[part]
         position, normal = texels.position[index], texels.normal[index]
         diffuse = irradiance_at(
             lit.rays, texture, lights, black_environment(), position, normal, patch[part],
-            sampling, lit.size,
+            sampling, lit.diagonal_m,
         )  # fmt: skip
         specular = specular_irradiance(
             lit, position, normal, index, lobes.phi, lobes.psi,

@@ -15,8 +15,13 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.tasks.atlas import Atlas
 from usdbrdf.transport.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.incoming_light import whole_patches
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
+from usdbrdf.transport.irradiance import (
+    Irradiance,
+    Sampling,
+    irradiance_at,
+    tiles_of_texels,
+    whole_tiles,
+)
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -42,7 +47,7 @@ def trace_irradiance(
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
-    order, patch = patches_of_texels(texels)
+    order, patch = tiles_of_texels(texels)
     tiles = tiles_of_patches(patch)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
@@ -65,7 +70,7 @@ def trace_irradiance(
 
 def tiles_of_patches(patch: npt.NDArray[np.int32]) -> list[slice]:
     """Ranges of about _TILE texels that do not cut a patch."""
-    return whole_patches(patch, _TILE)
+    return whole_tiles(patch, _TILE)
 
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:

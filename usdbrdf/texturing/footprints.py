@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import project
 
@@ -23,14 +24,14 @@ RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
 _OF_TEXEL, _LARGEST = 1 / 12, 1e6
 
 
-def footprints(texels: Texels, which: Int, world_from_camera: Double, intrinsics: Double) -> Float:
+def footprints(texels: Texels, which: Int, camera: Camera) -> Float:
     """A pixel's steps right and down on the surface at some texels, as a covariance in texels:
     (M, 3), xx, xy, yy. Texels that the camera sees from the front."""
     found = np.zeros((len(which), 3), np.float32)
     _footprints(
         which, texels.position, texels.step_x, texels.step_y,
-        np.linalg.inv(world_from_camera).astype(np.float64, copy=False),
-        np.asarray(intrinsics, np.float64), found,
+        np.linalg.inv(camera.world_from_camera).astype(np.float64, copy=False),
+        np.asarray(camera.intrinsics, np.float64), found,
     )  # fmt: skip
     return found
 

@@ -122,11 +122,11 @@ def samples_from_frames(
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
     for i, pixels in zip(order, _read_ahead(frames, order), strict=True):
-        pose, lens, size = frames.world_from_camera[i], frames.intrinsics[i], frames.resolution[i]
-        which = blocks.texels_in_view(pose, lens, size, MIN_COSINE)
+        camera = frames.camera(i)
+        which = blocks.texels_in_view(camera, MIN_COSINE)
         kind, radiance = samples_of_texels(
-            texels, which, owner, first_surfaces(rays, scene.face_object, pose, lens, size),
-            pixels.radiance, pixels.valid, pixels.clipped, pose, lens,
+            texels, which, owner, first_surfaces(rays, scene.face_object, camera),
+            pixels.radiance, pixels.valid, pixels.clipped, camera,
         )  # fmt: skip
         yield FrameSamples(
             frame=i,

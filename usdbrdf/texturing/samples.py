@@ -18,6 +18,7 @@ from numba import prange
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.glare import brightest_glare
 from usdbrdf.transport.rays import RayScene
@@ -43,15 +44,9 @@ class FirstSurfaces:
     point: Float
 
 
-def first_surfaces(
-    rays: RayScene,
-    face_object: Int,
-    world_from_camera: Double,
-    intrinsics: Double,
-    resolution: Int,
-) -> FirstSurfaces:
+def first_surfaces(rays: RayScene, face_object: Int, camera: Camera) -> FirstSurfaces:
     """The first hits of the rays through all pixels' centres."""
-    face, point = visible_faces(rays, world_from_camera, intrinsics, resolution)
+    face, point = visible_faces(rays, camera)
     seen = face_object[face]
     seen[face < 0] = -1
     return FirstSurfaces(object=seen, point=point)
@@ -64,19 +59,18 @@ def samples_from_frame(
     radiance: Float,
     valid: Bool,
     clipped: Bool,
-    world_from_camera: Double,
-    intrinsics: Double,
+    camera: Camera,
     beside_glare: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
     """Per texel: NOTHING, SAMPLE, or CLIPPED (visible, and saturated all over its footprint),
     (T,) int8, and the radiance of the samples, (T, 3) float32.
 
-    radiance (H, W, 3) float32; valid, clipped (H, W) bool; world_from_camera (4, 4);
-    intrinsics fx, fy, cx, cy. beside_glare: take samples there too, for whom highlights matter.
+    radiance (H, W, 3) float32; valid, clipped (H, W) bool. beside_glare: take samples there too,
+    for whom highlights matter.
     """
     return samples_of_texels(
         texels, np.arange(len(texels), dtype=np.int32), texel_object, surfaces, radiance, valid,
-        clipped, world_from_camera, intrinsics, beside_glare,
+        clipped, camera, beside_glare,
     )  # fmt: skip
 
 
@@ -88,12 +82,11 @@ def samples_of_texels(
     radiance: Float,
     valid: Bool,
     clipped: Bool,
-    world_from_camera: Double,
-    intrinsics: Double,
+    camera: Camera,
     beside_glare: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
     """The same for some texels, ``which`` (M,) int32: (M,) int8 and (M, 3) float32."""
-    camera_from_world = np.linalg.inv(world_from_camera).astype(np.float64, copy=False)
+    camera_from_world = np.linalg.inv(camera.world_from_camera).astype(np.float64, copy=False)
     if beside_glare:
         glare = np.zeros(valid.shape, np.float32)
     else:
@@ -113,8 +106,8 @@ def samples_of_texels(
         valid,
         clipped,
         camera_from_world,
-        world_from_camera[:3, 3].copy(),
-        np.asarray(intrinsics, np.float64),
+        camera.eye.copy(),
+        np.asarray(camera.intrinsics, np.float64),
         glare,
         kind,
         values,

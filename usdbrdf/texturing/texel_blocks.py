@@ -11,6 +11,7 @@ from numba import prange
 from usdbrdf.geometry.unwrap import MAX_SIDE
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 
 # Texels to a side of a patch.
@@ -33,24 +34,18 @@ class TexelBlocks:
     axis: Float
     spread: Float
 
-    def texels_in_view(
-        self,
-        world_from_camera: Double,
-        intrinsics: Double,
-        resolution: Int,
-        min_cosine: float,
-    ) -> Int:
+    def texels_in_view(self, camera: Camera, min_cosine: float) -> Int:
         """All texels, by block, that lie before the camera, project into the image and
         face the eye at ``min_cosine`` or more, and of few others."""
-        width, height = (int(side) for side in resolution)
-        fx, fy, cx, cy = (float(value) for value in intrinsics)
+        width, height = camera.width, camera.height
+        fx, fy, cx, cy = camera.intrinsics
         # Inward normals, in camera axes, of the planes through the image's borders and the eye.
         planes = np.array([
             [fx, 0, -cx], [-fx, 0, cx - width], [0, -fy, -cy], [0, fy, cy - height], [0, 0, -1],
         ])  # fmt: skip
         planes /= np.linalg.norm(planes, axis=1, keepdims=True)
-        normals = np.ascontiguousarray(planes @ np.asarray(world_from_camera)[:3, :3].T)
-        eye = np.array(world_from_camera[:3, 3], np.float64)
+        normals = np.ascontiguousarray(planes @ camera.world_from_camera[:3, :3].T)
+        eye = np.array(camera.eye, np.float64)
         seen = np.flatnonzero(
             _in_view(
                 self.centre, self.radius, self.axis, self.spread, normals, eye,

@@ -7,7 +7,6 @@ from decimal import ROUND_CEILING, Context
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.model.camera import camera_rays, pixel_centres
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.model.scene import Scene
@@ -30,11 +29,9 @@ def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_tex
     """
     footprints = []
     for i in range(len(frames)):
-        width, height = (int(n) for n in frames.resolution[i])
-        stride = max(1, int(np.sqrt(width * height / _RAYS_PER_FRAME)))
-        origins, directions = camera_rays(
-            frames.world_from_camera[i], frames.intrinsics[i], pixel_centres(width, height, stride)
-        )
+        camera = frames.camera(i)
+        stride = max(1, int(np.sqrt(camera.width * camera.height / _RAYS_PER_FRAME)))
+        origins, directions = camera.rays(camera.pixels(stride))
         hits = rays.closest(origins, directions)
         met = hits.face >= 0
         corners = scene.points[scene.triangles[hits.face[met]]]

@@ -1,4 +1,5 @@
-"""The non-diffuse lobe f_nd of the paper (eq. 3-6), and how to sample it.
+"""The non-diffuse lobe f_nd of the paper (eq. 3-6), and how to sample it: the one place of its
+equations.
 
     f_nd = G D F
     D = alpha^2 / (pi (1 + (alpha^2 - 1) (n.h)^2)^2),        alpha = max(0.001, phi)
@@ -8,11 +9,18 @@
 
 G1 already contains the microfacet denominator: G = G_smith / (4 n.w n.wo). F is affine in psi, so
 f_nd(phi, psi) = base(phi) + psi * slope(phi); psi = 0 still leaves the grazing part, ``base``.
+
+The formulas are plain operators: they take numbers, NumPy's arrays and Dr.Jit's, and may be called
+from compiled functions, in whose precision they are computed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
+from numba.extending import register_jitable
 
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double
@@ -20,6 +28,56 @@ from usdbrdf.model.arrays import Double
 F0_OF_PSI = 0.08
 
 MIN_ALPHA = 0.001
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def formula(function: F) -> F:
+    """A function that stays one of Python, and that kernels may call as well."""
+    same: F = register_jitable(function)
+    return same
+
+
+@formula
+def stretched(a2: Any, b2: Any, k2: Any) -> Any:
+    """a^2 + (k b)^2 from the squares. Of sine and cosine of an angle it is what D and G1 hold, in
+    the form that keeps the digits of a mirror's D: 1 + (k^2 - 1) cos^2 would not."""
+    return a2 + k2 * b2
+
+
+@formula
+def distribution(sin2_h: Any, alpha: Any) -> Any:
+    """D from sin^2 of the angle between normal and half vector."""
+    alpha2 = alpha * alpha
+    below = stretched(sin2_h, 1.0 - sin2_h, alpha2)
+    return alpha2 / (np.pi * below * below)
+
+
+@formula
+def masking_width(phi: Any) -> Any:
+    """y = (phi/2 + 1/2)^2 of G1."""
+    half = 0.5 * phi + 0.5
+    return half * half
+
+
+@formula
+def masking(x: Any, y: Any, sqrt: Any = np.sqrt) -> Any:
+    """G1(x, y), with the ``sqrt`` of the kind of numbers that x and y are."""
+    x2 = x * x
+    return 1.0 / (x + sqrt(stretched(x2, 1.0 - x2, y * y)))
+
+
+@formula
+def grazing(cos_wh: Any) -> Any:
+    """Schlick's (1 - w.h)^5 of a cosine in [0, 1]."""
+    m = 1.0 - cos_wh
+    return m * m * m * m * m
+
+
+@formula
+def fresnel(f0: Any, cos_wh: Any) -> Any:
+    """F of a cosine in [0, 1]."""
+    return f0 + (1.0 - f0) * grazing(cos_wh)
 
 
 @kernel
@@ -29,28 +87,9 @@ def alpha_of_phi(phi: float) -> float:
 
 
 @kernel
-def distribution(sin2_h: float, alpha: float) -> float:
-    """D from sin^2 of the angle between normal and half vector.
-
-    1 + (alpha^2 - 1) cos^2 = sin^2 + alpha^2 cos^2: written so, a mirror's D keeps its digits.
-    """
-    a2 = alpha * alpha
-    below = sin2_h + a2 * (1.0 - sin2_h)
-    return a2 / (np.pi * below * below)
-
-
-@kernel
-def masking(x: float, phi: float) -> float:
-    """G1(x, y) with y = (phi/2 + 1/2)^2."""
-    y = (0.5 * phi + 0.5) ** 2
-    return float(1.0 / (x + np.sqrt(x * x + y * y - x * x * y * y)))
-
-
-@kernel
-def grazing(cos_wh: float) -> float:
-    """Schlick's (1 - w.h)^5."""
-    m = min(1.0, max(0.0, 1.0 - cos_wh))
-    return m * m * m * m * m
+def clamped(cosine: float) -> float:
+    """Into [0, 1], beyond which rounding may have taken it."""
+    return min(1.0, max(0.0, cosine))
 
 
 @kernel
@@ -62,8 +101,9 @@ def lobe(n: Double, w: Double, wo: Double, phi: float) -> tuple[float, float]:
     if nw <= 0 or no <= 0:
         return 0.0, 0.0
     sin2_h, cos_wh = half_vector(n, w, wo)
-    dg = distribution(sin2_h, alpha_of_phi(phi)) * masking(nw, phi) * masking(no, phi)
-    x = grazing(cos_wh)
+    y = masking_width(phi)
+    dg = distribution(sin2_h, alpha_of_phi(phi)) * masking(nw, y) * masking(no, y)
+    x = grazing(clamped(cos_wh))
     return dg * x, F0_OF_PSI * dg * (1.0 - x)
 
 

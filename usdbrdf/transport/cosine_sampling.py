@@ -1,14 +1,5 @@
-"""Rays in cosine-distributed directions: made, traced and added up in one compiled loop.
-
-The loops here and in ``light_by_picks`` run on one thread, mostly in single precision, and let go
-of Python's lock; each thread takes points of its own. They take AHEAD points at a time, so that all
-that a ray needs from its making to what it brought stays in the nearest cache. One sample's rays of
-all points follow each other: within a patch they point in much the same direction, a group's are
-nearly parallel and traced together.
-
-Sums are kept in four blocks of samples, (4, P, 4), whose last column fills up a row, so that the
-estimator can tell its own error.
-"""
+"""Rays in cosine-distributed directions: made, traced and added up in one compiled loop, as
+``light_sampling`` does."""
 
 from __future__ import annotations
 
@@ -18,19 +9,25 @@ import numpy as np
 
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
-from usdbrdf.transport.embree import closest_hits, closest_hits_of_groups, prefetch
-from usdbrdf.transport.environment import EnvironmentArrays, environment_at
-from usdbrdf.transport.light_sampling import PickArrays, PointDraws, turns
-from usdbrdf.transport.patch_draws import groups_of
+from usdbrdf.transport.embree import (
+    Hits,
+    closest_hits,
+    closest_hits_of_groups,
+    empty_hits,
+)
+from usdbrdf.transport.environment import environment_at
+from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, turns
+from usdbrdf.transport.lights import DENSITY, GROUP, facing
 from usdbrdf.transport.surface_texture import (
     AHEAD,
-    PackedArrays,
     add_looked_at,
     empty_looks,
     fetch_face,
     look_at,
+    prefetch,
     unsigned,
 )
+from usdbrdf.transport.tile_draws import groups_of
 from usdbrdf.transport.warps import fractions, hashed_uniform, on_hemisphere, tangent_frame
 
 # In the loops' own precision: with Python's constants the compiler would go over to doubles.
@@ -51,20 +48,19 @@ def frames_of(normal: Float) -> Float:
 
 @loop
 def cosine_directions(
-    frames: Float, draws: PointDraws, sample: int, first: int, out: Float, room: Float
+    frames: Float, draws: PointDraws, sample: int, first: int, out: Float, scratch: Float
 ) -> None:
     """Cosine-distributed directions about the normals of points ``first`` and on, into ``out``
-    (N, 3); room (3, N) for what is computed on the way."""
-    sobol, scrambles, seed, identity = draws
+    (N, 3); scratch (3, N) for what is computed on the way."""
     count = len(out)
-    x, y, z = room[0, :count], room[1, :count], room[2, :count]
-    if len(sobol) == 0:
+    x, y, z = scratch[0, :count], scratch[1, :count], scratch[2, :count]
+    if len(draws.sobol) == 0:
         for k in range(count):
-            x[k] = hashed_uniform(seed, identity[first + k], sample * 2)
-            y[k] = hashed_uniform(seed, identity[first + k], sample * 2 + 1)
+            x[k] = hashed_uniform(draws.seed, draws.identity[first + k], sample * 2)
+            y[k] = hashed_uniform(draws.seed, draws.identity[first + k], sample * 2 + 1)
     else:
-        fractions(sobol[sample, 0], scrambles[0, first : first + count], x)
-        fractions(sobol[sample, 1], scrambles[1, first : first + count], y)
+        fractions(draws.sobol[sample, 0], draws.scrambles[0, first : first + count], x)
+        fractions(draws.sobol[sample, 1], draws.scrambles[1, first : first + count], y)
     on_hemisphere(x, y, z)
     f = frames[:, first : first + count]
     for k in range(count):
@@ -74,43 +70,30 @@ def cosine_directions(
 
 
 @loop
-def add_light_by_direction(
-    scene: int,
-    radiance: PackedArrays,
-    environment: EnvironmentArrays,
-    picks: PickArrays,
-    origin: Float,
-    normal: Float,
-    draws: PointDraws,
-    start: int,
-    block: Long,
-    sums: Double,
-    escaped: Double,
+def add_cosine_samples(
+    met: Met, receivers: Receivers, start: int, block: Long, sums: Double, escaped: Double
 ) -> None:
-    """sums += L cos / (p_cosine + p_light) for samples ``start`` and on of P points (origin,
-    normal (P, 3)), each into its ``block``; escaped (P,) += 1 for each ray that met nothing."""
-    frames, room, group = frames_of(normal), np.empty((3, AHEAD), np.float32), groups_of(draws[3])
-    directions, face = np.empty((AHEAD, 3), np.float32), np.empty(AHEAD, np.int32)
-    u, v, distance = np.empty((3, AHEAD), np.float32)
-    weight, looks = np.empty(AHEAD, np.float32), empty_looks()
+    """sums += L cos / (p_cosine + p_light) for samples ``start`` and on of P points, each into its
+    ``block``; escaped (P,) += 1 for each ray that met nothing."""
+    draws, radiance = receivers.draws, met.radiance
+    frames, scratch = frames_of(receivers.normal), np.empty((3, AHEAD), np.float32)
+    group, directions = groups_of(draws.identity), np.empty((AHEAD, 3), np.float32)
+    hits, weight, looks = empty_hits(AHEAD), np.empty(AHEAD, np.float32), empty_looks()
     lamps, light = np.empty((2, AHEAD), np.int32)
-    image, z_up = environment
-    is_light, use_lights = picks[0][6], len(picks[4]) > 0
+    is_light, use_lights = receivers.groups.is_light, len(receivers.picks.ratio) > 0
     for first, last, s in turns(group, len(block)):
         total = sums[block[s]]
         part = last - first
-        d = directions[:part]
-        cosine_directions(frames, draws, start + s, first, d, room)
-        if len(draws[0]):
-            closest_hits_of_groups(
-                scene, origin[first:last], d, group[first:last], face, u, v, distance
-            )
+        d, origin = directions[:part], receivers.origin[first:last]
+        cosine_directions(frames, draws, start + s, first, d, scratch)
+        if len(draws.sobol):
+            closest_hits_of_groups(met.scene, origin, d, group[first:last], hits)
         else:
-            closest_hits(scene, origin[first:last], d, face, u, v, distance)
+            closest_hits(met.scene, origin, d, hits)
         # In passes, so that what they wait for from memory is under way before it is read.
         count = 0
         for i in range(part):
-            f = face[i]
+            f = hits.face[i]
             fetch_face(radiance, max(f, 0))
             weight[i], lamps[count] = _PI, i
             if f >= 0:
@@ -119,42 +102,41 @@ def add_light_by_direction(
                 weight[i], k = 0, unsigned(first + i)
                 escaped[k] += 1
                 for c in range(3):
-                    total[k, c] += np.pi * environment_at(image, z_up, d[i, 0], d[i, 1], d[i, 2], c)
+                    far = environment_at(met.environment, d[i, 0], d[i, 1], d[i, 2], c)
+                    total[k, c] += np.pi * far
         if use_lights:
-            weigh_lamps(picks, normal, first, d, (face, distance), lamps[:count], light, weight)
+            weigh_lamps(receivers, first, d, hits, lamps[:count], light, weight)
         for i in range(part):
-            look_at(radiance, looks, i, max(face[i], 0), u[i], v[i])
+            look_at(radiance, looks, i, max(hits.face[i], 0), hits.u[i], hits.v[i])
         for i in range(part):
             add_looked_at(radiance, looks, i, weight[i], total, unsigned(first + i))
 
 
 @loop
 def weigh_lamps(
-    picks: PickArrays,
-    normal: Float,
+    receivers: Receivers,
     first: int,
     directions: Float,
-    hits: tuple[Int, Float],
+    hits: Hits,
     which: Int,
     light: Int,
     weight: Float,
 ) -> None:
     """The weights of the rays ``which`` (N,), of those of points ``first`` and on, that met lights
-    and might have been picked as well. hits: face and distance of each ray."""
-    light_of_face, triangles, row, ratio = picks[0][4], picks[0][5], picks[1], picks[4]
-    face, distance = hits
+    and might have been picked as well; ``light`` is overwritten."""
+    groups, normal, ratio = receivers.groups, receivers.normal, receivers.picks.ratio
     for i in which:
-        prefetch(light_of_face, unsigned(face[i]))
+        prefetch(groups.of_face, unsigned(hits.face[i]))
     for j in range(len(which)):
-        light[j] = light_of_face[unsigned(face[which[j]])]
-        prefetch(triangles, unsigned(light[j]))
+        light[j] = groups.of_face[unsigned(hits.face[which[j]])]
+        prefetch(groups.triangles, unsigned(light[j]))
     for j in range(len(which)):
         i = unsigned(which[j])
-        t, k = triangles[unsigned(light[j])], unsigned(first + i)
+        triangle, k = groups.triangles[unsigned(light[j])], unsigned(first + i)
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        facing = -(x * t[9] + y * t[10] + z * t[11])
+        sent = facing(triangle, x, y, z)
         cosine = max(x * normal[k, 0] + y * normal[k, 1] + z * normal[k, 2], _TINY)
-        if facing > 0:
-            density = t[12] * ratio[row[k], np.int32(t[13])]
-            square = distance[i] * distance[i]
-            weight[i] = cosine / (cosine * _INVERSE_PI + density * square / facing)
+        if sent > 0:
+            density = triangle[DENSITY] * ratio[receivers.row[k], np.int32(triangle[GROUP])]
+            square = hits.distance[i] * hits.distance[i]
+            weight[i] = cosine / (cosine * _INVERSE_PI + density * square / sent)

@@ -1,86 +1,54 @@
-"""Asking for memory before it is needed: what a loop then reads is in the cache already."""
+"""Embree by its C interface: a scene of triangles, and loops that trace rays through it.
+
+Rays are laid out in memory as Embree's headers say; no function tells these offsets.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import weakref
 from functools import cache
-from typing import Any
+from typing import NamedTuple
 
 import embreex.rtcore_scene
 import llvmlite.binding
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bool, Float, Int, Long
 
-_READ, _KEEP, _DATA = 0, 3, 1
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def prefetch(_: Any, array: Any, row: Any) -> Any:
-    """Fetch the line of the cache that holds the start of array[row]; never reads, never waits.
-    For use inside kernels; ``row`` is not counted from the end."""
-
-    def instruction(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        of_array = signature.args[0]
-        data = context.make_array(of_array)(context, builder, values[0])
-        first = context.get_constant(types.intp, 0)
-        index = context.cast(builder, values[1], signature.args[1], types.intp)
-        place = cgutils.get_item_pointer(
-            context, builder, of_array, data, [index] + [first] * (of_array.ndim - 1)
-        )
-        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        call = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
-        builder.call(
-            call, [builder.bitcast(place, byte), number(_READ), number(_KEEP), number(_DATA)]
-        )
-        return context.get_dummy_value()
-
-    return types.void(array, row), instruction
-
-
 _TRIANGLES = 0  # RTC_GEOMETRY_TYPE_TRIANGLE
-
 _INDICES, _VERTICES = 0, 1  # RTC_BUFFER_TYPE_INDEX, _VERTEX
-
 _UINT3, _FLOAT3 = 0x5003, 0x9003  # RTC_FORMAT_UINT3, _FLOAT3
+_HIGH = 2  # RTC_BUILD_QUALITY_HIGH
 
 # Rays near an edge hit one of its triangles: without it one in 10,000 leaves a closed room that
 # lies 100 m from the origin of its coordinates.
 _ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
 
-_HIGH = 2  # RTC_BUILD_QUALITY_HIGH
-
 # Embree may read 16 bytes from any vertex, also the last.
 _FLOATS_BEHIND_VERTICES = 4
 
-# A ray and its hit, RTCRayHit: 21 words of 4 bytes, filled up to 24, aligned to 16 bytes.
-_WORDS, _ALIGNED = 24, 16
-
+# A ray and its hit, RTCRayHit: 21 words of 4 bytes, filled up to 24, aligned to 16 bytes; and eight
+# of them, RTCRayHit8: each word of a ray for all of them, aligned to 32 bytes.
+_WORDS, _ALIGNED, _LANES, _ALIGNED_PACKET = 24, 16, 8, 32
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
-
 _U, _V, _FACE, _GEOMETRY, _INSTANCE = 15, 16, 17, 18, 19
-
-# Rays of one packet, RTCRayHit8: each word of a ray for all of them, aligned to 32 bytes.
-_LANES, _ALIGNED_PACKET = 8, 32
-
 _COHERENT = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
+
+# The version in which they lie so, and RTC_DEVICE_PROPERTY_VERSION_MAJOR.
+_MAJOR_VERSION, _VERSION_MAJOR = 4, 1
 
 # Finite, so that what is computed with the distance of a ray that met nothing stays a number.
 _FARTHEST = np.float32(1e37)
 
 _pointer, _number, _size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
-
 _FUNCTIONS: dict[str, tuple[object, list[object]]] = {
     "rtcNewDevice": (_pointer, [ctypes.c_char_p]),
     "rtcGetDeviceError": (_number, [_pointer]),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, [_pointer, _number]),
     "rtcNewScene": (_pointer, [_pointer]),
     "rtcSetSceneFlags": (None, [_pointer, _number]),
     "rtcSetSceneBuildQuality": (None, [_pointer, _number]),
@@ -123,6 +91,13 @@ def _device() -> int:
         raise EnvironmentFailure(
             f"Embree does not start (its error {_embree().rtcGetDeviceError(None)}): it needs a "
             "64-bit processor with SSE2 and free memory"
+        )
+    version = _embree().rtcGetDeviceProperty(device, _VERSION_MAJOR)
+    if version != _MAJOR_VERSION:
+        raise EnvironmentFailure(
+            f"{embreex.rtcore_scene.__file__} reaches Embree {version}, whose rays lie in memory "
+            f"as those of Embree {_MAJOR_VERSION} need not: install the wheel of embreex 4.4 from "
+            "PyPI"
         )
     return device
 
@@ -177,69 +152,82 @@ _intersect_packet = types.ExternalFunction(
 _occluded = types.ExternalFunction("rtcOccluded1", types.void(types.intp, types.intp, types.intp))
 
 
-@loop
-def closest_hits(
-    scene: int, origins: Float, directions: Float, face: Int, u: Float, v: Float, distance: Float
-) -> None:
-    """First surface along each of R rays, into the last four (R,): triangle (-1: none),
-    barycentric place, distance in lengths of the direction.
+class Hits(NamedTuple):
+    """First surfaces along R rays.
 
-    origins (P, 3), directions (R, 3): ray r starts at origins[r % P].
+    face      (R,) int32, index of the triangle, -1 where the ray left the scene
+    u, v      (R,) float32, hit = (1-u-v) p0 + u p1 + v p2
+    distance  (R,) float32, in units of the direction's length; meaningless where face is -1
     """
-    ray = _aligned(_WORDS, _ALIGNED)
-    words, place, count = ray.view(np.int32), ray.ctypes.data, len(origins)
-    point = 0
+
+    face: Int
+    u: Float
+    v: Float
+    distance: Float
+
+
+class _Ray(NamedTuple):
+    """Memory of a ray and its hit, as float32 and int32 words and as an address."""
+
+    floats: Float
+    words: Int
+    address: int
+
+
+@loop
+def empty_hits(count: int) -> Hits:
+    """Memory for the hits of so many rays."""
+    u, v, distance = np.empty((3, count), np.float32)
+    return Hits(np.empty(count, np.int32), u, v, distance)
+
+
+@loop
+def closest_hits(scene: int, origins: Float, directions: Float, hits: Hits) -> None:
+    """First surface along each of R rays with directions (R, 3), into ``hits``; origins (P, 3): ray
+    r starts at origins[r % P]."""
+    ray, point, count = _empty_ray(), 0, len(origins)
     for r in range(len(directions)):
-        _aim(ray, words, origins, point, directions, r)
-        _find(scene, ray, words, place, (face, u, v, distance), r)
+        _aim(ray, origins, point, directions, r)
+        _find(scene, ray, hits, r)
         point = point + 1 if point + 1 < count else 0
 
 
 @loop
 def closest_hits_of_groups(
-    scene: int,
-    origins: Float,
-    directions: Float,
-    group: Long,
-    face: Int,
-    u: Float,
-    v: Float,
-    distance: Float,
+    scene: int, origins: Float, directions: Float, group: Long, hits: Hits
 ) -> None:
     """``closest_hits`` of rays with origins and directions (R, 3), of which those with the same
     number in ``group`` (R,) follow each other, start close together and are nearly parallel: they
     go through the scene together, eight at a time."""
-    ray = _aligned(_WORDS, _ALIGNED)
-    ray_words, ray_place = ray.view(np.int32), ray.ctypes.data
+    ray = _empty_ray()
     # In one piece: the packet, which of its rays count, RTCIntersectArguments.
     memory = _aligned((_WORDS + 2) * _LANES, _ALIGNED_PACKET)
-    words, place = memory.view(np.int32), memory.ctypes.data
-    rays, hits = memory.reshape(-1, _LANES), words.reshape(-1, _LANES)
-    counts, arguments = hits[_WORDS], hits[_WORDS + 1]
-    hits[_MASK], arguments[0], arguments[1] = -1, _COHERENT, -1
+    floats, words = memory.reshape(-1, _LANES), memory.view(np.int32).reshape(-1, _LANES)
+    counts, arguments = words[_WORDS], words[_WORDS + 1]
+    words[_MASK], arguments[0], arguments[1] = -1, _COHERENT, -1
     start, end = 0, len(directions)
     while start < end:
         lanes = 1
         while lanes < _LANES and start + lanes < end and group[start + lanes] == group[start]:
             lanes += 1
         if lanes == 1:  # alone it is nearly twice as fast
-            _aim(ray, ray_words, origins, start, directions, start)
-            _find(scene, ray, ray_words, ray_place, (face, u, v, distance), start)
+            _aim(ray, origins, start, directions, start)
+            _find(scene, ray, hits, start)
             start += 1
             continue
         for j in range(lanes):
             r = start + j
             for c in range(3):
-                rays[_ORIGIN + c, j], rays[_DIRECTION + c, j] = origins[r, c], directions[r, c]
+                floats[_ORIGIN + c, j], floats[_DIRECTION + c, j] = origins[r, c], directions[r, c]
         for j in range(_LANES):
             counts[j] = -1 if j < lanes else 0
-            rays[_FAR, j] = _FARTHEST
-            hits[_GEOMETRY, j], hits[_INSTANCE, j] = -1, -1
-        _intersect_packet(counts.ctypes.data, scene, place, arguments.ctypes.data)
+            floats[_FAR, j] = _FARTHEST
+            words[_GEOMETRY, j], words[_INSTANCE, j] = -1, -1
+        _intersect_packet(counts.ctypes.data, scene, memory.ctypes.data, arguments.ctypes.data)
         for j in range(lanes):
             r = start + j
-            face[r] = hits[_FACE, j] if hits[_GEOMETRY, j] >= 0 else -1
-            u[r], v[r], distance[r] = rays[_U, j], rays[_V, j], rays[_FAR, j]
+            hits.face[r] = words[_FACE, j] if words[_GEOMETRY, j] >= 0 else -1
+            hits.u[r], hits.v[r], hits.distance[r] = floats[_U, j], floats[_V, j], floats[_FAR, j]
         start += lanes
 
 
@@ -255,13 +243,12 @@ def occlusion(
     """True in ``blocked`` (R,) where anything is nearer than ``distance``, in lengths of the
     direction; origins (P, 3), directions (R, 3): ray r starts at origins[start[r]], for the R of
     ``start``."""
-    ray = _aligned(_WORDS, _ALIGNED)
-    words, place = ray.view(np.int32), ray.ctypes.data
+    ray = _empty_ray()
     for r in range(len(start)):
-        _aim(ray, words, origins, start[r], directions, r)
-        ray[_FAR] = distance
-        _occluded(scene, place, 0)
-        blocked[r] = ray[_FAR] < 0
+        _aim(ray, origins, start[r], directions, r)
+        ray.floats[_FAR] = distance
+        _occluded(scene, ray.address, 0)
+        blocked[r] = ray.floats[_FAR] < 0
 
 
 @loop
@@ -273,26 +260,26 @@ def _aligned(words: int, size: int) -> Float:
 
 
 @loop
-def _find(
-    scene: int,
-    ray: Float,
-    words: Int,
-    place: int,
-    found: tuple[Int, Float, Float, Float],
-    r: int,
-) -> None:
-    """What the aimed ``ray`` meets, into face, u, v and distance at ``r``."""
-    face, u, v, distance = found
-    ray[_FAR] = _FARTHEST
-    words[_GEOMETRY], words[_INSTANCE] = -1, -1
-    _intersect(scene, place, 0)
-    face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
-    u[r], v[r], distance[r] = ray[_U], ray[_V], ray[_FAR]
+def _empty_ray() -> _Ray:
+    floats = _aligned(_WORDS, _ALIGNED)
+    return _Ray(floats, floats.view(np.int32), floats.ctypes.data)
 
 
 @loop
-def _aim(ray: Float, words: Int, origins: Float, o: int, directions: Float, d: int) -> None:
+def _find(scene: int, ray: _Ray, hits: Hits, r: int) -> None:
+    """What the aimed ``ray`` meets, into ``hits`` at ``r``."""
+    floats, words = ray.floats, ray.words
+    floats[_FAR] = _FARTHEST
+    words[_GEOMETRY], words[_INSTANCE] = -1, -1
+    _intersect(scene, ray.address, 0)
+    hits.face[r] = words[_FACE] if words[_GEOMETRY] >= 0 else -1
+    hits.u[r], hits.v[r], hits.distance[r] = floats[_U], floats[_V], floats[_FAR]
+
+
+@loop
+def _aim(ray: _Ray, origins: Float, o: int, directions: Float, d: int) -> None:
+    floats, words = ray.floats, ray.words
     for c in range(3):
-        ray[_ORIGIN + c], ray[_DIRECTION + c] = origins[o, c], directions[d, c]
-    ray[_NEAR], ray[_TIME] = 0, 0
+        floats[_ORIGIN + c], floats[_DIRECTION + c] = origins[o, c], directions[d, c]
+    floats[_NEAR], floats[_TIME] = 0, 0
     words[_MASK], words[_ID], words[_FLAGS] = -1, 0, 0

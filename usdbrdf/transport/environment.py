@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Float
 
-# What the kernels take of an Environment, in this order: image, z_up.
-EnvironmentArrays: TypeAlias = tuple[Float, bool]
 
-
-@dataclass(frozen=True, kw_only=True)
-class Environment:
+class Environment(NamedTuple):
     """Radiance of the far surroundings.
 
     image   (H, W, 3) float32; OpenEXR's and UsdLux's latitude-longitude layout: the top row is the
@@ -26,20 +21,16 @@ class Environment:
     image: Float
     z_up: bool
 
-    @property
-    def arrays(self) -> EnvironmentArrays:
-        return self.image, self.z_up
-
 
 def black_environment() -> Environment:
     return Environment(image=np.zeros((1, 1, 3), np.float32), z_up=False)
 
 
 @kernel
-def environment_at(image: Float, z_up: bool, x: float, y: float, z: float, channel: int) -> float:
+def environment_at(environment: Environment, x: float, y: float, z: float, channel: int) -> float:
     """Radiance from the unit direction (x, y, z); nearest pixel; for use inside kernels."""
-    height = image.shape[0]
-    width = image.shape[1]
+    image, z_up = environment.image, environment.z_up
+    height, width, _ = image.shape
     up = z if z_up else y
     ahead = -y if z_up else z
     row = int((0.5 - np.arcsin(min(1.0, max(-1.0, up))) / np.pi) * height)

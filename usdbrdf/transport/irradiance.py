@@ -7,8 +7,8 @@ eq. 10). Two estimators:
 ``mis``     as many cosine-distributed directions as points picked on the bright triangles, combined
             by the balance heuristic (E. Veach and L. Guibas, "Optimally combining sampling
             techniques for Monte Carlo rendering", 1995). Which triangles are picked is up to each
-            patch of 8 x 8 texels (``light_groups``). Sobol points with random bits of the scene,
-            of neighbours and of the texel or group (``patch_draws``): groups of neighbouring texels
+            tile of 8 x 8 texels (``lights``). Sobol points with random bits of the scene,
+            of neighbours and of the texel or group (``tile_draws``): groups of neighbouring texels
             trace nearly parallel rays, which Embree does at six tenths of the cost.
 
 Both are unbiased for the piecewise bilinear L_d that they are given, but for the stopping rule of
@@ -17,37 +17,37 @@ Both are unbiased for the piecewise bilinear L_d that they are given, but for th
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
+from usdbrdf.transport.cosine_sampling import add_cosine_samples
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.incoming_light import (
-    BLOCKS,
-    IncomingLight,
-    Points,
-    mean_and_error,
-    whole_patches,
-)
-from usdbrdf.transport.lights import Lights
-from usdbrdf.transport.patch_draws import (
-    STRATA_BY_PLACE,
-    TEXELS,
-    independent_draws,
-    interleaved,
-    patch_draws,
-    places_in_patch,
-)
+from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, add_light_samples
+from usdbrdf.transport.lights import LightGroups, Lights, TilePicks, weighed_groups
 from usdbrdf.transport.rays import RayScene, lift_from_surface
 from usdbrdf.transport.surface_texture import SurfaceTexture
+from usdbrdf.transport.tile_draws import (
+    STRATA_BY_PLACE,
+    TEXELS,
+    TileDraws,
+    independent_draws,
+    interleaved,
+    places_in_tile,
+    scrambles_of_points,
+    tile_draws,
+)
 
-_FIRST_ROUND = 64
+# Samples of the first round, and blocks that sums are kept in.
+_FIRST_ROUND, _BLOCKS = 64, 4
 
 # Points that a thread takes at a time: near points' nearly parallel rays follow each other.
 _POINTS = 1 << 12
@@ -58,7 +58,7 @@ class Sampling:
     """How S is estimated.
 
     estimator       "mis" or "cosine"
-    standard_error  "mis" doubles a patch's rays until its relative standard error is below this
+    standard_error  "mis" doubles a tile's rays until its relative standard error is below this
     max_rays        per texel; "cosine" traces exactly this many
     seed            of the random bits
     """
@@ -84,19 +84,19 @@ class Irradiance:
     escaped: Float
 
 
-def patches_of_texels(texels: Texels) -> tuple[Long, Int]:
+def tiles_of_texels(texels: Texels) -> tuple[Long, Int]:
     """Texels in the order of 8 x 8 blocks of their atlas, near blocks near: order (T,), and the
-    patch of each texel in that order, (T,) int32 ascending from 0. Within a patch those that share
+    tile of each texel in that order, (T,) int32 ascending from 0. Within a tile those that share
     directions follow each other."""
     owner = texels.object_index()
     local = texels.pixel - texels.first_pixel[owner]
     width = texels.resolution[owner, 0]
     x, y = local % width, local // width
     block = interleaved(x // 8, y // 8)
-    order = np.lexsort((places_in_patch(x % 8, y % 8), block, owner))
+    order = np.lexsort((places_in_tile(x % 8, y % 8), block, owner))
     key = np.stack([owner, block], axis=-1)[order]
-    patch = np.concatenate([[0], np.cumsum((np.diff(key, axis=0) != 0).any(axis=1))])
-    return order, patch.astype(np.int32)
+    tile = np.concatenate([[0], np.cumsum((np.diff(key, axis=0) != 0).any(axis=1))])
+    return order, tile.astype(np.int32)
 
 
 def irradiance_at(
@@ -106,27 +106,27 @@ def irradiance_at(
     environment: Environment,
     position: Float,
     normal: Float,
-    patch: Int,
+    tile: Int,
     sampling: Sampling,
-    scene_size: float,
+    diagonal_m: float,
     dark: Float | None = None,
 ) -> Irradiance:
     """S at N surface points.
 
-    position, normal (N, 3) float32, world; patch (N,) int32 ascending, at most 64 points each:
-    points of one patch share what lights they pick, part of their random bits, and their stopping;
-    patches that follow each other share random bits as well, ``independent_patches`` do not.
-    scene_size: metres, for the lift off the surface. dark: (N,) W/m^2; where S is below it, the
-    standard error is held against it instead of S.
+    position, normal (N, 3) float32, world; tile (N,) int32 ascending, at most 64 points each:
+    points of one tile share what lights they pick, part of their random bits, and their stopping;
+    tiles that follow each other share random bits as well, ``independent_tiles`` do not.
+    diagonal_m: the scene's, for the lift off the surface. dark: (N,) W/m^2; where S is below it,
+    the standard error is held against it instead of S.
     """
-    # A point's number within its patch of at most 64: so no two points of the scene share their
-    # random numbers, and a point draws the same ones whatever tile it comes in.
-    first = np.flatnonzero(np.diff(patch, prepend=-1))
-    size = np.diff(first, append=len(patch))
-    number = np.arange(len(patch)) - np.repeat(first, size)
-    identity = TEXELS * patch.astype(np.int64) + number
+    # A point's number within its tile of at most 64: so no two points of the scene share their
+    # random numbers, and a point draws the same ones whatever comes with it.
+    first = np.flatnonzero(np.diff(tile, prepend=-1))
+    size = np.diff(first, append=len(tile))
+    number = np.arange(len(tile)) - np.repeat(first, size)
+    identity = TEXELS * tile.astype(np.int64) + number
     stratum = STRATA_BY_PLACE[TEXELS * number // np.repeat(size, size)]
-    floor = np.zeros(len(patch)) if dark is None else dark.astype(np.float64)
+    floor = np.zeros(len(tile)) if dark is None else dark.astype(np.float64)
     techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     rounds = _rounds(sampling, techniques)
     light = IncomingLight(
@@ -136,22 +136,22 @@ def irradiance_at(
         environment=environment,
         draws=independent_draws(sampling.seed)
         if sampling.estimator == "cosine"
-        else patch_draws(sampling.seed, rounds[0][1], rounds[-1][1]),
+        else tile_draws(sampling.seed, rounds[0][1], rounds[-1][1]),
         techniques=techniques,
     )
 
     def traced(part: slice) -> Irradiance:
-        origin = lift_from_surface(position[part], normal[part], scene_size)
+        origin = lift_from_surface(position[part], normal[part], diagonal_m)
         points = Points(
-            origin, normal[part], patch[part], identity[part], stratum[part], floor[part],
-            _numbers(patch[part]),
+            origin, normal[part], tile[part], identity[part], stratum[part], floor[part],
+            _numbers(tile[part]),
         )  # fmt: skip
         return _irradiance_of(points, light, rounds, sampling.standard_error)
 
     threads = os.cpu_count() or 1
-    count = min(_POINTS, max(1, len(patch) // (4 * threads)))
+    count = min(_POINTS, max(1, len(tile) // (4 * threads)))
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        found = list(pool.map(traced, whole_patches(patch, count)))
+        found = list(pool.map(traced, whole_tiles(tile, count)))
     names = [field.name for field in fields(Irradiance)]
     return Irradiance(**{n: np.concatenate([getattr(part, n) for part in found]) for n in names})
 
@@ -159,11 +159,11 @@ def irradiance_at(
 def _irradiance_of(
     points: Points, light: IncomingLight, rounds: list[tuple[int, int]], standard_error: float
 ) -> Irradiance:
-    """Rounds of samples, each as many as all before, until every patch has enough."""
+    """Rounds of samples, each as many as all before, until every tile has enough."""
     count = len(points.origin)
     mean, error = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    sums, escaped = np.zeros((2, BLOCKS, count, 4)), np.zeros(count)
+    sums, escaped = np.zeros((2, _BLOCKS, count, 4)), np.zeros(count)
     active: Any = slice(None)
     picks = light.picks(points)
     for first, last in rounds:
@@ -177,7 +177,7 @@ def _irradiance_of(
         done[active] = light.techniques * last
         if last == rounds[-1][1]:
             break
-        noisy = np.flatnonzero(_noisy(points.patch, found, scatter, standard_error, points.floor))
+        noisy = np.flatnonzero(_noisy(points.tile, found, scatter, standard_error, points.floor))
         if not len(noisy):
             break
         if len(noisy) < len(escaped):
@@ -198,10 +198,10 @@ def _rounds(sampling: Sampling, techniques: int) -> list[tuple[int, int]]:
     return list(pairwise(ends))
 
 
-def _noisy(patch: Int, mean: Double, error: Double, target: float, dark: Double) -> Any:
-    """(P,) bool: does the point's patch still miss the target relative standard error? mean, error
+def _noisy(tile: Int, mean: Double, error: Double, target: float, dark: Double) -> Any:
+    """(P,) bool: does the point's tile still miss the target relative standard error? mean, error
     (P, 3)."""
-    index = patch - patch[0]
+    index = tile - tile[0]
     points = np.maximum(np.bincount(index), 1)
     level = np.bincount(index, mean.sum(axis=1) / 3) / points
     square = np.bincount(index, (error**2).sum(axis=1) / 3) / points
@@ -209,6 +209,99 @@ def _noisy(patch: Int, mean: Double, error: Double, target: float, dark: Double)
     return (np.sqrt(square) > target * np.maximum(level, floor))[index]
 
 
-def _numbers(patch: Int) -> Int:
-    """Which of the patches here, counted from 0, (P,)."""
-    return np.cumsum(np.diff(patch, prepend=patch[0]) != 0, dtype=np.int32)
+def _numbers(tile: Int) -> Int:
+    """Which of the tiles here, counted from 0, (P,)."""
+    return np.cumsum(np.diff(tile, prepend=tile[0]) != 0, dtype=np.int32)
+
+
+class Points(NamedTuple):
+    """Points of whole tiles: origins of their rays and normals (P, 3), tiles, random numbers'
+    identities and strata, least S to hold errors against, and the row of their tile in what is
+    kept for each, (P,)."""
+
+    origin: Float
+    normal: Float
+    tile: Int
+    identity: Long
+    stratum: Int
+    floor: Double
+    row: Int
+
+    def of(self, which: Any) -> Points:
+        return Points(*(values[which] for values in self))
+
+
+def whole_tiles(tile: Int, points: int) -> list[slice]:
+    """Ranges of about so many ``points`` that cut no tile."""
+    starts = np.flatnonzero(np.diff(tile, prepend=-1))
+    wanted = np.searchsorted(starts, np.arange(0, int(starts[-1]) + 1, points))
+    firsts = [int(first) for first in np.unique(starts[wanted])]
+    return [slice(first, last) for first, last in pairwise([*firsts, len(tile)])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class IncomingLight:
+    """All that brings light, and the one or two ``techniques`` that look for it."""
+
+    rays: RayScene
+    radiance: SurfaceTexture
+    groups: LightGroups
+    environment: Environment
+    draws: TileDraws
+    techniques: int
+
+    def picks(self, points: Points) -> TilePicks:
+        """How the points' tiles pick lights."""
+        if self.techniques == 1:
+            return TilePicks(
+                np.zeros((0, 0)), np.zeros((0, 0), np.int16), np.zeros((0, 0), np.float32)
+            )
+        first_point = np.searchsorted(points.row, np.arange(points.row[-1] + 2))
+        return weighed_groups(self.groups, points.origin, points.normal, first_point)
+
+    def add(
+        self,
+        points: Points,
+        picks: TilePicks,
+        samples: tuple[int, int],
+        sums: Double,
+        escaped: Double,
+    ) -> None:
+        """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
+        technique, and escaped (P,)."""
+        seed = self.draws.seed
+        scrambles = scrambles_of_points(points.identity, points.stratum, seed, self.draws.shared)
+        draws = PointDraws(self.draws.sobol, scrambles, seed, points.identity)
+        receivers = Receivers(points.origin, points.normal, draws, self.groups, points.row, picks)
+        met = Met(self.rays.address, self.radiance, self.environment)
+        start, block = samples[0], _block_of(np.arange(*samples), *samples)
+        add_cosine_samples(met, receivers, start, block, sums[0], escaped)
+        if self.techniques == 2:
+            add_light_samples(met, receivers, start, block, sums[1])
+
+
+def _block_of(sample: Long, first: int, last: int) -> Long:
+    """The first round fills all four blocks; each later one the last two (the first two then hold
+    what came before)."""
+    if first == 0:
+        return sample * _BLOCKS // last
+    return 2 + (sample - first) * 2 // (last - first)
+
+
+@loop
+def mean_and_error(sums: Double, samples: int) -> tuple[Double, Double]:
+    """Mean of ``samples`` in all, and its standard error from the four blocks, (P, 3) each; sums
+    (2, 4, P, 4), one for each technique, whose last column is not looked at."""
+    count = sums.shape[2]
+    mean, error = np.empty((count, 3)), np.empty((count, 3))
+    block = np.empty(4)
+    for k in range(count):
+        for c in range(3):
+            for b in range(4):
+                block[b] = (sums[0, b, k, c] + sums[1, b, k, c]) * (4 / samples)
+            centre = (block[0] + block[1] + block[2] + block[3]) / 4
+            square = 0.0
+            for b in range(4):
+                square += (block[b] - centre) ** 2
+            mean[k, c], error[k, c] = centre, math.sqrt(square / 12)
+    return mean, error

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.model.arrays import Bool, Double, Float, Int
-from usdbrdf.model.camera import camera_rays
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
@@ -42,11 +42,9 @@ class SurfacePoints:
         )
 
 
-def visible_points(
-    rays: RayScene, scene: Scene, world_from_camera: Double, intrinsics: Double, pixels: Double
-) -> SurfacePoints:
+def visible_points(rays: RayScene, scene: Scene, camera: Camera, pixels: Double) -> SurfacePoints:
     """The surface under pixel coordinates (R, 2)."""
-    return points_of_rays(rays, scene, *camera_rays(world_from_camera, intrinsics, pixels))
+    return points_of_rays(rays, scene, *camera.rays(pixels))
 
 
 def points_of_rays(
@@ -73,7 +71,7 @@ def points_of_rays(
 @dataclass(frozen=True, kw_only=True)
 class LitScene:
     """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
-    emission mask, and the scene's size in metres."""
+    emission mask, and the diagonal of the scene's box."""
 
     scene: Scene
     rays: RayScene
@@ -81,7 +79,7 @@ class LitScene:
     lights: Lights
     emission: SurfaceTexture
     environment: Environment
-    size: float
+    diagonal_m: float
 
     def owner(self, face: Int) -> Int:
         """The object of each face (R,), -1 where the face is -1."""
@@ -90,22 +88,21 @@ class LitScene:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One frame as the fit sees it: radiance (H, W, 3), valid (H, W), pose and pinhole."""
+    """One frame as the fit sees it: radiance (H, W, 3), valid (H, W), and its camera."""
 
     radiance: Float
     valid: Bool
-    world_from_camera: Double
-    intrinsics: Double
+    camera: Camera
 
 
 def sub_pixel_points(
-    lit: LitScene, view: View, pixels: Double, index: int, offsets: Double
+    lit: LitScene, camera: Camera, pixels: Double, index: int, offsets: Double
 ) -> tuple[Bool, SurfacePoints]:
     """Surface points at ``offsets`` (K, 2) in pixels from each of the pixel coordinates (P, 2).
 
     Returns which pixels have all K on object ``index``, (P,) bool, and their points in order.
     """
     inside = (pixels[:, None] + offsets).reshape(-1, 2)
-    points = visible_points(lit.rays, lit.scene, view.world_from_camera, view.intrinsics, inside)
+    points = visible_points(lit.rays, lit.scene, camera, inside)
     whole = (lit.owner(points.face) == index).reshape(-1, len(offsets)).all(axis=1)
     return whole, points.take(np.flatnonzero(np.repeat(whole, len(offsets))))

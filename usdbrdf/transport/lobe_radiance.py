@@ -1,22 +1,387 @@
-"""The specular light that known lobes send to a camera, I_nd of the paper's image model (eq. 2),
-and to other surfaces: lamps mirrored in a floor light a ceiling."""
+"""The specular light that lobes reflect: I_nd of the paper's image model (eq. 2) for roughnesses
+that are tried, of known lobes to a camera, and to other surfaces: lamps mirrored in a floor light a
+ceiling.
+
+Incident light around each point is traced once and reused for every roughness: the directions,
+their weights, and sums for roughnesses, as compiled loops.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple, TypeAlias
+
 import numpy as np
+from numba import prange
 
-from usdbrdf.model.arrays import Float, Long
-from usdbrdf.transport.brdf import MIN_ALPHA
+from usdbrdf.kernel import kernel, loop, parallel_kernel
+from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
+from usdbrdf.transport.brdf import (
+    F0_OF_PSI,
+    MIN_ALPHA,
+    alpha_of_phi,
+    clamped,
+    grazing,
+    half_vector,
+    masking,
+    masking_width,
+    reflected_density,
+    sample_half_vector,
+    stretched,
+)
+from usdbrdf.transport.embree import Hits
+from usdbrdf.transport.environment import Environment, environment_at
+from usdbrdf.transport.lights import DENSITY, LightGroups, Lights, facing, picked, way_to
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, points_of_rays
-from usdbrdf.transport.lobe_samples import Mixture, non_diffuse, trace_lobe_samples
-from usdbrdf.transport.rays import lift_from_surface
-from usdbrdf.transport.warps import cosine_rays
+from usdbrdf.transport.rays import RayScene, lift_from_surface
+from usdbrdf.transport.surface_texture import SurfaceTexture
+from usdbrdf.transport.warps import (
+    cosine_direction,
+    cosine_rays,
+    hashed_uniform,
+    sobol_bits,
+    tangent_frame,
+    triangle_point,
+)
 
-# Points are traced in pieces of this many rays: what bounds the memory.
-_RAYS_AT_ONCE = 1 << 20
+Three: TypeAlias = tuple[float, float, float]
+Six: TypeAlias = tuple[float, float, float, float, float, float]
+Basis: TypeAlias = Callable[[Sequence[float]], tuple[Float, Float]]
+
+# Widths that the lobes' samples are drawn with, for any roughness.
+LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
+
+# Roughnesses that vector instructions take at once, and rays of points that are traced at once:
+# what bounds the memory.
+_LANES, _RAYS_AT_ONCE = 8, 1 << 20
 
 
-def non_diffuse_radiance(
+class Mixture(NamedTuple):
+    """How many of a point's samples each technique draws: per lobe width, towards the lights, and
+    cosine-distributed."""
+
+    per_lobe: int = 8
+    lights: int = 8
+    cosine: int = 4
+
+
+MIXTURE = Mixture()
+
+
+class GroupDraws(NamedTuple):
+    """Sobol points (N, 2), numbers of the groups (G,) of equally many points, and the seed. With
+    each technique a group's points use one after the other's part of the same Sobol points."""
+
+    sobol: Bits
+    number: Long
+    seed: int
+
+
+class Aimed(NamedTuple):
+    """Of R points: normals and directions to the camera (R, 3), lobe widths (R, A), directions
+    (R, K, 3), and the light's triangle that each was sent to (R, K), -1 for the others."""
+
+    normal: Float
+    to_camera: Float
+    alphas: Double
+    direction: Float
+    chosen: Int
+
+
+class LobeSamples(NamedTuple):
+    """K samples at each of R surface points.
+
+    cos_in     (R, K) float32, n.w (0 where the sample brings nothing)
+    sin2_half  (R, K) float32, sin^2 of the angle between n and h
+    grazing    (R, K) float32, (1 - w.h)^5
+    weighted   (R, K, 3) float32, L cos / (K density of the whole mixture)
+    cos_out    (R,) float32, n.wo
+    """
+
+    cos_in: Float
+    sin2_half: Float
+    grazing: Float
+    weighted: Float
+    cos_out: Float
+
+
+# Inside a ``prange`` numba drops what is stored in an array of a tuple, so that the work on a point
+# is a call.
+@parallel_kernel
+def draw_directions(
+    aimed: Aimed, origin: Float, draws: GroupDraws, mixture: Mixture, groups: LightGroups
+) -> None:
+    """Directions of every technique in turn, and what they are sent to, into ``aimed``."""
+    for r in prange(len(origin)):
+        _draw_point(aimed, r, origin[r], draws, mixture, groups)
+
+
+@kernel
+def _draw_point(
+    aimed: Aimed, r: int, origin: Float, draws: GroupDraws, mixture: Mixture, groups: LightGroups
+) -> None:
+    n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
+    sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
+    number, place = draws.number[r // group], r % group
+    frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
+    for a in range(widths):
+        flips = _flips(seed, number, a)
+        for i in range(mixture.per_lobe):
+            u1, u2 = _drawn(sobol, place * mixture.per_lobe + i, flips)
+            half = _in_world(frame, n, sample_half_vector(u1, u2, aimed.alphas[r, a]))
+            _reflect(half, to_camera, directions[k])
+            k += 1
+    flips = _flips(seed, number, widths)
+    turn = hashed_uniform(seed, number, 15)
+    for i in range(mixture.lights):
+        j = i * group + place
+        pick = (turn + j / (group * mixture.lights)) % 1.0
+        aimed.chosen[r, k] = _aim(groups, pick, _drawn(sobol, j, flips), origin, directions[k])
+        k += 1
+    flips = _flips(seed, number, widths + 1)
+    for i in range(mixture.cosine):
+        u1, u2 = _drawn(sobol, place * mixture.cosine + i, flips)
+        w = _in_world(frame, n, cosine_direction(u1, u2))
+        directions[k, 0], directions[k, 1], directions[k, 2] = w
+        k += 1
+
+
+@kernel
+def _flips(seed: int, number: int, technique: int) -> tuple[np.uint32, np.uint32]:
+    """The random bits that a group's Sobol points of a technique are combined with."""
+    return (
+        np.uint32(hashed_uniform(seed, number, 16 + 2 * technique) * 2.0**32),
+        np.uint32(hashed_uniform(seed, number, 17 + 2 * technique) * 2.0**32),
+    )
+
+
+@kernel
+def _drawn(sobol: Bits, i: int, flips: tuple[np.uint32, np.uint32]) -> tuple[float, float]:
+    """The i-th point in the unit square."""
+    return (sobol[i, 0] ^ flips[0]) * 2.0**-32, (sobol[i, 1] ^ flips[1]) * 2.0**-32
+
+
+@kernel
+def _in_world(frame: Six, n: Float, d: Three) -> Three:
+    """The direction d about +z, about the normal n instead."""
+    tx, ty, tz, bx, by, bz = frame
+    return (
+        d[0] * tx + d[1] * bx + d[2] * n[0],
+        d[0] * ty + d[1] * by + d[2] * n[1],
+        d[0] * tz + d[1] * bz + d[2] * n[2],
+    )
+
+
+@kernel
+def _reflect(half: Three, wo: Float, direction: Float) -> None:
+    along = 2 * (half[0] * wo[0] + half[1] * wo[1] + half[2] * wo[2])
+    for c in range(3):
+        direction[c] = along * half[c] - wo[c]
+
+
+@kernel
+def _aim(
+    groups: LightGroups, pick: float, u: tuple[float, float], origin: Float, direction: Float
+) -> int:
+    """The direction to a point on the lights, and the triangle that this is on."""
+    which = picked(groups.cumulative, groups.guide, pick)
+    v1, v2 = triangle_point(u[0], u[1])
+    x, y, z = way_to(groups.triangles[which], v1, v2, origin[0], origin[1], origin[2])
+    length = max(np.sqrt(x * x + y * y + z * z), 1e-9)
+    direction[0], direction[1], direction[2] = x / length, y / length, z / length
+    return int(groups.face[which])
+
+
+@parallel_kernel
+def weigh(
+    aimed: Aimed,
+    hits: Hits,
+    mixture: Mixture,
+    groups: LightGroups,
+    environment: Environment,
+    samples: LobeSamples,
+) -> None:
+    """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
+    first surfaces along the (R, K) directions."""
+    for r in prange(len(samples.cos_out)):
+        _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
+
+
+@kernel
+def _weigh_point(
+    aimed: Aimed,
+    r: int,
+    hits: Hits,
+    mixture: Mixture,
+    groups: LightGroups,
+    environment: Environment,
+    samples: LobeSamples,
+) -> None:
+    n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
+    for k in range(len(weighted)):
+        w = aimed.direction[r, k]
+        f = hits.face[r, k]
+        cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+        light = 0.0
+        if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
+            triangle = groups.triangles[groups.of_face[f]]
+            sent = facing(triangle, w[0], w[1], w[2])
+            if sent > 0:
+                light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
+        # A ray sent to a point on a light counts only if that is what it meets.
+        missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
+        if cosine <= 0 or missed:
+            weighted[k] = 0
+            continue
+        s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
+        density = mixture.cosine * cosine / np.pi + mixture.lights * light
+        for a in range(len(alphas)):
+            density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
+        samples.cos_in[r, k] = cosine
+        samples.sin2_half[r, k] = s2
+        samples.grazing[r, k] = grazing(clamped(cos_wh))
+        for c in range(3):
+            value = weighted[k, c]
+            if f < 0:
+                value = environment_at(environment, w[0], w[1], w[2], c)
+            weighted[k, c] = value * cosine / density
+
+
+@parallel_kernel
+def integrate(samples: LobeSamples, phis: Float, base: Float, slope: Float) -> None:
+    """base, slope (G, 3, Q) += light times G D x, 0.08 G D (1 - x), summed over samples, means of
+    each group of consecutive points, with the group's roughnesses phis (G, Q)."""
+    group = len(samples.cos_out) // len(phis)
+    for g in prange(len(phis)):
+        for r in range(g * group, (g + 1) * group):
+            if samples.cos_out[r] > 0:
+                _add_point(samples, r, phis[g], 1.0 / group, base[g], slope[g])
+
+
+@loop
+def _add_point(
+    samples: LobeSamples, r: int, phis: Float, share: float, base: Float, slope: Float
+) -> None:
+    """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
+    side by side, as vector instructions want it."""
+    cos_in, sin2_half, graze = samples.cos_in[r], samples.sin2_half[r], samples.grazing[r]
+    weighted, cos_out = samples.weighted[r], samples.cos_out[r]
+    one, count = np.float32(1), len(phis)
+    alpha2, y2, scale = np.empty_like(phis), np.empty_like(phis), np.empty_like(phis)
+    for q in range(count):
+        y = masking_width(phis[q])
+        alpha2[q], y2[q] = alpha_of_phi(phis[q]) ** 2, y * y
+        scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
+    dg = np.empty_like(phis)
+    for k in range(len(cos_in)):
+        x, s2 = cos_in[k], sin2_half[k]
+        if x <= 0:
+            continue
+        x2, c2 = x * x, one - s2
+        rest = one - x2
+        for q in range(count):
+            below = stretched(s2, c2, alpha2[q])
+            dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
+        for c in range(3):
+            of_base = graze[k] * weighted[k, c]
+            of_slope = np.float32(F0_OF_PSI) * (weighted[k, c] - of_base)
+            for q in range(count):
+                base[c, q] += dg[q] * of_base
+            for q in range(count):
+                slope[c, q] += dg[q] * of_slope
+
+
+def trace_lobe_samples(
+    rays: RayScene,
+    points: SurfacePoints,
+    radiance: SurfaceTexture,
+    lights: Lights,
+    environment: Environment,
+    mixture: Mixture,
+    diagonal_m: float,
+    seed: int,
+    stream: Long | None = None,
+    alphas: Double | None = None,
+    group: int = 1,
+) -> LobeSamples:
+    """Trace the mixture at R surface points; all of ``points`` must lie on the surface.
+
+    group          this many consecutive points divide each technique's Sobol points among them, so
+                   that their mean has a smaller error
+    stream (G,)    groups of the same number share their random numbers; default: none do
+    alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
+    """
+    if not len(lights.face):
+        mixture = Mixture(mixture.per_lobe, 0, mixture.cosine + mixture.lights)
+    count = len(points.face)
+    if alphas is None:
+        alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
+    total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
+    origin = lift_from_surface(points.position, points.normal, diagonal_m)
+    draws = GroupDraws(
+        sobol_bits(int(np.ceil(np.log2(group * max(mixture))))),
+        np.arange(count // group) if stream is None else stream,
+        seed,
+    )
+    directions = np.zeros((count * total, 3), np.float32)
+    aimed = Aimed(
+        points.normal, points.to_camera, alphas, directions.reshape(count, total, 3),
+        np.full((count, total), -1, np.int32),
+    )  # fmt: skip
+    draw_directions(aimed, origin, draws, mixture, lights.groups)
+    hits = rays.closest(np.repeat(origin, total, axis=0), directions)
+    samples = LobeSamples(
+        cos_in=np.zeros((count, total), np.float32),
+        sin2_half=np.zeros((count, total), np.float32),
+        grazing=np.zeros((count, total), np.float32),
+        weighted=radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3),
+        cos_out=np.einsum("rd,rd->r", points.normal, points.to_camera),
+    )
+    hits = Hits._make(values.reshape(count, total) for values in hits)
+    weigh(aimed, hits, mixture, lights.groups, environment, samples)
+    return samples
+
+
+def lobe_basis(
+    lit: LitScene,
+    points: SurfacePoints,
+    num_groups: int,
+    seed: int,
+    mixture: Mixture = MIXTURE,
+    stream: Long | None = None,
+) -> Basis:
+    """Roughnesses (Q,) -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3, Q) each: the
+    mean over equally many consecutive ``points`` per group. Rays are traced once, when they
+    are first needed."""
+
+    @cache
+    def samples() -> LobeSamples:
+        return trace_lobe_samples(
+            lit.rays, points, lit.radiance, lit.lights, lit.environment, mixture, lit.diagonal_m,
+            seed, stream, group=len(points.face) // max(num_groups, 1),
+        )  # fmt: skip
+
+    def basis(phis: Sequence[float]) -> tuple[Float, Float]:
+        # As many as vector instructions take at once.
+        padded = np.zeros(-(-len(phis) // _LANES) * _LANES, np.float32)
+        padded[: len(phis)] = phis
+        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)))
+        return base[..., : len(phis)], slope[..., : len(phis)]
+
+    return basis
+
+
+def non_diffuse(samples: LobeSamples, phis: Float) -> tuple[Float, Float]:
+    """I_nd = base + psi * slope, (G, 3, Q) float32 each, means over each of G groups of consecutive
+    points, for its roughnesses phis (G, Q)."""
+    base = np.zeros((len(phis), 3, phis.shape[1]), np.float32)
+    slope = np.zeros_like(base)
+    integrate(samples, phis, base, slope)
+    return base, slope
+
+
+def lobe_radiance(
     lit: LitScene,
     points: SurfacePoints,
     phi: Float,
@@ -39,7 +404,7 @@ def non_diffuse_radiance(
         part = np.arange(start, min(start + step, len(phi)))
         samples = trace_lobe_samples(
             lit.rays, points.take(part), lit.radiance, lit.lights, lit.environment, mixture,
-            lit.size, seed, part if stream is None else stream[part], alphas[part],
+            lit.diagonal_m, seed, part if stream is None else stream[part], alphas[part],
         )  # fmt: skip
         base, slope = non_diffuse(samples, phi[part, None].astype(np.float32))
         result[part] = base[..., 0] + psi[part, None] * slope[..., 0]
@@ -65,7 +430,7 @@ def specular_irradiance(
     rays          cosine-distributed rays per point, and ``rays_of_lobe`` from where each ends
     """
     count = len(position)
-    origin = np.tile(lift_from_surface(position, normal, lit.size), (rays, 1))
+    origin = np.tile(lift_from_surface(position, normal, lit.diagonal_m), (rays, 1))
     directions = cosine_rays(normal, identity, seed, rays)
     points = points_of_rays(lit.rays, lit.scene, origin, directions)
     emits = lit.emission.at(points.face, points.u, points.v)[:, 0] > 0.5
@@ -73,7 +438,7 @@ def specular_irradiance(
     owner = lit.scene.face_object[points.face[reflects]]
     arriving = np.zeros((len(directions), 3), np.float32)
     number = (rays * identity + np.arange(rays)[:, None]).ravel()[reflects]
-    arriving[reflects] = non_diffuse_radiance(
+    arriving[reflects] = lobe_radiance(
         lit, points.take(reflects), phi[owner], psi[owner], rays_of_lobe, seed, number
     )
     mean: Float = arriving.reshape(rays, count, 3).mean(axis=0)

@@ -5,34 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Float, Int
-from usdbrdf.transport.embree import EmbreeScene, closest_hits
+from usdbrdf.transport.embree import EmbreeScene, closest_hits, empty_hits
+from usdbrdf.transport.embree import Hits as Hits
 
 # Rays are traced one at a time without Python's lock: chunks this long keep every core busy.
 _CHUNK = 1 << 16
 
 BOX_FACES = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class Hits:
-    """First surfaces along R rays.
-
-    face      (R,) int32, index of the triangle, -1 where the ray left the scene
-    u, v      (R,) float32, hit = (1-u-v) p0 + u p1 + v p2
-    distance  (R,) float32, in units of the direction's length; meaningless where face is -1
-    """
-
-    face: Int
-    u: Float
-    v: Float
-    distance: Float
 
 
 class RayScene:
@@ -75,17 +60,17 @@ class RayScene:
         """First hit of R rays: directions (R, 3), origins (P, 3), 1 <= P <= R, ray r from r % P,
         all float32 in the world frame."""
         count = len(directions)
-        face, (u, v, distance) = np.empty(count, np.int32), np.empty((3, count), np.float32)
+        hits: Hits = empty_hits(count)
         in_turn = len(origins) < count
 
         def trace(part: slice) -> None:
             closest_hits(
-                self._scene.address, origins if in_turn else origins[part], directions[part],
-                face[part], u[part], v[part], distance[part],
+                self.address, origins if in_turn else origins[part], directions[part],
+                Hits._make(values[part] for values in hits),
             )  # fmt: skip
 
         self._in_chunks(count, len(origins) if in_turn else 1, trace)
-        return Hits(face=face, u=u, v=v, distance=distance)
+        return hits
 
     def _in_chunks(self, count: int, whole: int, trace: Callable[[slice], None]) -> None:
         """Rays 0 to count in parts of a multiple of ``whole``."""
@@ -97,12 +82,12 @@ class RayScene:
             list(self._pool.map(trace, parts))
 
 
-def lift_from_surface(positions: Float, normals: Float, scene_size: float) -> Float:
+def lift_from_surface(positions: Float, normals: Float, diagonal_m: float) -> Float:
     """Origins just above the surface, so that a ray does not hit the triangle it starts on.
 
-    The lift is 1e-5 of the scene's size plus the float32 spacing of the coordinates themselves
-    (positions, normals (R, 3) float32; scene_size in the same unit).
+    The lift is 1e-5 of the scene's diagonal plus the float32 spacing of the coordinates themselves
+    (positions, normals (R, 3) float32, metres).
     """
     spacing = 4 * np.float32(1.2e-7) * np.abs(positions).max(axis=-1, keepdims=True)
-    lifted = positions + normals * (np.float32(1e-5 * scene_size) + spacing)
+    lifted = positions + normals * (np.float32(1e-5 * diagonal_m) + spacing)
     return np.ascontiguousarray(lifted, np.float32)

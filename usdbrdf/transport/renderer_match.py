@@ -27,7 +27,14 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf.model.arrays import Double
-from usdbrdf.transport.brdf import F0_OF_PSI, MIN_ALPHA
+from usdbrdf.transport.brdf import (
+    F0_OF_PSI,
+    MIN_ALPHA,
+    distribution,
+    fresnel,
+    masking,
+    masking_width,
+)
 
 # Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
 _VIEWS, _SLOPES, _AZIMUTHS, _COSINES, _CANDIDATES = 24, 120, 32, 128, 400
@@ -125,9 +132,9 @@ def view_cosines() -> Double:
 def fitted_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Double:
     """(V, N) directional albedo of the fitted lobe for reflectances F0 (N,)."""
     lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
-    y = (0.5 * phi + 0.5) ** 2
-    g = _g1(lobe.cos_out, y) * _g1(lobe.cos_in, y)  # holds 1 / (4 cos cos)
-    return np.asarray(_over_cosines(lobe, g) @ _schlick(f0))
+    y = masking_width(phi)
+    g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
+    return np.asarray(_over_cosines(lobe, g) @ fresnel(f0, _wh()[:, None]))
 
 
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:
@@ -162,9 +169,12 @@ def storm_albedo(
     excess = 1 + 0.001 / alpha**2 if mirror_error else 1.0
     # The diffuse term's light comes from everywhere: cosine-distributed about the normal.
     half = _half_vectors(1.0, cosines)
-    everywhere = _over_cosines(half, half.cos_in * 0 + 1 / np.pi / _ggx(half.cos_half, 1.0))
-    kept = everywhere @ (1 - _schlick(f0)) / everywhere.sum(axis=1)[:, None]
-    return Albedo(excess * (_over_cosines(lobe, g) @ _schlick(f0)), kept)
+    everywhere = _over_cosines(
+        half, half.cos_in * 0 + 1 / np.pi / distribution(1 - half.cos_half**2, 1.0)
+    )
+    f = fresnel(f0, _wh()[:, None])
+    kept = everywhere @ (1 - f) / everywhere.sum(axis=1)[:, None]
+    return Albedo(excess * (_over_cosines(lobe, g) @ f), kept)
 
 
 class _HalfVectors(NamedTuple):
@@ -188,7 +198,9 @@ def _half_vectors(alpha: float, cosines: Double | None = None) -> _HalfVectors:
     cos_wh = np.sqrt(1 - cos_out**2) * sin_half * np.cos(azimuth) + cos_out * cos_half
     cos_in = 2 * cos_wh * cos_half - cos_out
     step = (log_s[1] - log_s[0]) * 2 * np.pi / _AZIMUTHS
-    weight = 4 * cos_wh * sin_half**2 * cos_half * step * _ggx(cos_half, alpha) * cos_in
+    weight = (
+        4 * cos_wh * sin_half**2 * cos_half * step * distribution(1 - cos_half**2, alpha) * cos_in
+    )
     front = (cos_wh > 0) & (cos_in > 0)
     return _HalfVectors(
         cos_out,
@@ -212,12 +224,6 @@ def _wh() -> Double:
     return np.asarray((np.arange(_COSINES) + 0.5) / _COSINES)
 
 
-def _schlick(f0: Double) -> Double:
-    """(C, N)"""
-    edge = (1 - _wh()[:, None]) ** 5
-    return np.asarray(f0 + (1 - f0) * edge)
-
-
 def _dielectric(f0: Double, cosine: Double) -> Double:
     """(C, N) Fresnel's equations for the index of refraction that has F0."""
     ior = (1 + np.sqrt(f0)) / (1 - np.sqrt(f0))
@@ -228,14 +234,32 @@ def _dielectric(f0: Double, cosine: Double) -> Double:
     )
 
 
-def _ggx(cos_half: Double, alpha: float) -> Double:
-    below = 1 - cos_half**2 + (alpha * cos_half) ** 2
-    return np.asarray(alpha**2 / (np.pi * below**2))
-
-
-def _g1(x: Double, y: float) -> Double:
-    return np.asarray(1 / (x + np.sqrt(x**2 + y**2 - x**2 * y**2)))
-
-
 def _lambda(x: Double, alpha: float) -> Double:
     return np.asarray(0.5 * (np.sqrt(1 + alpha**2 * (1 / x**2 - 1)) - 1))
+
+
+@cache
+def matching_factor(phi: float, f0: float) -> float:
+    """Factor on a GGX lobe with Smith's masking that gives it the hemispherical albedo of the
+    fitted lobe, both with alpha = max(0.001, phi) and the same f0."""
+    alpha = max(MIN_ALPHA, phi)
+    fitted, smith = (_uniform_albedo(alpha, f0, y) for y in (masking_width(phi), alpha))
+    return fitted / smith
+
+
+def _uniform_albedo(alpha: float, f0: float, y: float) -> float:
+    """Share of uniform light that D G1(., y) G1(., y) F reflects, by the midpoint rule over half
+    vectors: with h drawn from D(h) cos h, what remains of f cos_o is G F 4 (wo.h) cos_o / cos h."""
+    mid = [(np.arange(n) + 0.5) / n for n in (24, 48, 24)]
+    cos_i2, u, azimuth = np.meshgrid(*mid, indexing="ij")  # cos^2 uniform: cosine-weighted
+    cos_i = np.sqrt(cos_i2)
+    sin_i = np.sqrt(1 - cos_i2)
+    cos_h = 1 / np.sqrt(1 + alpha**2 * u / (1 - u))
+    sin_h = np.sqrt(1 - cos_h**2)
+    wi_h = sin_i * sin_h * np.cos(2 * np.pi * azimuth) + cos_i * cos_h
+    cos_o = 2 * wi_h * cos_h - cos_i
+    front = (wi_h > 0) & (cos_o > 0)
+    cos_o = np.where(front, cos_o, 1.0)
+    g = masking(cos_i, y) * masking(cos_o, y)  # holds 1 / (4 cos_i cos_o)
+    weight = g * fresnel(f0, np.clip(wi_h, 0, 1)) * 4 * wi_h * cos_o / cos_h
+    return float(np.where(front, weight, 0.0).mean())

@@ -3,36 +3,73 @@ together lies together."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
+from llvmlite import ir
+from numba import prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from usdbrdf.kernel import loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.embree import prefetch
-
-# pixels (P, 4) float32; per triangle (F, 8) float32: pixel of its first corner, edges to the others
-# in pixels, and the same memory as int32, whose last two are the atlas's first pixel and its width
-# and height, 16 bits each.
-PackedArrays: TypeAlias = tuple[Float, Float, Int]
-
-# Places of a texture that many look-ups of a loop keep, and their distances to the next row and
-# to the left and upper pixel's middle.
-Looks: TypeAlias = tuple[Bits, Bits, Float, Float]
 
 # Places to ask for before the first is read: few enough to be in the nearest cache then.
 AHEAD = 128
 
-# Pixels that are laid out at a time.
-_AT_A_TIME = 1 << 16
+# Pixels that are laid out at a time, and bytes of a line of the cache.
+_AT_A_TIME, _LINE = 1 << 16, 64
 
-# Bytes of a line of the cache.
-_LINE = 64
+# Of a prefetch: to be read, for long, data.
+_READ, _KEEP, _DATA = 0, 3, 1
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+class SurfaceTexture(NamedTuple):
+    """All atlases in one flat array, gutters dilated.
+
+    pixels  (P + some, 4) float32
+    faces   (F, 8) float32, of each triangle the pixel of its first corner and the edges to the
+            others in pixels
+    places  (F, 8) int32, the same memory, whose last two are the atlas's first pixel and its width
+            and height, 16 bits each
+    """
+
+    pixels: Float
+    faces: Float
+    places: Int
+
+    def showing(self, texels: Texels, values: Float) -> SurfaceTexture:
+        """Other values (T, 3) of the same texels."""
+        return self._replace(pixels=_pixels(texels, values))
+
+    def at(self, face: Int, u: Float, v: Float) -> Float:
+        """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""
+        return _lookup(self, face, u, v)
+
+
+class Looks(NamedTuple):
+    """Places of a texture that many look-ups of a loop keep, the rows' widths, and the distances
+    to the left and upper pixel's middle, (AHEAD,) each."""
+
+    place: Bits
+    width: Bits
+    x: Float
+    y: Float
+
+
+def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceTexture:
+    """Per-texel values (T, 3) as a texture that can be looked up anywhere on the surface."""
+    faces, places = packed_faces(
+        texels.corner_pixel, texels.first_pixel[face_object], texels.resolution[face_object]
+    )
+    return SurfaceTexture(_pixels(texels, values), faces, places)
+
+
+def _pixels(texels: Texels, values: Float) -> Float:
+    return packed_pixels(values, texels.nearest_texel, int(texels.resolution[:, 0].max(initial=1)))
 
 
 def packed_pixels(values: Float, shown: Int, widest: int) -> Float:
@@ -73,6 +110,30 @@ def _zeros(rows: int, columns: int) -> Float:
     return bytes_[first : first + rows * columns * 4].view(np.float32).reshape(rows, columns)
 
 
+@intrinsic  # type: ignore[untyped-decorator]
+def prefetch(_: Any, array: Any, row: Any) -> Any:
+    """Fetch the line of the cache that holds the start of array[row]; never reads, never waits.
+    For use inside kernels; ``row`` is not counted from the end."""
+
+    def instruction(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        of_array = signature.args[0]
+        data = context.make_array(of_array)(context, builder, values[0])
+        first = context.get_constant(types.intp, 0)
+        index = context.cast(builder, values[1], signature.args[1], types.intp)
+        place = cgutils.get_item_pointer(
+            context, builder, of_array, data, [index] + [first] * (of_array.ndim - 1)
+        )
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        call = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        builder.call(
+            call, [builder.bitcast(place, byte), number(_READ), number(_KEEP), number(_DATA)]
+        )
+        return context.get_dummy_value()
+
+    return types.void(array, row), instruction
+
+
 @loop
 def unsigned(number: int) -> int:
     unsigned_number: int = np.uint32(number)  # type: ignore[assignment]
@@ -81,11 +142,11 @@ def unsigned(number: int) -> int:
 
 @loop
 def packed_place(
-    texture: PackedArrays, f: int, u: float, v: float
+    texture: SurfaceTexture, f: int, u: float, v: float
 ) -> tuple[int, int, float, float]:
     """Where a texture is read at barycentric (u, v) of face f: the upper left of four pixels, the
     distance to the next row of pixels, and how far the place is from its middle, in pixels."""
-    _, faces, places = texture
+    faces, places = texture.faces, texture.places
     # Unsigned: the compiler need not think of places counted from the end.
     f = unsigned(f)
     width = places[f, 7] & 0xFFFF
@@ -102,10 +163,10 @@ def packed_place(
 
 @loop
 def packed_colour(
-    texture: PackedArrays, k: int, width: int, fx: float, fy: float
+    texture: SurfaceTexture, k: int, width: int, fx: float, fy: float
 ) -> tuple[float, float, float]:
     """All three channels at a ``packed_place``, bilinear."""
-    p, right, low = texture[0], unsigned(k + 1), unsigned(k + width)
+    p, right, low = texture.pixels, unsigned(k + 1), unsigned(k + width)
     low_right = unsigned(low + 1)
     gx, gy = _ONE - fx, _ONE - fy
     a, b, c, d = gx * gy, fx * gy, gx * fy, fx * fy
@@ -120,45 +181,43 @@ def packed_colour(
 def empty_looks() -> Looks:
     """Room for AHEAD places of a texture."""
     place, width = np.empty(AHEAD, np.uint32), np.empty(AHEAD, np.uint32)
-    return place, width, np.empty(AHEAD, np.float32), np.empty(AHEAD, np.float32)
+    return Looks(place, width, np.empty(AHEAD, np.float32), np.empty(AHEAD, np.float32))
 
 
 @loop
-def fetch_face(texture: PackedArrays, f: int) -> None:
+def fetch_face(texture: SurfaceTexture, f: int) -> None:
     """Ask for the memory that ``look_at`` will read."""
-    prefetch(texture[1], unsigned(f))
+    prefetch(texture.faces, unsigned(f))
 
 
 @loop
-def look_at(texture: PackedArrays, looks: Looks, i: int, f: int, u: float, v: float) -> None:
+def look_at(texture: SurfaceTexture, looks: Looks, i: int, f: int, u: float, v: float) -> None:
     """Keep a place as the i-th of ``looks``, and ask for its pixels' memory."""
-    place, width, fx, fy = looks
-    place[i], width[i], fx[i], fy[i] = packed_place(texture, f, u, v)
-    low = unsigned(place[i] + width[i])
-    prefetch(texture[0], place[i])
-    prefetch(texture[0], unsigned(place[i] + 1))
-    prefetch(texture[0], low)
-    prefetch(texture[0], unsigned(low + 1))
+    place, width, x, y = packed_place(texture, f, u, v)
+    looks.place[i], looks.width[i], looks.x[i], looks.y[i] = place, width, x, y
+    low = unsigned(place + width)
+    prefetch(texture.pixels, place)
+    prefetch(texture.pixels, unsigned(place + 1))
+    prefetch(texture.pixels, low)
+    prefetch(texture.pixels, unsigned(low + 1))
 
 
 @loop
-def colour_looked_at(texture: PackedArrays, looks: Looks, i: int) -> tuple[float, float, float]:
+def colour_looked_at(texture: SurfaceTexture, looks: Looks, i: int) -> tuple[float, float, float]:
     """``packed_colour`` at the i-th of ``looks``."""
-    place, width, fx, fy = looks
-    return packed_colour(texture, place[i], width[i], fx[i], fy[i])
+    return packed_colour(texture, looks.place[i], looks.width[i], looks.x[i], looks.y[i])
 
 
 @loop
 def add_looked_at(
-    texture: PackedArrays, looks: Looks, i: int, weight: float, total: Double, k: int
+    texture: SurfaceTexture, looks: Looks, i: int, weight: float, total: Double, k: int
 ) -> None:
     """total[k] += weight times what is found at the i-th of ``looks``; total (P, 4), whose last
     column is nothing but what makes a row as wide as the processor's numbers."""
-    place, width, fx, fy = looks
-    p, left = texture[0], place[i]
-    right, low = unsigned(left + 1), unsigned(left + width[i])
+    p, left = texture.pixels, looks.place[i]
+    right, low = unsigned(left + 1), unsigned(left + looks.width[i])
     low_right = unsigned(low + 1)
-    x, y = weight * fx[i], fy[i]
+    x, y = weight * looks.x[i], looks.y[i]
     rest = weight - x
     gy = _ONE - y
     a, b, c, d = rest * gy, x * gy, rest * y, x * y
@@ -166,45 +225,8 @@ def add_looked_at(
         total[k, n] += a * p[left, n] + b * p[right, n] + c * p[low, n] + d * p[low_right, n]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurfaceTexture:
-    """All atlases in one flat array, gutters dilated, as ``packed_texture`` lays them out.
-
-    pixels  (P + some, 4) float32; faces (F, 8) float32, places (F, 8) int32: see ``PackedArrays``
-    """
-
-    pixels: Float
-    faces: Float
-    places: Int
-
-    @property
-    def arrays(self) -> PackedArrays:
-        """What the kernels take."""
-        return self.pixels, self.faces, self.places
-
-    def showing(self, texels: Texels, values: Float) -> SurfaceTexture:
-        """Other values (T, 3) of the same texels."""
-        return replace(self, pixels=_pixels(texels, values))
-
-    def at(self, face: Int, u: Float, v: Float) -> Float:
-        """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""
-        return _lookup(self.arrays, face, u, v)
-
-
-def surface_texture(texels: Texels, face_object: Int, values: Float) -> SurfaceTexture:
-    """Per-texel values (T, 3) as a texture that can be looked up anywhere on the surface."""
-    faces, places = packed_faces(
-        texels.corner_pixel, texels.first_pixel[face_object], texels.resolution[face_object]
-    )
-    return SurfaceTexture(pixels=_pixels(texels, values), faces=faces, places=places)
-
-
-def _pixels(texels: Texels, values: Float) -> Float:
-    return packed_pixels(values, texels.nearest_texel, int(texels.resolution[:, 0].max(initial=1)))
-
-
 @parallel_kernel
-def _lookup(texture: PackedArrays, face: Int, u: Float, v: Float) -> Float:
+def _lookup(texture: SurfaceTexture, face: Int, u: Float, v: Float) -> Float:
     out = np.zeros((len(face), 3), np.float32)
     for part in prange((len(face) + AHEAD - 1) // AHEAD):
         looks, first = empty_looks(), part * AHEAD

@@ -43,20 +43,13 @@ def hashed_uniform(seed: int, index: int, draw: int) -> float:
 
 @kernel
 def shifts_of(numbers: Long, dimensions: int, seed: int) -> Double:
-    """The random shifts of the patches with these ``numbers`` (N,), (N, dimensions)."""
+    """Uniform numbers that depend on those ``numbers`` (N,) and the seed only, (N, dimensions)."""
     shifts = np.zeros((len(numbers), dimensions))
     for i in range(len(numbers)):
         for d in range(dimensions):
             # Other draws than a point's own ones, whose numbers are counted from 0 as well.
             shifts[i, d] = hashed_uniform(seed, numbers[i], 16 + d)
     return shifts
-
-
-@kernel
-def patch_shifts(num_patches: int, dimensions: int, seed: int, first: int = 0) -> Double:
-    """Those of patches ``first`` and on, (num_patches, dimensions): a patch's shift depends on its
-    number and the seed only."""
-    return shifts_of(np.arange(first, first + num_patches), dimensions, seed)
 
 
 @kernel

@@ -14,14 +14,14 @@ from usdbrdf.asset.readers.frames import capture_camera, frames_from_stage
 from usdbrdf.asset.readers.lights import lights_from_stage
 from usdbrdf.asset.readers.surfaces import published_surfaces
 from usdbrdf.errors import UsageError
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import Light
 from usdbrdf.model.material import Surface
 
 _DEFAULT_WIDTH = 1280
 
 
-def published_camera(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode) -> View:
+def published_camera(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode) -> Camera:
     """The camera at ``prim_path``, or the capture's where that is None; as many pixels as its
     photographs have, else 1280 across."""
     if prim_path is None:
@@ -50,7 +50,7 @@ def time_code(stage: Usd.Stage, frame: float | None) -> Usd.TimeCode:
     return Usd.TimeCode(frame)
 
 
-def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> View:
+def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> Camera:
     prim = camera.GetPrim()
     if camera.GetProjectionAttr().Get(time) != UsdGeom.Tokens.perspective:
         raise UsageError(
@@ -70,7 +70,7 @@ def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> View:
     pose = np.array(camera.ComputeLocalToWorldTransform(time)).T
     pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
     pose[:3, 3] *= UsdGeom.GetStageMetersPerUnit(prim.GetStage())
-    return View(
+    return Camera(
         name=str(prim.GetName()),
         world_from_camera=pose,
         intrinsics=(

@@ -29,7 +29,7 @@ from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
-from usdbrdf.model.camera import View
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
@@ -46,7 +46,7 @@ class Views:
     frames: Frames
 
 
-def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[View, ...]:
+def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
     """The cameras of a document, named after their images, to render from.
 
     Images need not exist where the document states width and height. InputRefused where a view
@@ -117,11 +117,11 @@ def _rigid_records(
     return rigid_records(records, findings, source, pose_scale=pose_scale)
 
 
-def _camera(record: FrameRecord, metres_per_unit: float) -> View:
+def _camera(record: FrameRecord, metres_per_unit: float) -> Camera:
     pose = record.world_from_camera.copy()
     pose[:3, 3] *= metres_per_unit
     width, height = record.resolution
-    return View(
+    return Camera(
         name=record.name,
         world_from_camera=pose,
         intrinsics=record.intrinsics,

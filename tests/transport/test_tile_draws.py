@@ -1,4 +1,4 @@
-"""Random numbers of patches: every texel's uniform, neighbours' in different strata, and one in
+"""Random numbers of tiles: every texel's uniform, neighbours' in different strata, and one in
 each cell of a round; groups that share directions."""
 
 from __future__ import annotations
@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from usdbrdf.transport.patch_draws import (
+from usdbrdf.transport.tile_draws import (
     STRATA_BY_PLACE,
     TEXELS,
-    PatchDraws,
+    TileDraws,
     groups_of,
-    independent_patches,
-    patch_draws,
-    places_in_patch,
+    independent_tiles,
+    places_in_tile,
     scrambles_of_points,
     strata_of_texels,
+    tile_draws,
 )
 
 X, Y = (axis.ravel() for axis in np.meshgrid(np.arange(8), np.arange(8)))
-# Patches whose groups share random bits, and what these divide the cell of a direction into.
+# tiles whose groups share random bits, and what these divide the cell of a direction into.
 RUN, STEPS = 16, 16
 
 
@@ -29,9 +29,9 @@ def _quadrants(stratum: np.ndarray, bits: int) -> np.ndarray:
     return stratum >> 2 * (3 - bits)
 
 
-def _points(draws: PatchDraws, patches: int, samples: int) -> np.ndarray:
-    """All numbers of whole patches in [0, 1), (samples, 4, patches * 64)."""
-    identity, stratum = np.arange(patches * TEXELS), np.tile(STRATA_BY_PLACE, patches)
+def _points(draws: TileDraws, tiles: int, samples: int) -> np.ndarray:
+    """All numbers of whole tiles in [0, 1), (samples, 4, tiles * 64)."""
+    identity, stratum = np.arange(tiles * TEXELS), np.tile(STRATA_BY_PLACE, tiles)
     scrambles = scrambles_of_points(identity, stratum, draws.seed, draws.shared)
     return (draws.sobol[:samples, :, None] ^ scrambles) * 2.0**-32
 
@@ -44,8 +44,8 @@ def test_aligned_squares_of_texels_have_a_stratum_in_each_part_of_the_cell(bits:
         assert sorted(parts[square == one]) == list(range(4**bits))
 
 
-def test_a_patch_has_groups_of_eight_one_of_each_square_of_four():
-    place = places_in_patch(X, Y)
+def test_a_tile_has_groups_of_eight_one_of_each_square_of_four():
+    place = places_in_tile(X, Y)
     assert sorted(place) == list(range(TEXELS))
     np.testing.assert_array_equal(STRATA_BY_PLACE[place], strata_of_texels(X, Y))
     group = groups_of(place.astype(np.int64))
@@ -56,15 +56,15 @@ def test_a_patch_has_groups_of_eight_one_of_each_square_of_four():
 
 
 def test_every_ninth_texel_or_so_lies_in_another_row_and_column():
-    # Those at which a patch looks for what lights it.
-    place = places_in_patch(X, Y)
+    # Those at which a tile looks for what lights it.
+    place = places_in_tile(X, Y)
     found = np.flatnonzero(np.isin(place, [8 * i + 5 * i % 8 for i in range(8)]))
     assert sorted(X[found]) == sorted(Y[found]) == list(range(8))
 
 
 @pytest.mark.parametrize("samples", [8, 32])
 def test_a_round_has_one_sample_in_each_cell_for_every_point(samples: int):
-    draws = patch_draws(3, samples, samples)
+    draws = tile_draws(3, samples, samples)
     high, low = draws.shared
     assert 1 << high + low == samples
     points = _points(draws, 3, samples)
@@ -77,15 +77,15 @@ def test_a_round_has_one_sample_in_each_cell_for_every_point(samples: int):
 
 
 def test_a_group_shares_its_directions_and_no_two_groups_do():
-    draws = patch_draws(5, 32, 32)
+    draws = tile_draws(5, 32, 32)
     points = _points(draws, 2 * RUN, 32)[7].reshape(4, -1, 8)
     assert (points[:2] == points[:2, :, :1]).all()
     assert len({tuple(point) for point in points[:2, :, 0].T}) == 2 * RUN * 8
     assert len({tuple(point) for point in points[2:].reshape(2, -1).T}) == 2 * RUN * TEXELS
 
 
-def test_the_groups_of_a_run_of_patches_are_stratified_in_one_cell():
-    draws = patch_draws(5, 32, 32)
+def test_the_groups_of_a_run_of_tiles_are_stratified_in_one_cell():
+    draws = tile_draws(5, 32, 32)
     size = np.array([1 / 8, 1 / 4])[:, None]
     directions = _points(draws, 2 * RUN, 32)[7, :2].reshape(2, 2, 8 * RUN, 8)[..., 0]
     for run in range(2):
@@ -96,26 +96,26 @@ def test_the_groups_of_a_run_of_patches_are_stratified_in_one_cell():
         for x, y in ((16, 8), (8, 16), (4, 16)):
             cell = strata[0] * x // STEPS * y + strata[1] * y // STEPS
             assert (np.bincount(cell, minlength=x * y) == 8 * RUN // (x * y)).all()
-        # Of each patch one in each of 8, of each square of 2 x 2 texels one in each quarter.
+        # Of each tile one in each of 8, of each square of 2 x 2 texels one in each quarter.
         for count, x, y in ((8, 4, 2), (4, 2, 2)):
             parts = strata[0] * x // STEPS * y + strata[1] * y // STEPS
             assert (np.sort(parts.reshape(-1, count)) == np.arange(count)).all()
 
 
-def test_the_points_on_lights_of_a_patch_are_stratified_in_one_cell():
-    draws = patch_draws(5, 32, 32)
+def test_the_points_on_lights_of_a_tile_are_stratified_in_one_cell():
+    draws = tile_draws(5, 32, 32)
     size = np.array([1 / 8, 1 / 4])[:, None]
     lights = _points(draws, 4, 32)[7, 2:].reshape(2, 4, TEXELS)
-    for patch in range(4):
-        own = lights[:, patch]
+    for tile in range(4):
+        own = lights[:, tile]
         assert len({tuple(cell) for cell in np.floor(own / size).astype(int).T}) == 1
         assert len({tuple(cell) for cell in (own / size % 1 * 8).astype(int).T}) == TEXELS
 
 
 def test_every_texel_is_uniform_over_the_strata_and_within_them():
     # Chi-square over 64 strata, and over 64 parts of each of these, of one texel in 4,096 runs of
-    # patches.
-    draws = patch_draws(7, 32, 32)
+    # tiles.
+    draws = tile_draws(7, 32, 32)
     identity = np.arange(4096) * RUN * TEXELS
     for texel in (0, 21, 63):
         stratum = np.full(4096, STRATA_BY_PLACE[texel], np.int32)
@@ -130,26 +130,26 @@ def test_every_texel_is_uniform_over_the_strata_and_within_them():
 
 
 @pytest.mark.parametrize(("technique", "most"), [(0, 0.6 * 8), (2, 0.4)])
-def test_a_patch_integrates_as_stratified_samples_do_and_without_bias(technique: int, most: float):
+def test_a_tile_integrates_as_stratified_samples_do_and_without_bias(technique: int, most: float):
     # What lies within a circle about a corner: pi / 4 of 0.8. A round of 32 samples leaves each
-    # texel the error of its cells at the edge, of which the mean over a patch has far less variance
+    # texel the error of its cells at the edge, of which the mean over a tile has far less variance
     # than independent errors of its 8 groups or its 64 texels would leave.
-    draws = patch_draws(11, 32, 32)
+    draws = tile_draws(11, 32, 32)
     points = _points(draws, 512 * RUN, 32).reshape(32, 4, 512, RUN, TEXELS)[:, technique:, :, 0]
     inside = points[:, 0] ** 2 + points[:, 1] ** 2 < 0.8
     error = inside.mean(axis=0) - np.pi / 4 * 0.8
-    of_texels, of_patches = error.var(), error.mean(axis=1).var()
-    assert of_patches < most * of_texels / TEXELS
-    assert abs(error.mean()) < 4 * np.sqrt(of_patches / 512)
+    of_texels, of_tiles = error.var(), error.mean(axis=1).var()
+    assert of_tiles < most * of_texels / TEXELS
+    assert abs(error.mean()) < 4 * np.sqrt(of_tiles / 512)
     assert abs(error[:, 9].mean()) < 4 * np.sqrt(of_texels / 512)
 
 
 @pytest.mark.parametrize("groups", [1, 2, 3, 4, 6])
-def test_what_small_patches_have_of_a_run_is_stratified(groups: int):
-    # As above, over runs of patches whose last groups are missing.
-    draws, runs = patch_draws(11, 32, 32), 400
-    patch, group = np.divmod(np.arange(runs * RUN * groups), groups)
-    identity = TEXELS * patch + 8 * group
+def test_what_small_tiles_have_of_a_run_is_stratified(groups: int):
+    # As above, over runs of tiles whose last groups are missing.
+    draws, runs = tile_draws(11, 32, 32), 400
+    tile, group = np.divmod(np.arange(runs * RUN * groups), groups)
+    identity = TEXELS * tile + 8 * group
     scrambles = scrambles_of_points(identity, np.zeros(len(identity), np.int32), 11, draws.shared)
     points = (draws.sobol[:32, :2, None] ^ scrambles[:2]) * 2.0**-32
     inside = points[:, 0] ** 2 + points[:, 1] ** 2 < 0.8
@@ -157,9 +157,9 @@ def test_what_small_patches_have_of_a_run_is_stratified(groups: int):
     assert error.mean(axis=1).var() < 0.4 * error.var() / error.shape[1]
 
 
-def test_independent_patches_share_no_random_bits():
-    draws = patch_draws(3, 32, 32)
-    identity = TEXELS * independent_patches(4096).astype(np.int64)
+def test_independent_tiles_share_no_random_bits():
+    draws = tile_draws(3, 32, 32)
+    identity = TEXELS * independent_tiles(4096).astype(np.int64)
     scrambles = scrambles_of_points(identity, np.zeros(4096, np.int32), 3, draws.shared)
     # Neighbours' exclusive or in the bits of strata and below is any, in all four dimensions.
     for d in range(4):

@@ -35,7 +35,7 @@ def test_look_ups_are_bilinear():
     corners = (rng.random((5, 3, 2)) * 1.2 * size[:, None] - 0.1).astype(np.float32)
     pixels = packed_pixels(values, shown, int(size[:, 0].max()))
     faces, places = packed_faces(corners, first[:-1], size)
-    texture = pixels, faces, places
+    texture = SurfaceTexture(pixels, faces, places)
     face = np.tile(np.arange(5, dtype=np.int32), 400)
     u = rng.random(2000, np.float32)
     v = (1 - u) * rng.random(2000, np.float32)
@@ -53,7 +53,7 @@ def test_look_ups_are_bilinear():
     np.testing.assert_allclose(found, wanted, rtol=0, atol=3e-5)
     # What is asked for ahead is the same, in whatever numbers.
     face[::7] = -1
-    on_surface = SurfaceTexture(pixels=pixels, faces=faces, places=places).at(face, u, v)
+    on_surface = texture.at(face, u, v)
     np.testing.assert_allclose(on_surface, np.where(face[:, None] < 0, 0, found), rtol=0, atol=2e-7)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.transport.environment import black_environment, environment_at
+from usdbrdf.transport.environment import Environment, black_environment, environment_at
 
 
 def _numbered(height: int, width: int) -> np.ndarray:
@@ -15,7 +15,7 @@ def _numbered(height: int, width: int) -> np.ndarray:
 
 
 def _pixel(image: np.ndarray, z_up: bool, w: tuple[float, float, float]) -> tuple[int, int]:
-    return tuple(int(environment_at(image, z_up, *w, channel)) for channel in (0, 1))
+    return tuple(int(environment_at(Environment(image, z_up), *w, channel)) for channel in (0, 1))
 
 
 @pytest.mark.parametrize("z_up", [False, True])
@@ -66,9 +66,8 @@ def test_nothing_is_read_outside_of_the_picture():
     w /= np.linalg.norm(w, axis=1, keepdims=True)
     special = [(0, 1.0000001, 0), (0, -1.0000001, 0), (0, 0, -1), (0.0, 0.0, -1.0), (-0.0, 0, -1)]
     for x, y, z in [*w, *special]:
-        assert environment_at(image, False, float(x), float(y), float(z), 1) == 7
+        assert environment_at(Environment(image, False), float(x), float(y), float(z), 1) == 7
 
 
 def test_the_black_environment_is_black():
-    image, z_up = black_environment().arrays
-    assert environment_at(image, z_up, 0.0, 0.6, 0.8, 2) == 0
+    assert environment_at(black_environment(), 0.0, 0.6, 0.8, 2) == 0

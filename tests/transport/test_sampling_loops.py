@@ -8,9 +8,9 @@ import pytest
 from tests.physics.surfaces import World, box, room, world_of
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, patches_of_texels
-from usdbrdf.transport.light_groups import picked
+from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
 from usdbrdf.transport.light_sampling import turns
+from usdbrdf.transport.lights import picked
 from usdbrdf.transport.surface_texture import AHEAD
 from usdbrdf.transport.warps import cosine_direction, in_triangle, on_hemisphere, triangle_point
 
@@ -85,12 +85,12 @@ def test_how_many_points_a_thread_takes_does_not_matter(
     for name, values in vars(whole).items():
         np.testing.assert_array_equal(values, getattr(parts, name), err_msg=name)
     if estimator == "mis":
-        assert len(np.unique(whole.rays)) > 1  # some patches stopped early
+        assert len(np.unique(whole.rays)) > 1  # some tiles stopped early
 
 
 def _shaded(world: World, lit: np.ndarray, sampling: Sampling) -> Irradiance:
-    order, patch = patches_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     return irradiance_at(
         world.rays, world.texture(lit), world.lights(lit), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch, sampling, world.size,
+        world.texels.position[order], world.texels.normal[order], tile, sampling, world.size,
     )  # fmt: skip

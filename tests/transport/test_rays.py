@@ -8,7 +8,7 @@ import pytest
 from tests.physics.surfaces import World, box, quad, room, sphere, world_of
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.transport import rays as rays_module
-from usdbrdf.transport.embree import closest_hits_of_groups, occlusion
+from usdbrdf.transport.embree import closest_hits_of_groups, empty_hits, occlusion
 from usdbrdf.transport.rays import RayScene, lift_from_surface
 
 
@@ -99,9 +99,9 @@ def test_no_ray_leaves_a_closed_room_far_from_the_origin():
 
 
 def _in_groups(rays: RayScene, origins: np.ndarray, directions: np.ndarray, group: np.ndarray):
-    face, (u, v, distance) = np.empty(len(group), np.int32), np.empty((3, len(group)), np.float32)
-    closest_hits_of_groups(rays.address, origins, directions, group, face, u, v, distance)
-    return face, u, v, distance
+    hits = empty_hits(len(group))
+    closest_hits_of_groups(rays.address, origins, directions, group, hits)
+    return hits
 
 
 def _sizes_in_turn(rays: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Picking lights patch by patch: probabilities that add up, points that follow the density, and an
+"""Picking lights tile by tile: probabilities that add up, points that follow the density, and an
 irradiance that stays right whatever the picks favour."""
 
 from __future__ import annotations
@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
-from usdbrdf.transport import incoming_light
+from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, patches_of_texels
-from usdbrdf.transport.light_groups import LightGroups, weighed_groups
-from usdbrdf.transport.light_sampling import pick_triangles
-from usdbrdf.transport.lights import Lights
+from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.light_sampling import Picked, PointDraws, Receivers, pick_triangles
+from usdbrdf.transport.lights import GROUP, LightGroups, Lights, TilePicks, weighed_groups
 
 
 def _soup(count: int) -> Lights:
@@ -32,12 +31,12 @@ def _soup(count: int) -> Lights:
     )
 
 
-def _weighed(groups: LightGroups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weighed(groups: LightGroups) -> TilePicks:
     rng = np.random.default_rng(8)
     origin = (rng.random((16, 3)) * 4).astype(np.float32)
     normal = rng.normal(size=(16, 3))
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
-    return weighed_groups(groups.start, groups.bounds, origin, normal, np.array([0, 8, 16]))
+    return weighed_groups(groups, origin, normal, np.array([0, 8, 16]))
 
 
 @pytest.mark.parametrize("count", [1, 5, 3000])
@@ -46,7 +45,7 @@ def test_every_triangle_has_one_group_whose_bounds_hold_it(count: int):
     groups = lights.groups
     np.testing.assert_array_equal(np.sort(groups.face), lights.face)
     np.testing.assert_array_equal(groups.of_face[groups.face], np.arange(count))
-    of = groups.triangles[:, 13].astype(int)
+    of = groups.triangles[:, GROUP].astype(int)
     assert (np.diff(of) >= 0).all()
     assert of.max() + 1 == groups.bounds.shape[1] <= 512
     far = np.linalg.norm(lights.corners[groups.face] - groups.bounds[:3, of].T[:, None], axis=-1)
@@ -55,7 +54,7 @@ def test_every_triangle_has_one_group_whose_bounds_hold_it(count: int):
     assert (apart <= groups.bounds[7, of] * 1.0001 + 1e-6).all()
 
 
-def test_densities_of_a_patch_integrate_to_one():
+def test_densities_of_a_tile_integrate_to_one():
     lights = _soup(3000)
     groups = lights.groups
     cumulative, _, ratio = _weighed(groups)
@@ -64,27 +63,30 @@ def test_densities_of_a_patch_integrate_to_one():
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(*edges), axis=1) / 2
     for q in range(2):
-        density = lights.density * ratio[q, groups.triangles[groups.of_face, 13].astype(int)]
+        density = lights.density * ratio[q, groups.triangles[groups.of_face, GROUP].astype(int)]
         assert (density * area).sum() == pytest.approx(1, abs=1e-5)
         assert density.min() >= 0.099 * lights.density.min()  # none is left out
-    assert np.abs(ratio[0] - ratio[1]).max() > 1  # the two patches favour different lights
+    assert np.abs(ratio[0] - ratio[1]).max() > 1  # the two tiles favour different lights
 
 
 def test_picks_follow_the_density_and_leave_a_uniform_number():
     lights = _soup(300)
     groups = lights.groups
-    cumulative, guide, ratio = _weighed(groups)
-    count = 1 << 16
-    patch = np.zeros(count, np.int32)
+    tiles = _weighed(groups)
+    ratio, count = tiles.ratio, 1 << 16
     even = (np.arange(count, dtype=np.uint64) << 16).astype(np.uint32)  # each 2**-16 once
-    chosen, left = np.zeros(count, np.uint32), np.zeros(count, np.float32)
+    chosen, left = np.zeros(count, np.int32), np.zeros(count, np.float32)
     favour = np.zeros(count, np.float32)
-    picks = groups.arrays, patch, cumulative, guide, ratio
-    pick_triangles(picks, 0, 0, even, chosen, favour, left)
+    nothing, bits = np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint32)
+    receivers = Receivers(
+        nothing, nothing, PointDraws(bits, bits, 0, np.zeros(0, np.int64)), groups,
+        np.zeros(count, np.int32), tiles,
+    )  # fmt: skip
+    pick_triangles(receivers, 0, 0, even, Picked(chosen, favour, left, left))
     power = np.diff(groups.cumulative, prepend=0)
-    expected = power * ratio[0, groups.triangles[:, 13].astype(int)]
+    expected = power * ratio[0, groups.triangles[:, GROUP].astype(int)]
     np.testing.assert_allclose(np.bincount(chosen, minlength=300) / count, expected, atol=3e-5)
-    np.testing.assert_array_equal(favour, ratio[0, groups.triangles[chosen, 13].astype(int)])
+    np.testing.assert_array_equal(favour, ratio[0, groups.triangles[chosen, GROUP].astype(int)])
     assert left.min() >= 0
     assert left.max() < 1
     np.testing.assert_allclose(np.histogram(left, 8, (0, 1))[0] / count, 1 / 8, atol=5e-3)
@@ -98,10 +100,10 @@ def _two_lamps() -> World:
 
 
 def _shaded(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray:
-    order, patch = patches_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     return irradiance_at(
         world.rays, world.texture(lit), world.lights(lit), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch, sampling, world.size,
+        world.texels.position[order], world.texels.normal[order], tile, sampling, world.size,
     ).mean.mean(axis=1).astype(np.float64)  # fmt: skip
 
 
@@ -123,13 +125,13 @@ def test_unbiased_at_few_rays_and_nearer_than_by_power(monkeypatch: pytest.Monke
     z = (means.mean() - 1) / (means.std(ddof=1) / len(means) ** 0.5)
     assert abs(z) < 4
 
-    def by_power(start: np.ndarray, bounds: np.ndarray, *points: np.ndarray) -> tuple:
-        patches, count = len(points[2]) - 1, bounds.shape[1]
-        return (
-            np.tile(start[1:], (patches, 1)),
-            np.zeros((patches, count), np.int16),
-            np.ones((patches, count), np.float32),
+    def by_power(groups: LightGroups, *points: np.ndarray) -> TilePicks:
+        tiles, count = len(points[2]) - 1, groups.bounds.shape[1]
+        return TilePicks(
+            np.tile(groups.start[1:], (tiles, 1)),
+            np.zeros((tiles, count), np.int16),
+            np.ones((tiles, count), np.float32),
         )
 
-    monkeypatch.setattr(incoming_light, "weighed_groups", by_power)
+    monkeypatch.setattr(irradiance, "weighed_groups", by_power)
     assert ((ours - 1) ** 2).mean() < 0.7 * ((estimates() - 1) ** 2).mean()

@@ -9,16 +9,16 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.transport import embree
-from usdbrdf.transport.embree import EmbreeScene, closest_hits
+from usdbrdf.transport.embree import EmbreeScene, closest_hits, empty_hits
 
 _TRIANGLE = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0]], np.float32)
 _DOWN = np.array([[0.5, 0.25, 3]], np.float32), np.array([[0, 0, -1]], np.float32)
 
 
 def _face(scene: EmbreeScene) -> int:
-    face, (u, v, distance) = np.zeros(1, np.int32), np.zeros((3, 1), np.float32)
-    closest_hits(scene.address, *_DOWN, face, u, v, distance)
-    return int(face[0])
+    hits = empty_hits(1)
+    closest_hits(scene.address, *_DOWN, hits)
+    return int(hits.face[0])
 
 
 def test_a_library_that_lacks_a_function_is_named(monkeypatch: pytest.MonkeyPatch):
@@ -29,6 +29,16 @@ def test_a_library_that_lacks_a_function_is_named(monkeypatch: pytest.MonkeyPatc
             EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
     finally:
         embree._embree.cache_clear()
+
+
+def test_another_version_of_embree_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(embree, "_MAJOR_VERSION", 3)
+    embree._device.cache_clear()
+    try:
+        with pytest.raises(EnvironmentFailure, match=r"reaches Embree 4.*install the wheel"):
+            EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
+    finally:
+        embree._device.cache_clear()
 
 
 def test_what_embree_reads_is_the_scenes_own_and_padded():
