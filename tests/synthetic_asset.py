@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.asset.header import Provenance, StageHeader
+from usdbrdf.asset.header import Draft, Provenance, StageHeader
 from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.material_layer import write_material_layer
 from usdbrdf.asset.layers.root_layer import write_edits, write_pending_layer, write_root
@@ -125,10 +125,11 @@ class Built:
     shaded: tuple[ShadedObject, ...] = ()
     fitted: tuple[FittedObject, ...] = ()
 
-    def provenance(self, role):
-        return Provenance(
+    def draft(self, role):
+        provenance = Provenance(
             role=role, version="0.1.0", parameters={"quantile": 0.5}, inputs={"mesh": "0" * 64}
         )
+        return Draft(asset=self.asset, header=self.header, provenance=provenance)
 
     def write_lights(self):
         """Lights for the sides of the lamp, which shines 8, 4, 2 everywhere."""
@@ -147,23 +148,22 @@ class Built:
             for i, item in enumerate(self.shaded)
             if item.emitter
         ]
-        common = (self.asset, self.header, self.provenance("shading"))
         world = world_from_root(open_weaker(self.asset, "texturing"))
-        write_lights_layer(self.asset.lights_layer, *common, lamps, world)
+        write_lights_layer(self.asset.lights_layer, self.draft("shading"), lamps, world)
 
     def write_layer(self, role, path=None):
         """Write (again) the layer of one stage from the kept values."""
         path = path or self.asset.layer(role)
-        common = (self.asset, self.header, self.provenance(role))
+        draft = self.draft(role)
         if role == "scan":
-            write_scan_layer(path, self.scan, *common)
+            write_scan_layer(path, self.scan, draft)
         elif role == "texturing":
-            write_texturing_layer(path, self.asset.uv_layer, *common, self.textured)
+            write_texturing_layer(path, self.asset.uv_layer, draft, self.textured)
         elif role == "shading":
-            write_shading_layer(path, *common, self.shaded)
+            write_shading_layer(path, draft, self.shaded)
             self.write_lights()
         else:
-            write_material_layer(path, *common, self.fitted)
+            write_material_layer(path, draft, self.fitted)
 
 
 def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:

@@ -13,9 +13,9 @@ from usdbrdf.asset.layers.lights_layer import (
     Lamp,
     write_lights_layer,
 )
-from usdbrdf.asset.readers.render_scene import published
+from usdbrdf.asset.readers.render_scene import render_scene_from_stage
 from usdbrdf.files.images import write_exr
-from usdbrdf.shading.lamp_shapes import LampShape
+from usdbrdf.model.light import LampShape
 from usdbrdf.validation.validate import validate
 
 RADIANCE = np.array([8.0, 4.0, 2.0])
@@ -79,14 +79,14 @@ def gathered(spots, area_vectors, radiance, point):
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 1.2), (1.5, -1.0, 0.0)])
 def test_both_variants_light_the_floor_alike(lit, point):
-    glowing = published(opened(lit, EMISSIVE), TIME, pytest.fail)
+    glowing = render_scene_from_stage(opened(lit, EMISSIVE), TIME, pytest.fail)
     assert not glowing.lights
     emitters = [s for s in glowing.surfaces if s.material.emits]
     assert len(emitters) == 1
     expected = irradiance_of_triangles(emitters, np.array(point))
     assert expected.min() > 0.01
 
-    replaced = published(opened(lit, USDLUX), TIME, pytest.fail)
+    replaced = render_scene_from_stage(opened(lit, USDLUX), TIME, pytest.fail)
     assert not any(s.material.emits for s in replaced.surfaces)
     found = irradiance_of_lights(replaced.lights, np.array(point))
     assert found == pytest.approx(expected, rel=0.02)
@@ -125,7 +125,9 @@ def test_the_looks_switch_in_either_variant(built, look):
         assert chair == f"{expected}/Stuhl_No_1"
         # A map of the lamp is a map still: only the lamp's own material is switched off.
         emits = [
-            s.name for s in published(stage, TIME, lambda _: None).surfaces if s.material.emits
+            s.name
+            for s in render_scene_from_stage(stage, TIME, lambda _: None).surfaces
+            if s.material.emits
         ]
         assert ("/room/geo/lamp" in emits) == (look != "shaded" or variant == EMISSIVE)
 
@@ -134,7 +136,7 @@ def test_a_muted_layer_leaves_the_lamps_on(built):
     stage = opened(built, USDLUX)
     layers = [layer for layer in stage.GetLayerStack() if layer.GetDisplayName() == "lights.usda"]
     stage.MuteLayer(layers[0].identifier)
-    found = published(stage, TIME, pytest.fail)
+    found = render_scene_from_stage(stage, TIME, pytest.fail)
     assert not found.lights
     assert any(surface.material.emits for surface in found.surfaces)
 
@@ -149,8 +151,7 @@ def test_both_variants_validate(built):
 
 def test_a_ball_is_hidden_inside_its_light(built):
     lamp = ball_lamp(built)
-    common = (built.asset, built.header, built.provenance("shading"))
-    write_lights_layer(built.asset.lights_layer, *common, [lamp], np.eye(4))
+    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [lamp], np.eye(4))
     stage = opened(built, USDLUX)
     (light,) = (p for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI))
     assert light.GetTypeName() == "SphereLight"
@@ -184,9 +185,8 @@ def test_lights_stand_in_the_world_whatever_the_root_does(built):
     order = Sdf.AttributeSpec(prim, "xformOpOrder", types.TokenArray, Sdf.VariabilityUniform)
     order.default = ["xformOp:transform"]
     edits.Save()
-    common = (built.asset, built.header, built.provenance("shading"))
-    write_lights_layer(built.asset.lights_layer, *common, [ball_lamp(built)], root)
-    (light,) = published(opened(built, USDLUX), TIME, pytest.fail).lights
+    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [ball_lamp(built)], root)
+    (light,) = render_scene_from_stage(opened(built, USDLUX), TIME, pytest.fail).lights
     assert light.world_from_here[:3, 3] == pytest.approx([1.0, 2.0, 2.5])
     scale = abs(np.linalg.det(light.world_from_here[:3, :3])) ** (1 / 3)
     assert scale == pytest.approx(0.2)

@@ -10,7 +10,7 @@ from pxr import Sdf
 from usdbrdf.asset.layers.preview_surface import fit_from_preview_surface, preview_surface_from_fit
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import read_fit
-from usdbrdf.asset.readers.render_scene import published_file
+from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.transport.renderer_match import shown_lobe
 
 CHAIR, LAMP = 0, 2
@@ -30,7 +30,7 @@ def surfaces(built, overriding=None):
         prim = Sdf.CreatePrimInLayer(layer, f"{material}/PreviewSurface")
         Sdf.AttributeSpec(prim, f"inputs:{name}", Sdf.ValueTypeNames.Float).default = value
     layer.Save()
-    found = published_file(Path(layer.realPath), lambda text: None).surfaces
+    found = render_scene_from_file(Path(layer.realPath), lambda text: None).surfaces
     return {surface.name.split("/")[-1]: surface.material for surface in found}
 
 
@@ -116,9 +116,11 @@ def test_materialx_is_told_the_same(built):
     from usdbrdf.asset.layers.material_layer import write_material_layer
 
     built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
-    common = (built.asset, built.header, built.provenance("material"))
     write_material_layer(
-        built.asset.layer("material"), *common, built.fitted, materialx=built.asset.materialx_layer
+        built.asset.layer("material"),
+        built.draft("material"),
+        built.fitted,
+        materialx=built.asset.materialx_layer,
     )
     stage = open_measured(built.asset)
     root = f"/{built.asset.name}/mtl"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdMedia
 
-from usdbrdf.asset.layers.capture_camera import relative_path
+from usdbrdf.asset.layout import relative_path
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import capture_camera, frames_from_stage
 from usdbrdf.asset.readers.scene import scene_from_stage

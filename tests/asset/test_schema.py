@@ -2,20 +2,37 @@
 
 import importlib.util
 import json
+import math
 import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 from pxr import Plug, Sdf, Usd
 
 from usdbrdf.asset import schema
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.schema import plugin_path, register, schema_names, schema_version, verify
+from usdbrdf.asset.layers.author import author_record, over
+from usdbrdf.asset.properties import (
+    FIT,
+    RECORDS,
+    SCHEMA_VERSION,
+    Fact,
+    FittedObject,
+    facts_by_attribute,
+)
+from usdbrdf.asset.readers.compose import open_edited
+from usdbrdf.asset.readers.objects import read_record
+from usdbrdf.asset.schema import plugin_path, register, verify
 from usdbrdf.errors import UsdBrdfError
+from usdbrdf.validation.asset_stage import AssetStage
+from usdbrdf.validation.record_rules import not_allowed, out_of_range, undeclared
 
+VARIABILITY = {True: Sdf.VariabilityUniform, False: Sdf.VariabilityVarying}
 SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
 UNITS = (
     "metres|seconds|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
@@ -37,15 +54,26 @@ def run_python(code, *arguments, **environment):
     return done.stdout.strip()
 
 
-def test_generated_files_are_those_of_the_source(tmp_path):
+@pytest.fixture
+def generate():
+    """schemas/generate.py, which is no module of the package."""
+    spec = importlib.util.spec_from_file_location("generate", SCHEMAS / "generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_schema_is_that_of_the_table(generate):
+    committed = (SCHEMAS / "schema.usda").read_text()
+    assert generate.schema_text() == committed, "run python schemas/generate.py"
+
+
+def test_generated_files_are_those_of_the_source(generate, tmp_path):
     pytest.importorskip("jinja2", reason="usdGenSchema needs jinja2")
     if Usd.GetVersion() < (0, 26, 8):
         pytest.skip("usd-core brings what usdGenSchema needs from version 26.8 on")
-    spec = importlib.util.spec_from_file_location("generate", SCHEMAS / "generate.py")
-    generate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generate)
     generate.generate(tmp_path)
-    for name in ("generatedSchema.usda", "plugInfo.json"):
+    for name in ("schema.usda", "generatedSchema.usda", "plugInfo.json"):
         assert (tmp_path / name).read_text() == (SCHEMAS / name).read_text(), (
             f"{name} is stale: run schemas/generate.py"
         )
@@ -61,6 +89,17 @@ def test_plug_info_is_plain_json_without_placeholders():
 
 def test_plugin_path_holds_the_plug_info():
     assert (plugin_path() / "plugInfo.json").is_file()
+
+
+def test_usd_knows_what_the_table_declares():
+    register()
+    verify()
+    registry = Usd.SchemaRegistry()
+    for name, fact in facts_by_attribute().items():
+        definition = registry.FindAppliedAPIPrimDefinition(fact.schema.identifier)
+        spec = definition.GetSchemaAttributeSpec(name)
+        found = (str(spec.typeName), spec.variability)
+        assert found == (fact.type, VARIABILITY[fact.is_uniform]), name
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -90,12 +129,11 @@ def test_every_attribute_is_known_and_documented(name):
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one."""
     verify()
-    declared, authored = {}, {}
-    for name in schema_names():
-        definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(name)
-        for attribute in definition.GetPropertyNames():
-            spec = definition.GetSchemaAttributeSpec(attribute)
-            declared[attribute] = (str(spec.typeName), spec.variability)
+    authored = {}
+    declared = {
+        name: (fact.type, VARIABILITY[fact.is_uniform])
+        for name, fact in facts_by_attribute().items()
+    }
 
     def visit(path):
         spec = layer.GetObjectAtPath(path)
@@ -113,7 +151,7 @@ def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
     register()
     source = Sdf.Layer.FindOrOpen(str(SCHEMAS / "schema.usda"))
     version = source.customLayerData["usdBrdf"]["schemaVersion"]
-    assert schema_version() == version
+    assert version == SCHEMA_VERSION
     plugin = Plug.Registry().GetPluginWithName("usdBrdf")
     assert plugin.metadata["UsdBrdf"]["schemaVersion"] == version
     layers = [*(built.asset.folder / "layers").iterdir(), *built.asset.folder.glob("*.usda")]
@@ -124,7 +162,7 @@ def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
 
 def test_schemas_of_another_version_are_refused_before_the_first_write(monkeypatch):
     register()
-    monkeypatch.setattr(schema, "schema_version", lambda: 99)
+    monkeypatch.setattr(schema, "SCHEMA_VERSION", 99)
     with pytest.raises(UsdBrdfError, match=r"version 1.*99.*\[schema\.version\]"):
         verify()
 
@@ -178,3 +216,50 @@ def test_a_late_import_is_fine_with_the_environment_variable():
         "import usdbrdf.asset.schema as s; s.verify(); print('known')"
     )
     assert run_python(code, PXR_PLUGINPATH_NAME=str(plugin_path())) == "known"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GlossyFit(FittedObject):
+    """A copy of the table's last record with a row more."""
+
+    gloss: Annotated[
+        float, Fact(FIT, "gloss", "float", 0.25, "Gloss, without unit.", low=0, high=1)
+    ] = math.nan
+    finish: Annotated[
+        str, Fact(FIT, "finish", "token", "matt", "matt or satin.", tokens=("matt", "satin"))
+    ] = "matt"
+
+
+def test_a_row_more_is_declared_written_read_back_and_checked(built, generate):
+    records = [*RECORDS[:-1], GlossyFit]
+    declaration = "    uniform float usdBrdf:fit:gloss = 0.25 ("
+    assert declaration in generate.schema_text(records).splitlines()
+    assert declaration not in generate.schema_text().splitlines()
+
+    known, unknown, wrong = (
+        GlossyFit(**{**vars(built.fitted[0]), "gloss": gloss, "finish": finish})
+        for gloss, finish in ((0.5, "satin"), (math.nan, "matt"), (1.5, "oily"))
+    )
+    stage = open_edited(built.asset)
+    for path, record in zip(built.prims, (known, unknown, wrong), strict=True):
+        author_record(over(stage.GetEditTarget().GetLayer(), path), record)
+    chair, wall, _ = (stage.GetPrimAtPath(path) for path in built.prims)
+    others = {"prim_path": "", "identifier": ""}
+    found = read_record(GlossyFit, chair, **others)
+    assert (found.gloss, found.finish) == (0.5, "satin")
+    assert chair.GetAttribute("usdBrdf:fit:gloss").GetTypeName() == Sdf.ValueTypeNames.Float
+    assert not wall.GetAttribute("usdBrdf:fit:gloss")
+    assert math.isnan(read_record(GlossyFit, wall, **others).gloss)
+
+    facts, scene = facts_by_attribute(records), AssetStage(stage)
+    sites = [
+        str(fault.site.GetPath())
+        for faults in (
+            out_of_range(scene, lambda fact: fact.schema == FIT, facts),
+            not_allowed(scene, facts),
+            undeclared(scene, facts),
+        )
+        for fault in faults
+    ]
+    assert sites == [f"{built.prims[2]}.usdBrdf:fit:{name}" for name in ("gloss", "finish")]
+    assert len(list(undeclared(scene))) == 5

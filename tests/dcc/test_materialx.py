@@ -18,7 +18,7 @@ def picture(built, folder, *, materialx):
     """(H, W, 3): the chair under a distant light, which shows its lobe."""
     folder.mkdir()
     write_material_layer(
-        built.asset.layer("material"), built.asset, built.header, built.provenance("material"),
+        built.asset.layer("material"), built.draft("material"),
         built.fitted, materialx=built.asset.materialx_layer if materialx else None,
     )  # fmt: skip
     layer = Sdf.Layer.CreateNew(str(folder / "shot.usda"))

@@ -7,7 +7,7 @@ import zipfile
 import pytest
 from pxr import Sdf, Usd
 
-from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.asset.readers.surfaces import surfaces_from_stage
 from usdbrdf.delivery.package import PackageOptions, package
 
 TIME = Usd.TimeCode.EarliestTime()
@@ -23,7 +23,7 @@ def packed(room, tmp_path, name="room.usdz", **options):
 
 
 def surfaces_of(stage):
-    return {s.name: s for s in published_surfaces(stage, TIME, pytest.fail)}
+    return {s.name: s for s in surfaces_from_stage(stage, TIME, pytest.fail)}
 
 
 def members(output):

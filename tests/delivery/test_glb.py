@@ -12,7 +12,7 @@ import pytest
 from pxr import Sdf, Usd
 
 from tests.blender import in_blender, needs_blender
-from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.asset.readers.surfaces import surfaces_from_stage
 from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.glb import gltf_material, write_glb
 from usdbrdf.delivery.package import PackageOptions, package
@@ -106,7 +106,7 @@ def test_trimesh_reads_the_same_surfaces(room, exported):
     stage = stage_in_look(room.asset, "shaded")
     here = {
         s.name.rsplit("/", 1)[1]: s
-        for s in published_surfaces(stage, Usd.TimeCode.EarliestTime(), pytest.fail)
+        for s in surfaces_from_stage(stage, Usd.TimeCode.EarliestTime(), pytest.fail)
     }
     there = {s.name.split(":")[1]: s for s in surfaces_from_model(exported)}
     assert there.keys() == here.keys()

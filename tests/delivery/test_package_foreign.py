@@ -10,7 +10,7 @@ import OpenImageIO as oiio
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
-from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.asset.readers.surfaces import surfaces_from_stage
 from usdbrdf.cli import main
 from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.package import PackageOptions, package
@@ -92,7 +92,7 @@ def prop(room):
 
 
 def material_of(stage):
-    (lamp,) = (s for s in published_surfaces(stage, TIME, pytest.fail) if s.name == LAMP)
+    (lamp,) = (s for s in surfaces_from_stage(stage, TIME, pytest.fail) if s.name == LAMP)
     return lamp.material
 
 

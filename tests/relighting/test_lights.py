@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.relighting.scenes import cube, material, plate
-from usdbrdf.asset.readers.render_scene import published_file
+from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.files.images import write_exr
 from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight, SkyLight
 from usdbrdf.model.material import UNKNOWN_DIFFUSE, constant_map
@@ -22,7 +22,7 @@ _HEADER = '#usda 1.0\n(\n    metersPerUnit = 0.01\n    upAxis = "{up}"\n)\n'
 def _lights(tmp_path: Path, text: str, up: str = "Y") -> tuple[Light, ...]:
     file = tmp_path / "lights.usda"
     file.write_text(_HEADER.format(up=up) + text)
-    return published_file(file, pytest.fail).lights
+    return render_scene_from_file(file, pytest.fail).lights
 
 
 def test_rect_light_emission_is_radiance(tmp_path: Path) -> None:

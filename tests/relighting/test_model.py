@@ -13,7 +13,7 @@ from trimesh.visual.material import PBRMaterial
 
 from tests.relighting.conftest import BASE
 from tests.relighting.scenes import MATTE, looking, material, photograph, plate
-from usdbrdf.asset.readers.render_scene import Published, published_file
+from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_file
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_radiance, write_exr
@@ -89,21 +89,21 @@ def test_a_damaged_model_is_refused_in_a_sentence(tmp_path: Path) -> None:
             surfaces_from_model(tmp_path / name)
 
 
-def _inserted(model: Path, stage: Published, **how: Any) -> tuple[Surface, ...]:
+def _inserted(model: Path, stage: RenderScene, **how: Any) -> tuple[Surface, ...]:
     insert = Insert(model=model, **how)
     scene = relit_scene(stage, None, [insert], keep_emitters=False, eye_height=2.0)
     return scene.surfaces[len(stage.surfaces) :]
 
 
 @pytest.fixture
-def stage(tmp_path: Path) -> Published:
+def stage(tmp_path: Path) -> RenderScene:
     """The small stage, in centimetres with z up: its floor is 1 m wide."""
     file = tmp_path / "base.usda"
     file.write_text(BASE.replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
-    return published_file(file, pytest.fail)
+    return render_scene_from_file(file, pytest.fail)
 
 
-def test_axes_and_units_of_models(tmp_path: Path, stage: Published) -> None:
+def test_axes_and_units_of_models(tmp_path: Path, stage: RenderScene) -> None:
     box = _box()
     box.export(tmp_path / "box.glb")
     (glb,) = _inserted(tmp_path / "box.glb", stage)
@@ -182,7 +182,7 @@ def Scope "mtl"
 """
 
 
-def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: Published) -> None:
+def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: RenderScene) -> None:
     write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
     (tmp_path / "thing.usda").write_text(_USD)
     found = _inserted(tmp_path / "thing.usda", stage)
@@ -203,7 +203,7 @@ def test_an_input_of_another_type_is_told_and_left(tmp_path: Path) -> None:
     (tmp_path / "thing.usda").write_text(text)
     write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
     said: list[str] = []
-    found = published_file(tmp_path / "thing.usda", said.append).surfaces
+    found = render_scene_from_file(tmp_path / "thing.usda", said.append).surfaces
     glow, plain = sorted(found, key=lambda surface: not surface.material.emits)
     assert plain.material.roughness.ravel() == pytest.approx([0.5])
     assert glow.material.emission == pytest.approx(np.full((2, 3, 3), 1.5))
@@ -215,7 +215,7 @@ def test_textures_are_wrapped_as_the_stage_says(tmp_path: Path, mode: str) -> No
     wraps = f'token inputs:wrapS = "{mode}"\ntoken inputs:wrapT = "{mode}"\nasset inputs:file'
     (tmp_path / "thing.usda").write_text(_USD.replace("asset inputs:file", wraps))
     write_exr(tmp_path / "glow.exr", np.ones((2, 3, 3), np.float32))
-    found = published_file(tmp_path / "thing.usda", pytest.fail).surfaces
+    found = render_scene_from_file(tmp_path / "thing.usda", pytest.fail).surfaces
     assert sorted(surface.material.wrap for surface in found) == sorted([mode, "clamp"])
 
 

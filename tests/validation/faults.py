@@ -106,6 +106,10 @@ def roughness_above_one(built):
         layer.GetAttributeAtPath(f"{CHAIR}.usdBrdf:fit:phi").default = 1.5
 
 
+def negative_texels(built):
+    opinion(built, CHAIR, "usdBrdf:texturing:texelSize", Types.Float, -0.01)
+
+
 def measured_without_values(built):
     opinion(built, WALL, "usdBrdf:fit:status", Types.Token, "measured")
 
@@ -199,6 +203,7 @@ FAULTS = {
     "CameraLens": focal_length_doubled,
     "TextureCoordinates": texture_coordinates_in_the_next_tile,
     "FitRange": roughness_above_one,
+    "RecordRange": negative_texels,
     "FitStatus": measured_without_values,
     "AllowedTokens": status_that_is_none,
     "UndeclaredAttribute": misspelt_attribute,

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, UsdUtils
 
-from usdbrdf.asset.layers.capture_camera import relative_path
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import Asset, relative_path
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import temporary_beside
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 from pxr import Sdf, Tf, UsdGeom, Vt
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.schema import schema_version
+from usdbrdf.asset.properties import SCHEMA_VERSION
+from usdbrdf.asset.schema import verify
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Scan
 
@@ -47,7 +49,7 @@ class StageHeader:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """How a layer came about: the stage, its version, its options, the SHA-256 of its inputs.
+    """How a layer came about: the role, the code's version, its options, SHA-256 of its inputs.
 
     Nothing here may depend on the machine or the hour: equal work must give equal bytes.
     """
@@ -69,7 +71,7 @@ def new_layer(header: StageHeader, provenance: Provenance, **facts: Any) -> Sdf.
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, header.meters_per_unit)
     record = {
         "role": provenance.role,
-        "schemaVersion": schema_version(),
+        "schemaVersion": SCHEMA_VERSION,
         "version": provenance.version,
         "parameters": provenance.parameters,
         "inputs": provenance.inputs,
@@ -110,8 +112,8 @@ def open_metadata(layer: Path) -> Sdf.Layer:
 
 def _unreadable(layer: Path) -> str:
     return (
-        f"{layer}: this is not a readable USD layer. Run the stage that wrote it again. "
-        "[stage.unreadable]"
+        f"{layer}: this is not a readable USD layer. Run `usdbrdf convert` again, which makes it "
+        "anew. [stage.unreadable]"
     )
 
 
@@ -187,3 +189,24 @@ class Scopes:
     def path(self, scope: str, *names: str) -> str:
         """Path of a prim in a scope: ``path("materials", "chair")`` is /NAME/mtl/chair."""
         return "/".join((self.root, getattr(self, scope), *names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """A layer about to be written: the asset that it belongs to, and what it begins with."""
+
+    asset: Asset
+    header: StageHeader
+    provenance: Provenance
+
+    @cached_property
+    def scopes(self) -> Scopes:
+        return Scopes.of(self.asset)
+
+    def new_layer(self, **facts: Any) -> Sdf.Layer:
+        """An anonymous layer with header, provenance and the default prim as an ``over``;
+        ``facts`` join the provenance. Raises where USD does not know our schemas."""
+        verify()
+        layer = new_layer(self.header, self.provenance, **facts)
+        Sdf.CreatePrimInLayer(layer, f"/{self.header.name}")
+        return layer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import posixpath
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,27 @@ def is_storable(path: Path) -> bool:
     except (Tf.ErrorException, UnicodeEncodeError):
         return False
     return ":SDF_FORMAT_ARGS:" not in str(path)
+
+
+def relative_path(target: Path, folder: Path) -> str:
+    """Path from ``folder`` to a file, anchored and with forward slashes.
+
+    Folders are resolved first: ``..`` above a symbolic link would lead elsewhere. The file itself
+    may be a link and stays one.
+    """
+    target = Path(os.path.realpath(target.parent)) / target.name
+    relative = os.path.relpath(target, os.path.realpath(folder)).replace(os.sep, "/")
+    return relative if relative.startswith("../") else f"./{relative}"
+
+
+def storable_path(target: Path, folder: Path) -> str:
+    """The same; refuses names that USD cannot hold."""
+    if not is_storable(target):
+        raise InputRefused(
+            f"{str(target)!r}: the name holds characters that USD cannot store in a path. "
+            "Rename the file. [stage.asset_path]"
+        )
+    return relative_path(target, folder)
 
 
 def path_in_layer(asset_relative: str) -> str:

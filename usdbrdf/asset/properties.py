@@ -1,84 +1,292 @@
-"""What the stages hand over for an object, and what readers get back."""
+"""Every attribute ``usdBrdf:*``, said once: the records of an object, whose fields are the rows.
 
-from __future__ import annotations
+A field that is stored carries a ``Fact``: the schema, the attribute's name, type, fallback and
+range, and its documentation. From these rows are made the schemas (``schemas/generate.py``), what
+the layers say (``layers.author.author_record``), what is read back (``readers.objects``) and what
+is checked (``validation.record_rules``). A new fact is one row here, and whoever measures it.
+"""
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, get_type_hints
 
+from usdbrdf.asset.layout import path_in_asset, path_in_layer
 from usdbrdf.model.arrays import Float
 
+# What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
+# away, not when one is added.
+SCHEMA_VERSION = 1
+
+# In the names of a schema that is applied several times, in the place of the instance.
+INSTANCE = "__INSTANCE_NAME__"
+
 Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Schema:
+    """An applied API schema, UsdBrdf<name>API.
+
+    namespace  before the names of its attributes
+    prims      the type of prim that it may be applied to
+    key        the attribute that tells whether somebody measured what the schema is about
+    flag       the field of the record that says whether the schema applies; "": it always does
+    """
+
+    name: str
+    namespace: str
+    prims: str
+    key: str
+    doc: str
+    flag: str = ""
+
+    @property
+    def identifier(self) -> str:
+        return f"UsdBrdf{self.name}API"
+
+    @property
+    def is_multiple(self) -> bool:
+        return self.namespace.endswith(INSTANCE)
+
+    def applied(self, instance: str = "") -> str:
+        """The name as it stands among a prim's ``apiSchemas``."""
+        return f"{self.identifier}:{instance}" if self.is_multiple else self.identifier
+
+    def attribute(self, name: str, instance: str = INSTANCE) -> str:
+        return f"{self.namespace.replace(INSTANCE, instance)}:{name}"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """How a field of a record is stored.
+
+    type      as USD spells it
+    fallback  of the schema: what an application sees where nothing is authored
+    doc       documentation in the schema, with the unit of numbers; line breaks count as spaces
+    tokens    all values that are allowed; () for any
+    low, high  all values that make sense, bounds included, of each component
+    samples   of a sequence with a value per frame: at "every" frame, or where it "changes"
+    varying   may have samples, though we author none
+    when      whether a record has it to say; numbers that are not finite are never authored
+    absent    what the record holds where nothing is authored; None: NaN of a float, else fallback
+    stored, read   from the field's value to the attribute's, and back. Of several facts of a field
+              all are authored, and the first that is there is read
+    """
+
+    schema: Schema
+    name: str
+    type: str
+    fallback: Any
+    doc: str
+    tokens: tuple[str, ...] = ()
+    low: float = -math.inf
+    high: float = math.inf
+    samples: Literal["", "every", "changes"] = ""
+    varying: bool = False
+    when: Callable[[Any], bool] = lambda record: True
+    absent: Any = None
+    stored: Callable[[Any], Any] = lambda value: value
+    read: Callable[[Any], Any] = lambda value: value
+
+    @property
+    def documentation(self) -> str:
+        return " ".join(self.doc.split())
+
+    @property
+    def is_uniform(self) -> bool:
+        return not (self.samples or self.varying)
+
+    @property
+    def is_bounded(self) -> bool:
+        return math.isfinite(self.low) or math.isfinite(self.high)
+
+    @property
+    def unknown(self) -> Any:
+        """What the record holds where nothing is authored: a fallback is no measurement."""
+        if self.absent is not None:
+            return self.absent
+        return math.nan if self.type == "float" else self.fallback
+
+    def attribute(self, instance: str = INSTANCE) -> str:
+        return self.schema.attribute(self.name, instance)
+
+
+OBJECT = Schema(
+    "Object", "usdBrdf", "Mesh", "label",
+    "One object of the capture's segmentation. A mesh without it is not one of ours.",
+)  # fmt: skip
+CAPTURE = Schema(
+    "Capture", "usdBrdf:capture", "Camera", "image",
+    "The photographs that a camera took, one per integer time code. Values between time codes mean "
+    "nothing.",
+)  # fmt: skip
+AOV = Schema(
+    "Aov", f"usdBrdf:aov:{INSTANCE}", "Mesh", "file",
+    "One map over the texture space (primvars:st) of an object, for review and for the next stage.",
+)  # fmt: skip
+TEXTURING = Schema(
+    "Texturing", "usdBrdf:texturing", "Mesh", "texelSize",
+    "How well the photographs covered an object, and at which resolution its lit texture was "
+    "measured.",
+)  # fmt: skip
+SHADING = Schema(
+    "Shading", "usdBrdf:shading", "Mesh", "raysPerTexel",
+    "How the irradiance and the albedo of an object were estimated.",
+)  # fmt: skip
+FIT = Schema(
+    "MaterialFit", "usdBrdf:fit", "Mesh", "status",
+    "The fitted GGX lobe of one object. UsdPreviewSurface is derived from it as "
+    "usdBrdf:fit:mapping says.",
+)  # fmt: skip
+EMITTER = Schema(
+    "Emitter", "usdBrdf:emitter", "Mesh", "radiance",
+    "An object that emits light of its own. Its material has emissiveColor and no albedo.",
+    flag="emitter",
+)  # fmt: skip
+
+SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER)
+
+_CONFIDENCES = ("high", "low", "none")
+
+
+# A table: one paragraph per row.
+# fmt: off
+@dataclass(frozen=True, kw_only=True)
+class LabelledObject:
+    """What makes a mesh one of our objects."""
+
+    label: Annotated[str, Fact(OBJECT, "label", "string", "", """The object's name as captured,
+        unchanged; the prim's own name is a legal identifier made from it.""")]
+    class_name: Annotated[str, Fact(OBJECT, "class", "string", "", """The object's semantic class,
+        such as chair or wall; empty where the capture has none.""")]
+    identifier: Annotated[str, Fact(OBJECT, "identifier", "token", "", """Legal identifier, unique
+        in the asset: names the object's material and its textures.""")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photographs:
+    """What the capture camera says of its photographs: sequences have a value for each."""
+
+    image: Annotated[Sequence[str], Fact(CAPTURE, "image", "asset", "", """The photograph at this
+        time code, a path relative to the layer.""", samples="every")]
+    exposure_time: Annotated[Sequence[float], Fact(CAPTURE, "exposureTime", "double", 1.0,
+        """Exposure time of the photograph in seconds; 1 where it is not known. The pixel values
+        are radiance already: do not apply it again.""", samples="every")]
+    saturation_radiance: Annotated[Sequence[float], Fact(CAPTURE, "saturationRadiance", "double",
+        0.0, """Radiance, in the units of the pixel values, at which a channel is clipped; a
+        channel at or above 0.998 of it is not used.""", samples="every")]
+    noise_floor_radiance: Annotated[Sequence[float], Fact(CAPTURE, "noiseFloorRadiance", "double",
+        0.0, """Radiance, in the units of the pixel values, below which a channel is noise and is
+        not used.""", samples="every")]
+    intrinsics: Annotated[Sequence[Sequence[float]], Fact(CAPTURE, "pinhole", "double4",
+        (0, 0, 0, 0), """Focal lengths and principal point fx, fy, cx, cy in pixels; the centre of
+        the first pixel is (0.5, 0.5).""", samples="changes")]
+    resolution: Annotated[Sequence[Sequence[int]], Fact(CAPTURE, "resolution", "int2", (0, 0),
+        "Width and height of the photograph in pixels.", samples="changes")]
+    encoding: Annotated[str, Fact(CAPTURE, "encoding", "token", "lin_rec709_scene", """Colour space
+        in which the image files are stored, in OpenColorIO's names. The textures are always
+        lin_rec709_scene.""")]
+    radiometric: Annotated[bool, Fact(CAPTURE, "radiometric", "bool", True, """True where pixel
+        values are proportional to scene radiance. False for low dynamic range photographs: what
+        was measured from them is relative.""")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Aov:
     """One map of an object.
 
-    name   a USD identifier: also the look that shows it
-    file   path relative to the asset folder
-    scale  factor from stored value to displayed value
-    unit   of the stored values; "1" for pure numbers
+    name  a USD identifier: also the look that shows it
+    file  relative to the asset folder here, to the layer where it is stored
     """
 
     name: str
-    file: str
-    scale: float = 1.0
-    unit: str = "1"
+    file: Annotated[str, Fact(AOV, "file", "asset", "", """The map, an OpenEXR file of linear
+        values, a path relative to the layer.""", varying=True, stored=path_in_layer,
+        read=path_in_asset)]
+    scale: Annotated[float, Fact(AOV, "scale", "float", 1.0, """Factor from stored value to
+        displayed value in the look of this name; without unit. The file holds the physical
+        value.""", varying=True)] = 1.0
+    unit: Annotated[str, Fact(AOV, "unit", "string", "", """Unit of the stored values, such as
+        W m-2 sr-1; 1 for pure numbers.""")] = "1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TexturedObject:
-    """Result of the texturing stage for one object.
-
-    corner_uv         (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
-    texel_size        metres
-    resolution        width, height in texels
-    seen_fraction     share of the texels that a photograph measured
-    clipped_fraction  share of the texels that were clipped wherever they were seen
-    seen              False where no texel was measured: the maps are filled in
-    quantile          what the lit map stores of the observed radiances
-    """
+class MeasuredObject:
+    """What every task hands over of an object: the mesh, its identifier, maps by their names."""
 
     prim_path: str
     identifier: str
+    aovs: tuple[Aov, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TexturedObject(MeasuredObject):
+    """Result of the task texture for one object.
+
+    corner_uv  (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
+    """
+
     corner_uv: Float
-    aovs: tuple[Aov, ...]
-    texel_size: float
-    seen_fraction: float
-    clipped_fraction: float
-    resolution: tuple[int, int]
-    seen: bool
-    quantile: float = 0.5
+    texel_size: Annotated[float, Fact(TEXTURING, "texelSize", "float", 0.0, """Edge length of a
+        texel on the surface, in metres whatever the stage's units.""", low=0)]
+    resolution: Annotated[tuple[int, int], Fact(TEXTURING, "resolution", "int2", (0, 0), """Width
+        and height of the object's textures in texels.""", low=0)]
+    seen_fraction: Annotated[float, Fact(TEXTURING, "seenFraction", "float", 0.0, """Share of the
+        object's texels that at least one photograph measured; 0 to 1, without unit.""",
+        low=0, high=1)]
+    clipped_fraction: Annotated[float, Fact(TEXTURING, "clippedFraction", "float", 0.0, """Share of
+        the object's texels that were clipped in every photograph that saw them; 0 to 1, without
+        unit. Their radiance is a lower bound.""", low=0, high=1)]
+    quantile: Annotated[float, Fact(TEXTURING, "quantile", "float", 0.5, """Quantile of the observed
+        radiances that the lit texture stores; 0 to 1, without unit; 0.5 is the median.""",
+        low=0, high=1)] = 0.5
+    seen: Annotated[bool, Fact(TEXTURING, "seen", "bool", True, """False where no photograph
+        measured any texel of the object: its textures are then filled in, not measured.""")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShadedObject:
-    """Result of the shading stage for one object.
+class ShadedObject(MeasuredObject):
+    """Result of the task shade for one object: how it reflects or, of an emitter, how it shines.
 
-    aovs                     "albedo" for a reflector, "emission" for an emitter, and others
-    radiance                 mean radiance of the emitting texels; zeros for a reflector
-    radiance_status          "measured"; clipped in every photograph: "estimated" from the light
-                             that it casts, or "lowerBound" where that does not tell either
-    radiance_error           relative standard error of an estimated radiance, else NaN
-    area_fraction            share of the surface that emits
-    mean_albedo              area-weighted, linear; zeros for an emitter
-    rays_per_texel           mean number of rays
-    standard_error           of the irradiance before denoising, relative, median over the texels
-    escaped_fraction         share of the rays that left the scene
+    aovs  "albedo" of a reflector, "emission" of an emitter, and others
     """
 
-    prim_path: str
-    identifier: str
-    aovs: tuple[Aov, ...]
     emitter: bool
-    radiance: Colour
-    radiance_status: str
-    radiance_error: float
-    area_fraction: float
-    mean_albedo: Colour
-    rays_per_texel: float
-    standard_error: float
-    escaped_fraction: float
+    rays_per_texel: Annotated[float, Fact(SHADING, "raysPerTexel", "float", 0.0, """Mean number of
+        rays traced per texel.""", low=0)]
+    standard_error: Annotated[float, Fact(SHADING, "standardError", "float", 0.0, """Relative
+        standard error of the irradiance before any denoising, median over the texels; without
+        unit.""", low=0)]
+    escaped_fraction: Annotated[float, Fact(SHADING, "escapedFraction", "float", 0.0, """Share of
+        the rays that left the scene and met the environment; 0 to 1, without unit.""",
+        low=0, high=1)]
+    mean_albedo: Annotated[Colour, Fact(SHADING, "meanAlbedo", "color3f", (0, 0, 0),
+        """Area-weighted mean albedo, linear Rec.709; without unit. Black for an emitter, which has
+        no albedo.""", low=0, high=1)]
+    radiance: Annotated[Colour, Fact(EMITTER, "radiance", "color3f", (0, 0, 0), """Mean radiance of
+        the emitting texels, linear Rec.709, in W m-2 sr-1 where the capture is calibrated, else in
+        the units of the pixel values.""", low=0)]
+    radiance_status: Annotated[
+        str,
+        Fact(EMITTER, "radianceStatus", "token", "measured", """How the radiance is known: measured
+            in photographs; estimated from the light that the emitter casts, as it was clipped in
+            every photograph; lowerBound where that light does not tell.""",
+            tokens=("measured", "estimated", "lowerBound")),
+        # All that versions have authored which knew no estimates.
+        Fact(EMITTER, "lowerBound", "bool", False, """True where the emitter was clipped in every
+            photograph and the light that it casts does not tell its radiance either: the true
+            radiance is at least the stated one. radianceStatus is lowerBound then.""",
+            stored=lambda status: status == "lowerBound",
+            read=lambda bound: "lowerBound" if bound else "measured"),
+    ]
+    radiance_error: Annotated[float, Fact(EMITTER, "radianceError", "float", 0.0, """Relative
+        standard error of an estimated radiance, in the worst channel; without unit. Authored on
+        estimated emitters only.""", low=0,
+        when=lambda shaded: shaded.radiance_status == "estimated")]
+    area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
+        object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
 
     @property
     def radiance_is_lower_bound(self) -> bool:
@@ -86,37 +294,82 @@ class ShadedObject:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FittedObject:
-    """Result of the fitting stage for one object; NaN where a number is not known.
+class FittedObject(MeasuredObject):
+    """Result of the task fit for one object; NaN where a number is not known.
 
-    phi, psi      the paper's roughness and specular parameters, 0 to 1
-    phi_error, psi_error            standard deviations
-    phi_confidence, psi_confidence  "high", "low" or "none"
-    cost          loss at the minimum
-    evidence      1 - loss(phi, psi) / loss(no specular lobe)
-    status        "measured", "prior", "unseen" or "failed"
-    target_frame  index from 0 of the photograph that was fitted, or of many the one that shows the
-                  highlight best; -1 for none
-    num_pixels    how many the fit used
-    aovs          "diffuse", "refined_irradiance" and "base_color", if the fit refined them
-    mean_color    area-weighted base colour, linear
-    mapping       "measured" or "matched": what UsdPreviewSurface is told of phi and psi
+    aovs        "diffuse", "refined_irradiance" and "base_color", if the fit refined them
+    mean_color  area-weighted base colour, linear
     """
 
-    prim_path: str
-    identifier: str
-    phi: float
-    psi: float
-    cost: float
-    evidence: float
-    status: str
-    target_frame: int
-    num_pixels: int
-    method: str
-    phi_error: float = math.nan
-    psi_error: float = math.nan
-    phi_confidence: str = "none"
-    psi_confidence: str = "none"
-    aovs: tuple[Aov, ...] = ()
+    phi: Annotated[float, Fact(FIT, "phi", "float", 0.5, """Roughness parameter: alpha of the GGX
+        distribution is max(0.001, phi); 0 to 1, without unit.""", low=0, high=1)]
+    psi: Annotated[float, Fact(FIT, "psi", "float", 0.5, """Specular parameter: the reflectance at
+        normal incidence is F0 = 0.08 psi; 0 to 1, without unit.""", low=0, high=1)]
+    phi_error: Annotated[float, Fact(FIT, "phiError", "float", 0.0, """Standard deviation of phi,
+        errors of the model included; without unit.""", low=0)] = math.nan
+    psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
+        errors of the model included; without unit.""", low=0)] = math.nan
+    phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none", """high: the
+        photographs determine phi; low: they say something of it, and the values of the class the
+        rest; none: phi is the value of the class.""", tokens=_CONFIDENCES)] = "none"
+    psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none", """high: the
+        photographs determine psi; low: they say something of it, and the values of the class the
+        rest; none: psi is the value of the class.""", tokens=_CONFIDENCES)] = "none"
+    cost: Annotated[float, Fact(FIT, "cost", "float", 0.0, """Loss of the fit at its minimum: of
+        method views per degree of freedom, in units of the errors' variance; of scaled the mean
+        over the pixels used, relative to their squared radiance; of paper that in squared units of
+        radiance.""", low=0)]
+    evidence: Annotated[float, Fact(FIT, "evidence", "float", 0.0, """1 - loss(phi, psi) / loss(no
+        specular lobe): what the highlights explain; 0 is nothing, 1 is everything; without
+        unit.""", high=1)]
+    status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
+        the photographs, and their stated errors are small; prior: the values of the class, together
+        with what the photographs say; unseen: no photograph shows the object; failed: method paper
+        alone, which keeps its minimum even where the photograph does not determine it.""",
+        tokens=("measured", "prior", "unseen", "failed"))]
+    target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
+        shows the highlight best, counted from 0 (time code minus 1); -1 where there is none.""",
+        low=-1)]
+    num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, """Number of pixels that the fit
+        used.""", low=0)]
+    method: Annotated[str, Fact(FIT, "method", "token", "", """Name of the fitting method, as the
+        option --fit spells it.""")]
+    mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
+        derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
+        psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that
+        renderers show what the fitted lobe reflects.""", tokens=("measured", "matched"),
+        when=lambda fitted: fitted.is_known)] = "measured"
     mean_color: Colour = (0.0, 0.0, 0.0)
-    mapping: str = "measured"
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a lobe to show."""
+        return math.isfinite(self.phi) and math.isfinite(self.psi)
+# fmt: on
+
+
+RECORDS = (LabelledObject, Photographs, Aov, TexturedObject, ShadedObject, FittedObject)
+
+
+@cache
+def facts_of(record: type) -> tuple[tuple[str, Fact], ...]:
+    """The rows of a kind of record, each with the name of its field, in the order of authoring."""
+    hints = get_type_hints(record, include_extras=True)
+    rows = ((name, extra) for name in hints for extra in getattr(hints[name], "__metadata__", ()))
+    return tuple((name, extra) for name, extra in rows if isinstance(extra, Fact))
+
+
+def facts_by_attribute(records: Sequence[type] = RECORDS) -> dict[str, Fact]:
+    """The whole table; names of schemas that are applied several times hold ``INSTANCE``."""
+    return {fact.attribute(): fact for record in records for _, fact in facts_of(record)}
+
+
+def known_facts(record: Any) -> Iterator[tuple[Fact, Any]]:
+    """What a record has to say, each fact with the value as it is stored."""
+    kind: type = type(record)
+    for field, fact in facts_of(kind):
+        value = fact.stored(getattr(record, field))
+        applies = not fact.schema.flag or getattr(record, fact.schema.flag)
+        finite = fact.type != "float" or math.isfinite(value)
+        if applies and finite and fact.when(record):
+            yield fact, value

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 from pxr import Plug, Usd
 
+from usdbrdf.asset.properties import FIT, SCHEMA_VERSION
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.files.documents import read_json
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -17,8 +15,6 @@ _PLUGIN = "usdBrdf"
 
 # Earlier versions of USD take validators from C++ alone.
 _PYTHON_VALIDATORS = (0, 26, 8)
-
-_PROBE = ("UsdBrdfMaterialFitAPI", "usdBrdf:fit:phi")
 
 
 def plugin_path() -> Path:
@@ -35,24 +31,6 @@ def plugin_path() -> Path:
 def validators_path() -> Path:
     """Folder of the plugInfo.json that announces our validators to USD."""
     return _PACKAGE / "validation"
-
-
-@cache
-def schema_version() -> int:
-    """Version of the schemas that this package brings: what its layers state. Rises when an
-    attribute changes its meaning or goes away, not when one is added."""
-    return int(_plug_info()["UsdBrdf"]["schemaVersion"])
-
-
-@cache
-def schema_names() -> tuple[str, ...]:
-    """Names of the schemas, as they are applied."""
-    return tuple(_plug_info()["Types"])
-
-
-def _plug_info() -> dict[str, Any]:
-    (plugin,) = read_json(plugin_path() / "plugInfo.json")["Plugins"]
-    return dict(plugin["Info"])
 
 
 def register() -> None:
@@ -75,9 +53,8 @@ def verify() -> None:
     A plug-in that came too late, or whose resources were not found, still lists the types: only
     the attributes tell.
     """
-    schema, attribute = _PROBE
-    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema)
-    if not definition or attribute not in definition.GetPropertyNames():
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(FIT.identifier)
+    if not definition or FIT.attribute(FIT.key) not in definition.GetPropertyNames():
         raise UsdBrdfError(
             "OpenUSD does not know the usdBrdf schemas: it had built its schema registry before "
             "usdbrdf was imported. Import usdbrdf before any stage is opened, or set "
@@ -86,8 +63,8 @@ def verify() -> None:
     # Another installation's, by PXR_PLUGINPATH_NAME.
     metadata = Plug.Registry().GetPluginWithName(_PLUGIN).metadata
     version = metadata.get("UsdBrdf", {}).get("schemaVersion")
-    if version != schema_version():
+    if version != SCHEMA_VERSION:
         raise UsdBrdfError(
             f"OpenUSD knows version {version} of the usdBrdf schemas, this usdbrdf writes version "
-            f"{schema_version()}. Set PXR_PLUGINPATH_NAME={plugin_path()}. [schema.version]"
+            f"{SCHEMA_VERSION}. Set PXR_PLUGINPATH_NAME={plugin_path()}. [schema.version]"
         )

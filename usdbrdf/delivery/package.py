@@ -16,7 +16,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line
-from usdbrdf.asset.readers.surfaces import paths_of, published_surfaces
+from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.flat_stage import (
     fit_for_arkit,
     flattened,
@@ -116,7 +116,7 @@ def _write_glb(
     subject = asset.root_layer
     if lights := lights_of(flat):
         warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
-    surfaces = published_surfaces(flat, Usd.TimeCode.EarliestTime(), warn, subject)
+    surfaces = surfaces_from_stage(flat, Usd.TimeCode.EarliestTime(), warn, subject)
     return write_glb(output, [s.moved(turn) for s in surfaces], textures.max_size, warn)
 
 

@@ -5,9 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.model.material import (
-    Surface,
-)
+from usdbrdf.model.material import Surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class LampShape:
+    """A light of constant radiance.
+
+    kind              "rectangle" or "disk", which shine along their -z, or "sphere"
+    size              width along x and height along y; of the others the diameter, twice
+    world_from_light  (4, 4) of column vectors, a rigid motion, metres
+    radiance          (3,) linear Rec.709, W/(m^2 sr)
+    """
+
+    kind: str
+    size: tuple[float, float]
+    world_from_light: Double
+    radiance: tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,12 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.render_scene import eye_height, published, published_camera, time_code
+from usdbrdf.asset.readers.render_scene import (
+    eye_height,
+    render_scene_from_stage,
+    time_code,
+    view_from_stage,
+)
 from usdbrdf.asset.readers.views import cameras_of_views
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
@@ -81,9 +86,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     mitsuba, noise = mitsuba_variant(), chosen_filter(options.denoise)
     stage = open_edited(asset)
     time = time_code(stage, options.frame)
-    captured = published(stage, time, warn)
+    captured = render_scene_from_stage(stage, time, warn)
     if options.views is None:
-        views: tuple[Camera, ...] = (published_camera(stage, options.camera, time),)
+        views: tuple[Camera, ...] = (view_from_stage(stage, options.camera, time),)
     else:
         views = cameras_of_views(options.views, asset, captured.metres_per_unit)
     if options.width is not None:

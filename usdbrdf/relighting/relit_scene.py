@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.asset.readers.lights import sky_of_picture
-from usdbrdf.asset.readers.render_scene import Published, published_file
+from usdbrdf.asset.readers.render_scene import (
+    RenderScene,
+    render_scene_from_file,
+    sky_of_picture,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
@@ -60,7 +63,7 @@ SKY_SUFFIXES = frozenset({".exr", ".hdr"})
 
 
 def relit_scene(
-    asset: Published,
+    asset: RenderScene,
     lights: Path | None,
     inserts: Sequence[Insert],
     *,
@@ -100,7 +103,7 @@ def relit_scene(
 def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
         return (), (sky_of_picture(file, up_axis),)
-    found = published_file(file, warn)
+    found = render_scene_from_file(file, warn)
     if not found.lights and not any(surface.material.emits for surface in found.surfaces):
         raise InputRefused(
             f"{file}: no light in it, and no mesh that glows. Add UsdLux lights or an "
@@ -111,11 +114,11 @@ def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequenc
     return surfaces, [light.moved(turn) for light in found.lights]
 
 
-def _model(insert: Insert, asset: Published) -> tuple[Surface, ...]:
+def _model(insert: Insert, asset: RenderScene) -> tuple[Surface, ...]:
     """In metres, with the asset's up axis."""
     suffix = insert.model.suffix.lower()
     if suffix in USD_SUFFIXES:
-        found = published_file(insert.model, warn)
+        found = render_scene_from_file(insert.model, warn)
         if found.lights:
             warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
         surfaces, model_up, scale = found.surfaces, found.up_axis, 1.0

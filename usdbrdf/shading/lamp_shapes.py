@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from trimesh.bounds import oriented_bounds_2D
 
 from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.light import LampShape
 
 # A lamp is replaced by at most so many flat lights (a box has six sides), which together must
 # carry this share of its power.
@@ -28,22 +28,6 @@ _ROUND, _SPHERE_FILL = 0.05, 0.9
 
 # Lights lie this share of their size off the lamp's surface, which would shade them otherwise.
 _GAP = 1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
-class LampShape:
-    """A light of constant radiance.
-
-    kind              "rectangle" or "disk", which shine along their -z, or "sphere"
-    size              width along x and height along y; of the others the diameter, twice
-    world_from_light  (4, 4) of column vectors, a rigid motion, metres
-    radiance          (3,) linear Rec.709, W/(m^2 sr)
-    """
-
-    kind: str
-    size: tuple[float, float]
-    world_from_light: Double
-    radiance: tuple[float, float, float]
 
 
 def lamp_shapes(points: Float, triangles: Int, radiance: Float) -> tuple[LampShape, ...]:

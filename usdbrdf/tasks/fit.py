@@ -74,9 +74,7 @@ def fit(asset: Asset, options: FitOptions) -> StageResult:
         materialx = f"layers/{asset.materialx_layer.name}"
         write_material_layer(
             run.output(f"layers/{asset.layer('material').name}"),
-            asset,
-            step.header,
-            step.provenance,
+            step.draft,
             objects,
             materialx=run.output(materialx) if options.materialx else None,
         )

@@ -6,11 +6,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from usdbrdf.asset.header import StageHeader
-from usdbrdf.asset.layers.capture_camera import relative_path
+from usdbrdf.asset.header import Draft, StageHeader
 from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pending_layer, write_root
 from usdbrdf.asset.layers.scan_layer import write_scan_layer
-from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import USD_SUFFIXES
@@ -61,9 +60,8 @@ def ingest(
             say(f"warning: {warning}")
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
-        write_scan_layer(
-            run.output(f"layers/{asset.layer('scan').name}"), scan, asset, header, step.provenance
-        )
+        draft = Draft(asset=asset, header=header, provenance=step.provenance)
+        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         for role in ROLES[1:]:

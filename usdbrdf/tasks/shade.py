@@ -20,8 +20,9 @@ from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import StageResult, StageRun
 from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.light import LampShape
 from usdbrdf.shading.emitters import Emitters, find_emitters
-from usdbrdf.shading.lamp_shapes import LampShape, lamp_shapes
+from usdbrdf.shading.lamp_shapes import lamp_shapes
 from usdbrdf.tasks.albedo_map import albedo_map
 from usdbrdf.tasks.atlas import Atlas, MapWriter, TexelMap, atlas_from_stage
 from usdbrdf.tasks.clipped import ClippedLight, estimate_clipped_light
@@ -165,17 +166,11 @@ def _write(run: StageRun, step: Step, atlas: Atlas, shaded: _Shaded) -> dict[str
         aovs = writer.write(i, obj, {**maps, "emission": emission} if emits else maps)
         objects.append(_record(atlas, shaded, i, aovs))
     write_shading_layer(
-        run.output(f"layers/{step.asset.layer('shading').name}"),
-        step.asset,
-        step.header,
-        step.provenance,
-        objects,
+        run.output(f"layers/{step.asset.layer('shading').name}"), step.draft, objects
     )
     write_lights_layer(
         run.output(f"layers/{step.asset.lights_layer.name}"),
-        step.asset,
-        step.header,
-        step.provenance,
+        step.draft,
         [
             Lamp(
                 prim_path=item.prim_path,

@@ -11,7 +11,7 @@ from typing import Any
 
 from pxr import Ar
 
-from usdbrdf.asset.header import Provenance, StageHeader, read_header
+from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.errors import InputRefused
@@ -53,6 +53,11 @@ class Step:
     @property
     def header(self) -> StageHeader:
         return read_header(self.asset.layer("scan"))
+
+    @property
+    def draft(self) -> Draft:
+        """What the step's layers begin with."""
+        return Draft(asset=self.asset, header=self.header, provenance=self.provenance)
 
 
 def weaker_layers(asset: Asset, role: str) -> dict[str, str]:

@@ -216,9 +216,7 @@ def _write(
     write_texturing_layer(
         run.output(f"layers/{step.asset.layer('texturing').name}"),
         run.output(f"layers/{step.asset.uv_layer.name}"),
-        step.asset,
-        step.header,
-        step.provenance,
+        step.draft,
         objects,
     )
     return {

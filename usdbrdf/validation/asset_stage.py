@@ -14,6 +14,7 @@ from pxr import Ar, Sdf, Usd, UsdShade
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import named_files
+from usdbrdf.asset.readers.objects import authored
 
 
 @dataclass(frozen=True)
@@ -148,12 +149,6 @@ def record_of(layer: Sdf.Layer) -> dict[str, Any]:
     """``customLayerData.usdbrdf`` of a layer; empty where it has none."""
     record = layer.customLayerData.get("usdbrdf", {})
     return record if isinstance(record, dict) else {}
-
-
-def authored(prim: Usd.Prim, name: str) -> Any:
-    """The authored value of an attribute: a schema's fallback is no measurement. Else None."""
-    attribute = prim.GetAttribute(name)
-    return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
 
 
 def located(layer: Sdf.Layer, asset_path: str) -> Path:

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from usdbrdf.asset.layers.capture_camera import lens_from_pinhole
-from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.asset.layers.scan_layer import lens_from_pinhole
+from usdbrdf.asset.readers.objects import authored
+from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 _TOLERANCE = 1e-3

@@ -9,7 +9,7 @@ from typing import Any
 from pxr import Sdf
 
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.asset.schema import schema_version as known_version
+from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Severity, rule
@@ -93,10 +93,10 @@ def schema_version(scene: AssetStage) -> Iterator[Fault]:
     for layer in scene.layers:
         # The layers of the first version do not state it.
         version = record_of(layer).get("schemaVersion", 1)
-        if not isinstance(version, int) or not 1 <= version <= known_version():
+        if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
             yield Fault(
                 layer,
-                f"its schema version is {version!r}; this usdbrdf knows 1 to {known_version()}.",
+                f"its schema version is {version!r}; this usdbrdf knows 1 to {SCHEMA_VERSION}.",
             )
 
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
 from usdbrdf.asset.layers.lights_layer import EMISSIVE, USDLUX, VARIANT_SET
-from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.asset.readers.objects import authored
+from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.layers.input_bindings import BINDING
+from usdbrdf.asset.layers.input_usd import BINDING
 from usdbrdf.asset.layers.looks import LIT, SHADED, VARIANT_SET
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule

@@ -9,7 +9,8 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.layers.preview_surface import PreviewLobe, preview_surface_from_fit
-from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.asset.readers.objects import authored
+from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 Types = Sdf.ValueTypeNames

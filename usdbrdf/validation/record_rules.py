@@ -1,42 +1,61 @@
-"""Rules about what the layers state of a measurement: attributes of the usdBrdf schemas."""
+"""Rules about what the layers state of a measurement, made from the rows of ``asset.properties``:
+ranges, words, and that every attribute is one of ours; and what several of them say together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import NamedTuple
 
 from pxr import Sdf, Usd
 
-from usdbrdf.asset.schema import schema_names
-from usdbrdf.validation.asset_stage import AssetStage, authored
+from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, Fact, facts_by_attribute
+from usdbrdf.asset.readers.objects import authored
+from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
 
-_INSTANCE = "__INSTANCE_NAME__"
+# The table, by the attributes' names.
+FACTS = facts_by_attribute()
 
 
-class _Declared(NamedTuple):
-    """The schema that declares an attribute, its instance ("" for none), and its tokens."""
+class Said(NamedTuple):
+    """An authored attribute of ours; ``fact`` is None for one that the table does not have, and
+    ``instance`` "" unless its schema is applied several times."""
 
-    schema: str
+    attribute: Usd.Attribute
+    fact: Fact | None
     instance: str
-    tokens: tuple[str, ...]
 
 
-def _fit_range(scene: AssetStage) -> Iterator[Fault]:
-    for prim in scene.recorded:
-        for name in ("phi", "psi", "phiError", "psiError", "cost", "evidence"):
-            value = authored(prim, f"usdBrdf:fit:{name}")
-            if value is None:
-                continue
-            upper = 1.0 if name in ("phi", "psi", "evidence") else math.inf
-            lower = -math.inf if name == "evidence" else 0.0
-            if not (math.isfinite(value) and lower <= value <= upper):
-                yield Fault(
-                    site=prim.GetAttribute(f"usdBrdf:fit:{name}"),
-                    message=f"the value is {value:g}, outside {lower:g} to {upper:g}.",
-                )
+def out_of_range(
+    scene: AssetStage, about: Callable[[Fact], bool], facts: Mapping[str, Fact] = FACTS
+) -> Iterator[Fault]:
+    """Numbers that make no sense, among the facts that ``about`` chooses."""
+    for attribute, fact, _ in _said(scene, facts):
+        value = attribute.Get()
+        if fact is None or not fact.is_bounded or not about(fact) or value is None:
+            continue
+        numbers = [value] if isinstance(value, (int, float)) else list(value)
+        if not all(math.isfinite(x) and fact.low <= x <= fact.high for x in numbers):
+            shown, limits = ", ".join(f"{x:g}" for x in numbers), f"{fact.low:g} to {fact.high:g}"
+            yield Fault(site=attribute, message=f"the value is {shown}, outside {limits}.")
+
+
+def _said(scene: AssetStage, facts: Mapping[str, Fact]) -> Iterator[Said]:
+    return (said for prim in scene.recorded for said in _said_of(prim, facts))
+
+
+def _said_of(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[Said]:
+    """What a prim says in our namespace."""
+    for attribute in prim.GetAuthoredPropertiesInNamespace("usdBrdf"):
+        if isinstance(attribute, Usd.Attribute) and attribute.HasAuthoredValue():
+            name = attribute.GetName()
+            # usdBrdf:aov:INSTANCE:file
+            parts = name.split(":")
+            general = ":".join([*parts[:2], INSTANCE, *parts[3:]])
+            instance = parts[2] if name not in facts and general in facts else ""
+            yield Said(attribute, facts.get(general if instance else name), instance)
 
 
 def _fit_status(scene: AssetStage) -> Iterator[Fault]:
@@ -57,47 +76,44 @@ def _fit_status(scene: AssetStage) -> Iterator[Fault]:
             )
 
 
-def _tokens(scene: AssetStage) -> Iterator[Fault]:
-    for _, attribute, declared in _declared_attributes(scene):
+def not_allowed(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
+    """Words that are none of a fixed vocabulary."""
+    for attribute, fact, _ in _said(scene, facts):
         value = attribute.Get()
-        if declared and declared.tokens and value not in declared.tokens:
-            yield Fault(
-                site=attribute,
-                message=f"{value!r} is none of {', '.join(declared.tokens)}.",
-            )
+        if fact and fact.tokens and value not in fact.tokens:
+            message = f"{value!r} is none of {', '.join(fact.tokens)}."
+            yield Fault(site=attribute, message=message)
 
 
-def _undeclared(scene: AssetStage) -> Iterator[Fault]:
-    for _, attribute, declared in _declared_attributes(scene):
-        if declared is None:
-            yield Fault(
-                site=attribute,
-                message="no usdBrdf schema declares an attribute of this name: nothing reads it.",
-            )
+def undeclared(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
+    """Attributes in our namespace that are not ours."""
+    for attribute, fact, _ in _said(scene, facts):
+        if fact is None:
+            message = "no usdBrdf schema declares an attribute of this name: nothing reads it."
+            yield Fault(site=attribute, message=message)
 
 
 def _not_applied(scene: AssetStage) -> Iterator[Fault]:
     for prim in scene.recorded:
-        applied = {name for layer_names in _api_schemas(prim) for name in layer_names}
-        attributes = _attributes(prim)
-        wanted = {full_name(d) for d in map(_declaration, attributes) if d}
-        for name in sorted(wanted - applied):
+        for name in _missing_schemas(prim):
             yield Fault(
                 site=prim,
                 message=f"it has attributes of {name}, but that schema is not applied to it.",
             )
 
 
-def full_name(declared: _Declared) -> str:
-    """The schema's name as it is applied."""
-    return f"{declared.schema}:{declared.instance}" if declared.instance else declared.schema
-
-
 def _apply_schemas(site: Site) -> bool:
-    wanted = {full_name(d) for d in map(_declaration, _attributes(site)) if d}
-    applied = {name for names in _api_schemas(site) for name in names}
-    done = [site.AddAppliedSchema(name) for name in sorted(wanted - applied)]
+    done = [site.AddAppliedSchema(name) for name in _missing_schemas(site)]
     return all(done)
+
+
+def _missing_schemas(prim: Usd.Prim) -> list[str]:
+    """Schemas, as they would be applied, of the prim's attributes that are not."""
+    # As authored: GetAppliedSchemas leaves out those that USD does not know.
+    listed = prim.GetMetadata("apiSchemas")
+    applied = listed.GetAddedOrExplicitItems() if listed else []
+    wanted = {fact.schema.applied(instance) for _, fact, instance in _said_of(prim, FACTS) if fact}
+    return sorted(wanted.difference(applied))
 
 
 def _identifiers(scene: AssetStage) -> Iterator[Fault]:
@@ -117,59 +133,8 @@ def _identifiers(scene: AssetStage) -> Iterator[Fault]:
         first.setdefault(identifier, item)
 
 
-def _albedo(scene: AssetStage) -> Iterator[Fault]:
-    for prim in scene.recorded:
-        albedo = authored(prim, "usdBrdf:shading:meanAlbedo")
-        if albedo is not None and not all(0 <= value <= 1 for value in albedo):
-            yield Fault(
-                site=prim.GetAttribute("usdBrdf:shading:meanAlbedo"),
-                message=f"the mean albedo is {tuple(round(float(v), 3) for v in albedo)}: a "
-                "surface reflects between none and all of the light.",
-            )
-
-
-def _declared_attributes(
-    scene: AssetStage,
-) -> Iterator[tuple[Usd.Prim, Usd.Attribute, _Declared | None]]:
-    """All attributes of ours with their declaration; none where USD does not know the schemas."""
-    if _declarations():
-        for prim in scene.recorded:
-            for attribute in _attributes(prim):
-                yield prim, attribute, _declaration(attribute)
-
-
-def _attributes(prim: Usd.Prim) -> list[Usd.Attribute]:
-    found = prim.GetAuthoredPropertiesInNamespace("usdBrdf")
-    return [a for a in found if isinstance(a, Usd.Attribute) and a.HasAuthoredValue()]
-
-
-def _api_schemas(prim: Usd.Prim) -> list[list[str]]:
-    """Applied schemas as authored: GetAppliedSchemas leaves out those that USD does not know."""
-    listed = prim.GetMetadata("apiSchemas")
-    return [listed.GetAddedOrExplicitItems()] if listed else []
-
-
-def _declaration(attribute: Usd.Attribute) -> _Declared | None:
-    name = attribute.GetName()
-    declared = _declarations().get(name)
-    parts = name.split(":")
-    if declared or len(parts) < 4:
-        return declared
-    # usdBrdf:aov:INSTANCE:file
-    general = _declarations().get(":".join([*parts[:2], _INSTANCE, *parts[3:]]))
-    return general._replace(instance=parts[2]) if general else None
-
-
-@cache
-def _declarations() -> dict[str, _Declared]:
-    registry = Usd.SchemaRegistry()
-    found = {}
-    for schema in schema_names():
-        definition = registry.FindAppliedAPIPrimDefinition(schema)
-        for name in definition.GetPropertyNames() if definition else ():
-            tokens = definition.GetPropertyMetadata(name, "allowedTokens") or ()
-            found[name] = _Declared(schema, "", tuple(tokens))
-    return found
+def _is_albedo(fact: Fact) -> bool:
+    return fact.schema == SHADING and fact.name == "meanAlbedo"
 
 
 RULES = (
@@ -179,7 +144,16 @@ RULES = (
         description="phi and psi lie between 0 and 1, and their errors are finite and not "
         "negative. Other values have no meaning in the model of the lobe.",
         advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf fit.",
-        check=_fit_range,
+        check=partial(out_of_range, about=lambda fact: fact.schema == FIT),
+    ),
+    Rule(
+        name="RecordRange",
+        severity=Severity.WARNING,
+        description="What else the layers record of a measurement lies in the range that makes "
+        "sense: shares between 0 and 1, sizes, errors and radiances finite and not negative.",
+        advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf convert "
+        "again.",
+        check=partial(out_of_range, about=lambda fact: fact.schema != FIT and not _is_albedo(fact)),
     ),
     Rule(
         name="FitStatus",
@@ -196,7 +170,7 @@ RULES = (
         description="Attributes with a fixed vocabulary, such as usdBrdf:fit:status, hold one of "
         "its words. USD itself does not check that.",
         advice="Use one of the words that the message lists.",
-        check=_tokens,
+        check=not_allowed,
     ),
     Rule(
         name="UndeclaredAttribute",
@@ -204,7 +178,7 @@ RULES = (
         description="Attributes whose names begin with usdBrdf: are declared by the schemas. One "
         "that is not is misspelt, or comes from another version of usdbrdf.",
         advice="Correct the name, or put values of your own into another namespace.",
-        check=_undeclared,
+        check=undeclared,
     ),
     Rule(
         name="SchemaNotApplied",
@@ -233,6 +207,6 @@ RULES = (
         "missed: a lamp that no photograph shows, or photographs that are not radiometric.",
         advice="Look at the irradiance map of the object and at the lamps; see the options of "
         "usdbrdf shade.",
-        check=_albedo,
+        check=partial(out_of_range, about=_is_albedo),
     ),
 )

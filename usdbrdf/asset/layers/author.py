@@ -7,15 +7,32 @@ anywhere but these calls, and equal calls give equal bytes."""
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Gf, Sdf, Tf, Usd, UsdUtils
 
+from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.files.atomic import temporary_beside
+
+Types = Sdf.ValueTypeNames
+
+# From plain values, which may be numpy's, to those that USD takes for attributes of a type.
+_USD_VALUE: dict[str, Callable[[Any], Any]] = {
+    "asset": Sdf.AssetPath,
+    "bool": bool,
+    "color3f": lambda rgb: Gf.Vec3f(*map(float, rgb)),
+    "double": float,
+    "double4": lambda values: Gf.Vec4d(*map(float, values)),
+    "float": float,
+    "int": int,
+    "int2": lambda values: Gf.Vec2i(*map(int, values)),
+    "string": str,
+    "token": str,
+}
 
 
 def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
@@ -36,8 +53,9 @@ def apply_schema(prim: Sdf.PrimSpec, *names: str) -> None:
     """Append applied API schemas to the prim's own list, each once."""
     present = prim.GetInfo("apiSchemas").prependedItems if prim.HasInfo("apiSchemas") else []
     added = [name for name in names if name not in present]
-    items = Sdf.TokenListOp.Create(prependedItems=[*present, *added])
-    prim.SetInfo("apiSchemas", items)
+    if added:
+        items = Sdf.TokenListOp.Create(prependedItems=[*present, *added])
+        prim.SetInfo("apiSchemas", items)
 
 
 def attribute(
@@ -64,6 +82,43 @@ def attribute(
     return spec
 
 
+def attribute_per_frame(
+    prim: Sdf.PrimSpec,
+    name: str,
+    type_name: Sdf.ValueTypeName,
+    values: Sequence[Any],
+    *,
+    always: bool = False,
+) -> None:
+    """An attribute that has ``values[i]`` at time code i + 1, and the first by default.
+
+    Without ``always`` a constant gets no samples: it is easier to override then.
+    """
+    varies = always or any(value != values[0] for value in values)
+    samples = {float(i + 1): value for i, value in enumerate(values)} if varies else {}
+    attribute(prim, name, type_name, values[0], samples=samples)
+
+
+def author_fact(prim: Sdf.PrimSpec, fact: Fact, value: Any, instance: str = "") -> None:
+    """One attribute of ours with its schema; of a fact with samples a value per frame."""
+    apply_schema(prim, fact.schema.applied(instance))
+    name, type_name = fact.attribute(instance), Types.Find(fact.type)
+    convert = _USD_VALUE[fact.type]
+    if fact.samples:
+        values, always = [convert(each) for each in value], fact.samples == "every"
+        attribute_per_frame(prim, name, type_name, values, always=always)
+    else:
+        attribute(prim, name, type_name, convert(value), uniform=fact.is_uniform)
+
+
+def author_record(prim: Sdf.PrimSpec, record: Any, instance: str = "") -> None:
+    """What a record has to say (see ``properties``), and its maps: an ``instance`` for each."""
+    for fact, value in known_facts(record):
+        author_fact(prim, fact, value, instance)
+    for aov in getattr(record, "aovs", ()):
+        author_record(prim, aov, aov.name)
+
+
 def relationship(prim: Sdf.PrimSpec, name: str, *targets: str) -> Sdf.RelationshipSpec:
     """A relationship to these targets; without any it has no opinion about them."""
     spec = prim.relationships.get(name) or Sdf.RelationshipSpec(prim, name, custom=False)
@@ -81,6 +136,12 @@ def connect(
     return spec
 
 
+def author_inputs(prim: Sdf.PrimSpec, type_name: Sdf.ValueTypeName, **values: Any) -> None:
+    """Inputs of a shader or a light that share a type, by their names."""
+    for name, value in values.items():
+        attribute(prim, f"inputs:{name}", type_name, value)
+
+
 def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
     """Write ``layer`` to ``path``, in the format of its suffix, checked before it gets the name.
 
@@ -89,25 +150,24 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
     When the disk is full USD leaves a truncated file in place of the old one: hence a name beside.
     """
     with temporary_beside(path) as written:
+        failure = EnvironmentFailure(
+            f"{path}: the USD layer could not be written completely. Free disk space or correct "
+            "the permission, then run the same command again. [environment.io]"
+        )
         try:
             done = layer.Export(str(written))
+            stored = Sdf.Layer.OpenAsAnonymous(str(written)) if done else None
         except Tf.ErrorException as error:
-            raise EnvironmentFailure(_not_written(path)) from error
-        if not done:
-            raise EnvironmentFailure(_not_written(path))
-        _check(written, layer, path, folder)
+            raise failure from error
+        if not stored or stored.defaultPrim != layer.defaultPrim:
+            raise failure
+        _check_composition(stored, path, folder)
         os.replace(written, path)
 
 
-def _check(written: Path, layer: Sdf.Layer, path: Path, folder: Path) -> None:
-    try:
-        stored = Sdf.Layer.OpenAsAnonymous(str(written))
-    except Tf.ErrorException as error:
-        raise EnvironmentFailure(_not_written(path)) from error
-    if not stored or stored.defaultPrim != layer.defaultPrim:
-        raise EnvironmentFailure(_not_written(path))
+def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
     UsdUtils.ModifyAssetPaths(stored, lambda asset: _absolute(asset, folder))
-    # Sublayers that are not there yet are published later, or by another stage.
+    # Sublayers that are not there yet are published later, or by another task.
     stored.subLayerPaths = [sub for sub in stored.subLayerPaths if Path(sub).is_file()]
     stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
     problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
@@ -120,10 +180,3 @@ def _check(written: Path, layer: Sdf.Layer, path: Path, folder: Path) -> None:
 
 def _absolute(asset: str, folder: Path) -> str:
     return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
-
-
-def _not_written(path: Path) -> str:
-    return (
-        f"{path}: the USD layer could not be written completely. Free disk space or correct the "
-        "permission, then run the same command again. [environment.io]"
-    )

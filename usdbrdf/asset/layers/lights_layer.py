@@ -25,11 +25,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
-from usdbrdf.asset.layers.author import attribute, define, export, over
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.header import Draft
+from usdbrdf.asset.layers.author import attribute, author_inputs, define, export, over
 from usdbrdf.model.arrays import Double
-from usdbrdf.shading.lamp_shapes import LampShape
+from usdbrdf.model.light import LampShape
 
 Types = Sdf.ValueTypeNames
 
@@ -53,20 +52,13 @@ class Lamp:
 
 
 def write_lights_layer(
-    path: Path,
-    asset: Asset,
-    header: StageHeader,
-    provenance: Provenance,
-    lamps: Sequence[Lamp],
-    world_from_root: Double,
+    path: Path, draft: Draft, lamps: Sequence[Lamp], world_from_root: Double
 ) -> None:
     """Write lights.usda to ``path``; without a lamp that has shapes it holds nothing.
 
     world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
     """
-    scopes = Scopes.of(asset)
-    layer = new_layer(header, provenance)
-    root = over(layer, scopes.root)
+    scopes, layer = draft.scopes, draft.new_layer()
     shaped = [lamp for lamp in lamps if lamp.shapes]
     if shaped:
         emissive, usdlux = (
@@ -74,10 +66,10 @@ def write_lights_layer(
             for name in (EMISSIVE, USDLUX)
         )
         over(layer, str(emissive))
-        root.variantSelections[VARIANT_SET] = EMISSIVE
+        layer.GetPrimAtPath(scopes.root).variantSelections[VARIANT_SET] = EMISSIVE
         define(layer, _within(usdlux, scopes.path("lights")), "Scope")
         for lamp in shaped:
-            _author_lamp(layer, usdlux, scopes, lamp, world_from_root, header.meters_per_unit)
+            _author_lamp(layer, usdlux, draft, lamp, world_from_root)
     export(layer, path, folder=path.parent)
 
 
@@ -88,22 +80,18 @@ def world_from_root(stage: Usd.Stage) -> Double:
 
 
 def _author_lamp(
-    layer: Sdf.Layer,
-    variant: Sdf.Path,
-    scopes: Scopes,
-    lamp: Lamp,
-    world_from_root: Double,
-    meters_per_unit: float,
+    layer: Sdf.Layer, variant: Sdf.Path, draft: Draft, lamp: Lamp, world_from_root: Double
 ) -> None:
     """The lights, and what keeps the lamp itself from shining beside them."""
+    scopes = draft.scopes
     lights = _within(variant, scopes.path("lights", lamp.identifier))
     define(layer, lights, "Scope")
     for number, shape in enumerate(lamp.shapes, start=1):
         prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
-        _author_light(prim, shape, world_from_root, meters_per_unit)
+        _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
     texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
     prim = over(layer, _within(variant, texture))
-    attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(0, 0, 0, 1))
+    author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
     if lamp.shapes[0].kind == "sphere":
         hidden = over(layer, _within(variant, lamp.prim_path))
         attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
@@ -114,25 +102,19 @@ def _within(variant: Sdf.Path, path: str) -> str:
 
 
 def _author_light(
-    prim: Sdf.PrimSpec,
-    shape: LampShape,
-    world_from_root: Double,
-    meters_per_unit: float,
+    prim: Sdf.PrimSpec, shape: LampShape, world_from_root: Double, meters_per_unit: float
 ) -> None:
     """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
     brightest = max(shape.radiance)
-    exposure = math.log2(brightest)
     colour = Gf.Vec3f(*(value / brightest for value in shape.radiance))
-    attribute(prim, "inputs:intensity", Types.Float, 1.0)
-    attribute(prim, "inputs:exposure", Types.Float, exposure)
-    attribute(prim, "inputs:color", Types.Color3f, colour)
-    attribute(prim, "inputs:normalize", Types.Bool, False)
+    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    author_inputs(prim, Types.Color3f, color=colour)
+    author_inputs(prim, Types.Bool, normalize=False)
     width, height = (side / meters_per_unit for side in shape.size)
     if shape.kind == "rectangle":
-        attribute(prim, "inputs:width", Types.Float, width)
-        attribute(prim, "inputs:height", Types.Float, height)
+        author_inputs(prim, Types.Float, width=width, height=height)
     else:
-        attribute(prim, "inputs:radius", Types.Float, width / 2)
+        author_inputs(prim, Types.Float, radius=width / 2)
     half = Gf.Vec3f(width / 2, height / 2, width / 2 if shape.kind == "sphere" else 0)
     attribute(prim, "extent", Types.Float3Array, [-half, half])
     # Rigid in the world, in units of the stage: what the root does to sizes is undone here.

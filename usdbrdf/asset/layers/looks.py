@@ -6,15 +6,17 @@ and local opinions beat variants: every look would show the same material.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
 
 from pxr import Sdf
 
-from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.header import Draft, Scopes
 from usdbrdf.asset.layers.author import apply_schema, define, over, relationship
-from usdbrdf.asset.layers.input_bindings import BINDING, Competing
+from usdbrdf.asset.layers.input_usd import BINDING, recorded_bindings
 from usdbrdf.asset.layers.preview_surface import Colour, unlit_colour, unlit_texture
-from usdbrdf.asset.properties import Aov
+from usdbrdf.asset.properties import Aov, MeasuredObject
 
 VARIANT_SET = "look"
 
@@ -31,21 +33,17 @@ Bindings = Mapping[str, str]
 # What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
 Shown = Aov | Colour | None
 
+Measured = TypeVar("Measured", bound=MeasuredObject)
+
 
 def author_looks(
-    layer: Sdf.Layer,
-    scopes: Scopes,
-    looks: Mapping[str, Bindings],
-    *,
-    selected: str,
-    competing: Mapping[str, Competing],
+    layer: Sdf.Layer, draft: Draft, looks: Mapping[str, Bindings], *, selected: str
 ) -> None:
     """Add variants to the default prim and select one; weaker layers' variants remain.
 
-    competing  per object, what an input file binds otherwise and must be bound too
+    What an input file binds otherwise than by the mesh is bound in every look too.
     """
-    root = Sdf.Path(scopes.root)
-    over(layer, scopes.root)
+    root, competing = Sdf.Path(draft.scopes.root), recorded_bindings(draft.asset)
     for look, bindings in looks.items():
         variant = root.AppendVariantSelection(VARIANT_SET, look)
         over(layer, str(variant))
@@ -61,30 +59,45 @@ def author_looks(
 
 
 def author_look_materials(
-    layer: Sdf.Layer, scopes: Scopes, look: str, values: Iterable[tuple[str, str, Shown]]
+    layer: Sdf.Layer,
+    scopes: Scopes,
+    look: str,
+    objects: Sequence[Measured],
+    shown_of: Callable[[Measured], Shown],
 ) -> dict[str, str]:
-    """Unlit materials for one look, one per object; ``values`` are (prim path, identifier, what).
+    """Unlit materials for one look, one per object, and how they are bound.
 
-    Returns the bindings. Objects without a value share one material that says so.
+    Objects of which there is nothing to show share one material that says so.
     """
     define(layer, scopes.path("looks"), "Scope")
     define(layer, scopes.path("looks", look), "Scope")
     bindings = {}
-    for prim_path, identifier, shown in values:
-        material = scopes.path("looks", look, identifier)
+    for item in objects:
+        material, shown = scopes.path("looks", look, item.identifier), shown_of(item)
         if isinstance(shown, Aov):
             unlit_texture(layer, material, shown.file, shown.scale)
         elif shown is not None:
             unlit_colour(layer, material, shown)
         else:
-            material = _no_data(layer, scopes)
-        bindings[prim_path] = material
+            material = scopes.path("looks", NO_DATA)
+            unlit_colour(layer, material, NO_DATA_COLOUR)
+        bindings[item.prim_path] = material
     return bindings
 
 
-def _no_data(layer: Sdf.Layer, scopes: Scopes) -> str:
-    """Path of the material for objects without a value, defined in this layer."""
-    path = scopes.path("looks", NO_DATA)
-    if not layer.GetPrimAtPath(path):
-        unlit_colour(layer, path, NO_DATA_COLOUR)
-    return path
+def aov_looks(
+    layer: Sdf.Layer,
+    scopes: Scopes,
+    objects: Sequence[MeasuredObject],
+    hidden: frozenset[str] = frozenset(),
+) -> dict[str, dict[str, str]]:
+    """One look per map that any object has, with a binding for every object."""
+    names = {aov.name: None for item in objects for aov in item.aovs if aov.name not in hidden}
+    return {
+        name: author_look_materials(layer, scopes, name, objects, partial(_map_of, name=name))
+        for name in names
+    }
+
+
+def _map_of(item: MeasuredObject, name: str) -> Aov | None:
+    return next((aov for aov in item.aovs if aov.name == name), None)

@@ -1,33 +1,42 @@
-"""What the fitting stage adds: the specular lobe of every material, and how sure we are of it."""
+"""What the task fit adds: the specular lobe of every material, and how sure we are of it.
+
+Where it is asked for, the materials once more as OpenPBR networks of MaterialX, for renderers that
+take those rather than UsdPreviewSurface; they get the same numbers. materialx.usda is a sublayer of
+material.usda, weaker than it and listed there: so the root layer need not be written again, and a
+session that does not want it mutes one file. What glows keeps its UsdPreviewSurface alone, whose
+emission the variants of the lights switch off.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pxr import Sdf
 
-from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
-from usdbrdf.asset.layers.author import apply_schema, attribute, export, over
-from usdbrdf.asset.layers.input_bindings import recorded_bindings
+from usdbrdf.asset.header import Draft
+from usdbrdf.asset.layers.author import author_inputs, author_record, connect, export, over
 from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
-from usdbrdf.asset.layers.looks import SHADED, Shown, author_look_materials, author_looks
-from usdbrdf.asset.layers.materialx_layer import Coloured, write_materialx_layer
+from usdbrdf.asset.layers.looks import (
+    SHADED,
+    Shown,
+    aov_looks,
+    author_look_materials,
+    author_looks,
+)
 from usdbrdf.asset.layers.preview_surface import (
     NO_LOBE,
     SURFACE,
     PreviewLobe,
     colour_from_texture,
     lobe,
+    node,
     preview_surface_from_fit,
     scale_texture,
 )
 from usdbrdf.asset.layers.shading_layer import ALBEDO_TEXTURE
-from usdbrdf.asset.layers.texturing_layer import aov_looks, author_aovs
-from usdbrdf.asset.layout import Asset, path_in_layer
+from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.properties import FittedObject
-from usdbrdf.asset.schema import verify
 
 Types = Sdf.ValueTypeNames
 
@@ -35,50 +44,43 @@ BASE_COLOR = "base_color"
 
 
 def write_material_layer(
-    path: Path,
-    asset: Asset,
-    header: StageHeader,
-    provenance: Provenance,
-    objects: Sequence[FittedObject],
-    *,
-    materialx: Path | None = None,
+    path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
 ) -> None:
     """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
-    verify()
-    scopes = Scopes.of(asset)
-    layer = new_layer(header, provenance)
-    over(layer, scopes.root)
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
     shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
     networks = {}
     for item in objects:
         material = scopes.path("materials", item.identifier)
-        _author_facts(over(layer, item.prim_path), item)
+        author_record(over(layer, item.prim_path), item)
         shown = NO_LOBE
-        if _known(item):
+        if item.is_known:
             shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
             _author_lobe(layer, material, shown)
         texture = _author_colour(layer, material, item, shown.diffuse, shading)
-        if _known(item) and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
-            networks[material] = Coloured(shown, texture)
+        if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
+            networks[material] = (shown, texture)
     looks = {
         **aov_looks(layer, scopes, objects),
-        "roughness": author_look_materials(layer, scopes, "roughness", _greys(objects, "phi")),
-        "specular": author_look_materials(layer, scopes, "specular", _greys(objects, "psi")),
+        "roughness": author_look_materials(
+            layer, scopes, "roughness", objects, lambda item: _grey(item, item.phi)
+        ),
+        "specular": author_look_materials(
+            layer, scopes, "specular", objects, lambda item: _grey(item, item.psi)
+        ),
     }
-    competing = recorded_bindings(asset)
-    author_looks(layer, scopes, looks, selected=SHADED, competing=competing)
-    folder = asset.layer("material").parent
+    author_looks(layer, draft, looks, selected=SHADED)
     if materialx:
         layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
-        write_materialx_layer(materialx, folder, header, provenance, networks)
-    export(layer, path, folder=folder)
+        _write_materialx(materialx, draft, networks)
+    export(layer, path, folder=asset.layer("material").parent)
 
 
 def _author_lobe(layer: Sdf.Layer, material: str, shown: PreviewLobe) -> None:
     lobe(layer, material, shown.roughness, shown.ior)
     shader = over(layer, f"{material}/{SURFACE}")
-    attribute(shader, "inputs:metallic", Types.Float, 0.0)
-    attribute(shader, "inputs:useSpecularWorkflow", Types.Int, 0)
+    author_inputs(shader, Types.Float, metallic=0.0)
+    author_inputs(shader, Types.Int, useSpecularWorkflow=0)
 
 
 def _author_colour(
@@ -101,38 +103,41 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _author_facts(prim: Sdf.PrimSpec, item: FittedObject) -> None:
-    apply_schema(prim, "UsdBrdfMaterialFitAPI")
-    prefix = "usdBrdf:fit"
-    numbers = {
-        "phi": item.phi,
-        "psi": item.psi,
-        "phiError": item.phi_error,
-        "psiError": item.psi_error,
-        "cost": item.cost,
-        "evidence": item.evidence,
-    }
-    for name, value in numbers.items():
-        if math.isfinite(value):
-            attribute(prim, f"{prefix}:{name}", Types.Float, float(value), uniform=True)
-    attribute(prim, f"{prefix}:status", Types.Token, item.status, uniform=True)
-    for name, confidence in (("phi", item.phi_confidence), ("psi", item.psi_confidence)):
-        attribute(prim, f"{prefix}:{name}Confidence", Types.Token, confidence, uniform=True)
-    attribute(prim, f"{prefix}:targetFrame", Types.Int, int(item.target_frame), uniform=True)
-    attribute(prim, f"{prefix}:numPixels", Types.Int, int(item.num_pixels), uniform=True)
-    attribute(prim, f"{prefix}:method", Types.Token, item.method, uniform=True)
-    if _known(item):
-        attribute(prim, f"{prefix}:mapping", Types.Token, item.mapping, uniform=True)
-    author_aovs(prim, item.aovs)
+def _grey(item: FittedObject, parameter: float) -> Shown:
+    return (parameter,) * 3 if item.is_known else None
 
 
-def _known(item: FittedObject) -> bool:
-    return math.isfinite(item.phi) and math.isfinite(item.psi)
+def _write_materialx(
+    path: Path, draft: Draft, materials: Mapping[str, tuple[PreviewLobe, str]]
+) -> None:
+    """Write materialx.usda to ``path``. materials, by prim path: what UsdPreviewSurface is told,
+    and the texture of its diffuse colour as layers spell its path; "" is black."""
+    layer = draft.new_layer()
+    for material, (shown, texture) in materials.items():
+        _author_network(layer, material, shown, texture)
+    export(layer, path, folder=draft.asset.materialx_layer.parent)
 
 
-def _greys(objects: Sequence[FittedObject], parameter: str) -> list[tuple[str, str, Shown]]:
-    """Each object's parameter as a grey; None where it is not known."""
-    return [
-        (item.prim_path, item.identifier, (getattr(item, parameter),) * 3 if _known(item) else None)
-        for item in objects
-    ]
+def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
+    surface = f"{material}/OpenPBR"
+    connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
+    prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)
+    author_inputs(
+        prim, Types.Float,
+        base_weight=1.0, base_diffuse_roughness=0.0, base_metalness=0.0, specular_weight=1.0,
+        specular_roughness=shown.roughness, specular_ior=shown.ior,
+    )  # fmt: skip
+    if not file:
+        author_inputs(prim, Types.Color3f, base_color=(0.0, 0.0, 0.0))
+        return
+    st, image, scaled = (f"{material}/Mtlx{name}" for name in ("St", "BaseColor", "Scaled"))
+    prim_st = node(layer, st, "ND_geompropvalue_vector2", "out", Types.Float2)
+    author_inputs(prim_st, Types.String, geomprop="st")
+    texture = node(layer, image, "ND_image_color3", "out", Types.Color3f)
+    author_inputs(texture, Types.Asset, file=Sdf.AssetPath(file))
+    author_inputs(texture, Types.String, uaddressmode="clamp", vaddressmode="clamp")
+    connect(texture, "inputs:texcoord", Types.Float2, f"{st}.outputs:out")
+    product = node(layer, scaled, "ND_multiply_color3FA", "out", Types.Color3f)
+    author_inputs(product, Types.Float, in2=shown.diffuse)
+    connect(product, "inputs:in1", Types.Color3f, f"{image}.outputs:out")
+    connect(prim, "inputs:base_color", Types.Color3f, f"{scaled}.outputs:out")

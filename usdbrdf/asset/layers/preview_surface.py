@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pxr import Gf, Sdf
 
-from usdbrdf.asset.layers.author import attribute, connect, define, over
+from usdbrdf.asset.layers.author import attribute, author_inputs, connect, define, over
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.transport.renderer_match import measured_lobe, shown_lobe
 
@@ -80,22 +80,27 @@ def surface(
         Types.Token,
         f"{shader}.outputs:surface",
     )
-    prim = define(layer, shader, "Shader")
-    attribute(prim, "info:id", Types.Token, "UsdPreviewSurface", uniform=True)
-    attribute(prim, "inputs:useSpecularWorkflow", Types.Int, 0)
-    attribute(prim, "inputs:metallic", Types.Float, 0.0)
-    attribute(prim, "inputs:diffuseColor", Types.Color3f, Gf.Vec3f(0.0))
-    attribute(prim, "inputs:emissiveColor", Types.Color3f, Gf.Vec3f(0.0))
-    attribute(prim, "outputs:surface", Types.Token)
+    prim = node(layer, shader, "UsdPreviewSurface", "surface", Types.Token)
+    author_inputs(prim, Types.Int, useSpecularWorkflow=0)
+    author_inputs(prim, Types.Float, metallic=0.0)
+    author_inputs(prim, Types.Color3f, diffuseColor=Gf.Vec3f(0.0), emissiveColor=Gf.Vec3f(0.0))
     lobe(layer, material, roughness, ior)
     return prim
 
 
 def lobe(layer: Sdf.Layer, material: str, roughness: float, ior: float) -> None:
     """The specular lobe of a material that this layer, or a weaker one, defines."""
-    prim = over(layer, f"{material}/{SURFACE}")
-    attribute(prim, "inputs:roughness", Types.Float, roughness)
-    attribute(prim, "inputs:ior", Types.Float, ior)
+    author_inputs(over(layer, f"{material}/{SURFACE}"), Types.Float, roughness=roughness, ior=ior)
+
+
+def node(
+    layer: Sdf.Layer, path: str, identifier: str, output: str, output_type: Sdf.ValueTypeName
+) -> Sdf.PrimSpec:
+    """A shader of a network, by its ``info:id``, with one output."""
+    prim = define(layer, path, "Shader")
+    attribute(prim, "info:id", Types.Token, identifier, uniform=True)
+    attribute(prim, f"outputs:{output}", output_type)
+    return prim
 
 
 def colour_from_texture(
@@ -114,24 +119,16 @@ def colour_from_texture(
     file      path relative to the asset folder
     fallback  linear colour where the file is missing
     """
-    reader = define(layer, f"{material}/StReader", "Shader")
-    attribute(reader, "info:id", Types.Token, "UsdPrimvarReader_float2", uniform=True)
-    attribute(reader, "inputs:varname", Types.String, "st")
-    attribute(reader, "outputs:result", Types.Float2)
-
-    prim = define(layer, f"{material}/{texture}", "Shader")
-    attribute(prim, "info:id", Types.Token, "UsdUVTexture", uniform=True)
-    attribute(prim, "inputs:file", Types.Asset, Sdf.AssetPath(path_in_layer(file)))
+    reader = node(layer, f"{material}/StReader", "UsdPrimvarReader_float2", "result", Types.Float2)
+    author_inputs(reader, Types.String, varname="st")
+    prim = node(layer, f"{material}/{texture}", "UsdUVTexture", "rgb", Types.Float3)
+    author_inputs(prim, Types.Asset, file=Sdf.AssetPath(path_in_layer(file)))
     connect(prim, "inputs:st", Types.Float2, f"{material}/StReader.outputs:result")
     # "auto" would decode float images as sRGB in some applications.
-    attribute(prim, "inputs:sourceColorSpace", Types.Token, "raw")
-    attribute(prim, "inputs:wrapS", Types.Token, "clamp")
-    attribute(prim, "inputs:wrapT", Types.Token, "clamp")
-    attribute(prim, "inputs:fallback", Types.Float4, Gf.Vec4f(*map(float, fallback), 1.0))
+    author_inputs(prim, Types.Token, sourceColorSpace="raw", wrapS="clamp", wrapT="clamp")
+    author_inputs(prim, Types.Float4, fallback=Gf.Vec4f(*map(float, fallback), 1.0))
     if scale != 1.0:
         scale_texture(layer, material, texture, scale)
-    attribute(prim, "outputs:rgb", Types.Float3)
-
     shader = over(layer, f"{material}/{SURFACE}")
     source = f"{material}/{texture}.outputs:rgb"
     connected = connect(shader, f"inputs:{surface_input}", Types.Color3f, source)
@@ -141,7 +138,7 @@ def colour_from_texture(
 def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -> None:
     """A factor on the colour of a texture that this layer, or a weaker one, defines."""
     prim = over(layer, f"{material}/{texture}")
-    attribute(prim, "inputs:scale", Types.Float4, Gf.Vec4f(scale, scale, scale, 1.0))
+    author_inputs(prim, Types.Float4, scale=Gf.Vec4f(scale, scale, scale, 1.0))
 
 
 def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> None:
@@ -156,4 +153,4 @@ def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> N
 def unlit_colour(layer: Sdf.Layer, material: str, colour: Colour) -> None:
     """A material that glows with one linear colour and reflects nothing."""
     shader = surface(layer, material)
-    attribute(shader, "inputs:emissiveColor", Types.Color3f, Gf.Vec3f(*map(float, colour)))
+    author_inputs(shader, Types.Color3f, emissiveColor=Gf.Vec3f(*map(float, colour)))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,40 +11,52 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.header import Provenance, Scopes, StageHeader, new_layer
-from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over, relationship
-from usdbrdf.asset.layers.capture_camera import author_capture_camera
-from usdbrdf.asset.layers.input_bindings import competing_bindings, weaken_bindings
-from usdbrdf.asset.layers.input_geometry import (
+from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    attribute_per_frame,
+    author_fact,
+    author_record,
+    define,
+    export,
+    over,
+    relationship,
+)
+from usdbrdf.asset.layers.input_usd import (
     author_overrides,
     author_reference,
+    competing_bindings,
     has_transform,
     input_mesh,
     open_input,
+    weaken_bindings,
 )
-from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.schema import verify
+from usdbrdf.asset.layout import Asset, storable_path
+from usdbrdf.asset.properties import LabelledObject, Photographs, known_facts
 from usdbrdf.files.naming import readable_label
-from usdbrdf.model.capture import Scan
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
 
 Types = Sdf.ValueTypeNames
 
+APERTURE_MM = 36.0
 
-def write_scan_layer(
-    path: Path, scan: Scan, asset: Asset, header: StageHeader, provenance: Provenance
-) -> None:
+NEAR_M, FAR_M = 0.01, 1000.0
+
+_PLATE = "photograph"
+
+
+def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
-    verify()
-    folder = asset.layer("scan").parent
+    asset, folder = draft.asset, draft.asset.layer("scan").parent
     stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
-    scopes = Scopes.beside(f"/{header.name}", taken)
+    scopes = Scopes.beside(f"/{draft.header.name}", taken)
     meshes = _input_meshes(source, scan, scopes.root) if source else {}
-    layer = new_layer(
-        header,
-        provenance,
+    layer = draft.new_layer(
         adapter=scan.adapter,
         radiometric=scan.frames.radiometric,
         counts=scan.counts,
@@ -65,21 +78,18 @@ def write_scan_layer(
     define(layer, scopes.path("cameras"), "Scope")
     camera = scopes.path("cameras", "capture")
     moved = source is not None and has_transform(source)
-    author_capture_camera(
+    _author_capture_camera(
         layer, camera, scan.frames, scan.meters_per_unit, folder, reset_transform=moved
     )
     _author_render_settings(layer, scopes, scan)
     export(layer, path, folder=folder)
 
 
-def author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
+def _author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
     """What makes a mesh one of our objects."""
-    apply_schema(prim, "UsdBrdfObjectAPI")
-    text = readable_label(label.label)
-    class_name = readable_label(label.class_name)
-    attribute(prim, "usdBrdf:label", Types.String, text, uniform=True)
-    attribute(prim, "usdBrdf:class", Types.String, class_name, uniform=True)
-    attribute(prim, "usdBrdf:identifier", Types.Token, label.identifier, uniform=True)
+    text, class_name = readable_label(label.label), readable_label(label.class_name)
+    record = LabelledObject(label=text, class_name=class_name, identifier=label.identifier)
+    author_record(prim, record)
     prim.SetInfo("displayName", text)
     if class_name:
         apply_schema(prim, "SemanticsLabelsAPI:class")
@@ -112,7 +122,7 @@ def _author_input_meshes(
         weaken_bindings(layer, mesh, source, root)
         normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
         author_overrides(layer, path, mesh, normals)
-        author_label(over(layer, path), scan.objects[i])
+        _author_label(over(layer, path), scan.objects[i])
 
 
 def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
@@ -131,7 +141,7 @@ def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
             prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
             prim.SetInfo("kind", "component")
             _author_mesh(prim, mesh, faces)
-            author_label(prim, label)
+            _author_label(prim, label)
 
 
 def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:
@@ -161,3 +171,109 @@ def _author_render_settings(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> Non
     attribute(settings, "resolution", Types.Int2, Gf.Vec2i(width, height), uniform=True)
     relationship(settings, "camera", scopes.path("cameras", "capture"))
     attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
+
+
+def _author_capture_camera(
+    layer: Sdf.Layer,
+    path: str,
+    frames: Frames,
+    meters_per_unit: float,
+    folder: Path,
+    *,
+    reset_transform: bool = False,
+) -> None:
+    """Define the camera; frame i is at time code i + 1, and the first is the default as well.
+
+    folder           where the layer will lie: the photographs' paths are relative to it
+    reset_transform  the poses are in the world, whatever the camera's ancestors do
+    """
+    prim = define(layer, path, "Camera")
+    _author_pose(prim, frames.world_from_camera, reset_transform)
+    _author_lens(prim, frames, meters_per_unit)
+    _author_exposure(prim, frames.exposure_time)
+    _author_capture(prim, frames, folder)
+
+
+def lens_from_pinhole(
+    pinhole: Double, resolution: Sequence[int], meters_per_unit: float
+) -> tuple[float, float, float, float, float]:
+    """focalLength, horizontal and vertical aperture, horizontal and vertical offset.
+
+    In tenths of a scene unit, as USD wants them. Only ratios to the aperture mean anything, so the
+    aperture is that of a full-frame camera.
+    """
+    fx, fy, cx, cy = (float(value) for value in pinhole)
+    width, height = (int(value) for value in resolution)
+    aperture = APERTURE_MM / (100.0 * meters_per_unit)
+    focal = fx * aperture / width
+    vertical = focal * height / fy
+    offset_x = (width / 2 - cx) * aperture / width
+    offset_y = (cy - height / 2) * vertical / height
+    return focal, aperture, vertical, offset_x, offset_y
+
+
+def _author_pose(prim: Sdf.PrimSpec, world_from_camera: Double, reset_transform: bool) -> None:
+    # USD multiplies row vectors from the left: its matrices are ours transposed.
+    poses = [Gf.Matrix4d(pose.T.tolist()) for pose in np.asarray(world_from_camera, np.float64)]
+    name = "xformOp:transform"
+    attribute_per_frame(prim, name, Types.Matrix4d, poses, always=True)
+    order = ["!resetXformStack!", name] if reset_transform else [name]
+    attribute(prim, "xformOpOrder", Types.TokenArray, order, uniform=True)
+
+
+def _author_lens(prim: Sdf.PrimSpec, frames: Frames, meters_per_unit: float) -> None:
+    lens = [
+        lens_from_pinhole(pinhole, resolution, meters_per_unit)
+        for pinhole, resolution in zip(frames.intrinsics, frames.resolution, strict=True)
+    ]
+    names = (
+        "focalLength",
+        "horizontalAperture",
+        "verticalAperture",
+        "horizontalApertureOffset",
+        "verticalApertureOffset",
+    )
+    for name, values in zip(names, zip(*lens, strict=True), strict=True):
+        attribute_per_frame(prim, name, Types.Float, values)
+    attribute(prim, "projection", Types.Token, "perspective")
+    near, far = NEAR_M / meters_per_unit, FAR_M / meters_per_unit
+    attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(near, far))
+
+
+def _author_exposure(prim: Sdf.PrimSpec, exposure_time: Double) -> None:
+    """Exposure attributes whose product is 1: the frames are radiance already.
+
+    USD: scale = responsivity * time * (iso / 100) * 2^exposure / fStop^2.
+    """
+    times = [t if math.isfinite(t) and t > 0 else 1.0 for t in map(float, exposure_time)]
+    attribute(prim, "exposure", Types.Float, 0.0)
+    attribute(prim, "exposure:fStop", Types.Float, 1.0)
+    attribute(prim, "exposure:iso", Types.Float, 100.0)
+    attribute_per_frame(prim, "exposure:time", Types.Float, times)
+    attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
+
+
+def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
+    photographs = Photographs(
+        image=[storable_path(path, folder) for path in frames.image_paths],
+        exposure_time=frames.exposure_time.tolist(),
+        saturation_radiance=frames.saturation_radiance.tolist(),
+        noise_floor_radiance=frames.noise_floor_radiance.tolist(),
+        intrinsics=frames.intrinsics.tolist(),
+        resolution=frames.resolution.tolist(),
+        encoding=frames.encoding,
+        radiometric=frames.radiometric,
+    )
+    for fact, value in known_facts(photographs):
+        author_fact(prim, fact, value)
+        if fact.name == "image":
+            _author_back_plate(prim, value)
+
+
+def _author_back_plate(prim: Sdf.PrimSpec, images: Sequence[str]) -> None:
+    """The photographs where applications look for plates (new in USD 26.11; older versions pass
+    over a schema that they do not know). Muted: no render may change because of them."""
+    apply_schema(prim, f"BackPlateAPI:{_PLATE}")
+    prefix, values = f"backPlate:{_PLATE}", [Sdf.AssetPath(image) for image in images]
+    attribute_per_frame(prim, f"{prefix}:image", Types.Asset, values, always=True)
+    attribute(prim, f"{prefix}:plateVisibility", Types.Token, "mute")

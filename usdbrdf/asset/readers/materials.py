@@ -36,7 +36,7 @@ _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class PublishedMaterial:
+class BoundMaterial:
     """A material, and which primvars of a mesh it reads ("" for none).
 
     uv_from_st  (3, 3) of column vectors, a UsdTransform2d; None is the identity
@@ -59,7 +59,7 @@ class PublishedMaterial:
         return np.asarray(moved, np.float32)
 
 
-def mappings_of_materials(stage: Usd.Stage) -> dict[str, str]:
+def fit_mappings(stage: Usd.Stage) -> dict[str, str]:
     """What a fit recorded of the materials that its objects are bound to (usdBrdf:fit:mapping), by
     material path; others are not in there."""
     found = {}
@@ -72,12 +72,12 @@ def mappings_of_materials(stage: Usd.Stage) -> dict[str, str]:
     return found
 
 
-def published_material(
+def material_from_usd(
     material: UsdShade.Material,
     time: Usd.TimeCode,
     warn: Callable[[str], None],
-    mapping: str = "measured",
-) -> PublishedMaterial:
+    mapping: str,
+) -> BoundMaterial:
     """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks of
     UsdPreviewSurface with the mesh's display colour.
 
@@ -88,14 +88,14 @@ def published_material(
     if shader is None:
         if material:
             warn(f"<{material.GetPath()}>: no UsdPreviewSurface; shown in its display colour.")
-        return PublishedMaterial(material=_material_of({}), colour_primvar="displayColor")
+        return BoundMaterial(material=_material_of({}), colour_primvar="displayColor")
     reader = _Reader(time=time, warn=warn)
     inputs = {name: reader.read(shader.GetInput(name), value) for name, value in _FALLBACKS.items()}
     if inputs.pop("opacity").min() < 1:
         warn(f"<{material.GetPath()}>: opacity is not rendered; the surface is taken as opaque.")
     if mapping == "matched":
         inputs |= _as_fitted(inputs)
-    return PublishedMaterial(
+    return BoundMaterial(
         material=replace(_material_of(inputs), wrap=reader.wrap or "clamp"),
         uv_primvar=reader.uv_primvar,
         colour_primvar=reader.colour_primvar,

@@ -1,27 +1,70 @@
-"""A composed USD file as a renderer sees it: surfaces and lights in metres, cameras as pinholes."""
+"""A composed USD file as a renderer sees it: surfaces and lights in metres, cameras as pinholes.
+
+UsdLux: the emission of a light is intensity * 2^exposure * colour (* that of its temperature).
+It is the radiance of a light with an area, or, where the light is normalised, that radiance times
+the area in the world: of a disc in the sky the area is pi sin^2 of half its angle, so that the
+emission of a normalised distant light is the irradiance that it gives.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdLux
 
 from usdbrdf.asset.readers.compose import open_stage
-from usdbrdf.asset.readers.frames import capture_camera, frames_from_stage
-from usdbrdf.asset.readers.lights import lights_from_stage
-from usdbrdf.asset.readers.surfaces import published_surfaces
+from usdbrdf.asset.readers.frames import asset_file, capture_camera, frames_from_stage
+from usdbrdf.asset.readers.materials import read_texture
+from usdbrdf.asset.readers.surfaces import metres_from_units, surfaces_from_stage
 from usdbrdf.errors import UsageError
+from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.light import Light
-from usdbrdf.model.material import Surface
+from usdbrdf.model.light import DistantLight, Light, ShapeLight, SkyLight
+from usdbrdf.model.material import Surface, constant_map, turned_up
 
 _DEFAULT_WIDTH = 1280
 
+_SHAPES = ("RectLight", "DiskLight", "SphereLight")
 
-def published_camera(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode) -> Camera:
+_DOMES = ("DomeLight", "DomeLight_1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderScene:
+    """Surfaces and lights in metres, in the world of the stage.
+
+    up_axis          "Y" or "Z"
+    metres_per_unit  of the stage, whose units these were
+    """
+
+    surfaces: tuple[Surface, ...]
+    lights: tuple[Light, ...]
+    up_axis: str
+    metres_per_unit: float
+
+
+def render_scene_from_stage(
+    stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None]
+) -> RenderScene:
+    """What is visible in a stage at a time; ``warn`` is told, in sentences, what is left out."""
+    return RenderScene(
+        surfaces=surfaces_from_stage(stage, time, warn),
+        lights=lights_from_stage(stage, time, warn),
+        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
+        metres_per_unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
+    )
+
+
+def render_scene_from_file(file: Path, warn: Callable[[str], None]) -> RenderScene:
+    """The same of a USD file at its earliest time."""
+    return render_scene_from_stage(open_stage(file.absolute()), Usd.TimeCode.EarliestTime(), warn)
+
+
+def view_from_stage(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode) -> Camera:
     """The camera at ``prim_path``, or the capture's where that is None; as many pixels as its
     photographs have, else 1280 across."""
     if prim_path is None:
@@ -84,36 +127,121 @@ def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> Camera:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """Surfaces and lights in metres, in the world of the stage.
-
-    up_axis          "Y" or "Z"
-    metres_per_unit  of the stage, whose units these were
-    """
-
-    surfaces: tuple[Surface, ...]
-    lights: tuple[Light, ...]
-    up_axis: str
-    metres_per_unit: float
-
-
-def published(stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None]) -> Published:
-    """What is visible in a stage at a time; ``warn`` is told, in sentences, what is left out."""
-    return Published(
-        surfaces=published_surfaces(stage, time, warn),
-        lights=lights_from_stage(stage, time, warn),
-        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
-        metres_per_unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
-    )
-
-
-def published_file(file: Path, warn: Callable[[str], None]) -> Published:
-    """The same of a USD file at its earliest time."""
-    return published(open_stage(file.absolute()), Usd.TimeCode.EarliestTime(), warn)
-
-
 def eye_height(stage: Usd.Stage) -> float:
     """Metres along the up axis of the capture's highest camera: below every ceiling."""
     poses = frames_from_stage(stage).world_from_camera
     return float(poses[:, "XYZ".index(str(UsdGeom.GetStageUpAxis(stage))), 3].max())
+
+
+def lights_from_stage(
+    stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None]
+) -> tuple[Light, ...]:
+    """All active, visible lights that emit.
+
+    warn  is told, in sentences, what was left out
+    """
+    lights: list[Light] = []
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+        kind = str(prim.GetTypeName())
+        # A light's own geometry (MeshLightAPI) glows by its material and is a surface.
+        if not prim.HasAPI(UsdLux.LightAPI) or prim.IsA(UsdGeom.Mesh):
+            continue
+        if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+            continue
+        if kind not in (*_SHAPES, *_DOMES, "DistantLight"):
+            warn(f"<{prim.GetPath()}>: a {kind} is not rendered.")
+            continue
+        if prim.HasAPI(UsdLux.ShapingAPI):
+            warn(f"<{prim.GetPath()}>: the shaping of the light is not rendered.")
+        emission = _emission(prim, time)
+        if not emission.any():
+            continue
+        world_from_light = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)).T
+        if kind == "DistantLight":
+            lights.append(_distant(prim, emission, world_from_light, time))
+        elif kind in _DOMES:
+            lights.append(_dome(prim, emission, world_from_light, time))
+        else:
+            lights.append(_shape(prim, kind, emission, world_from_light, time))
+    return tuple(lights)
+
+
+def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
+    """A latitude-longitude picture about the stage's up axis, as ``shade --environment`` has it:
+    in a world with z up it is the y-up one turned by 90 degrees about x."""
+    image = np.maximum(read_texture(file, "raw"), 0)
+    return SkyLight(image=image, world_from_here=turned_up("Y", up_axis)[:3, :3])
+
+
+def _emission(prim: Usd.Prim, time: Usd.TimeCode) -> Float:
+    """(3,) colour * intensity * 2^exposure, with the colour temperature."""
+    light = UsdLux.LightAPI(prim)
+    colour = np.array(light.GetColorAttr().Get(time) or (1, 1, 1), np.float32)
+    if light.GetEnableColorTemperatureAttr().Get(time):
+        kelvin = light.GetColorTemperatureAttr().Get(time)
+        colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float32)
+    scale = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
+    return np.asarray(np.maximum(colour * scale, 0), np.float32)
+
+
+def _normalised(prim: Usd.Prim, time: Usd.TimeCode) -> bool:
+    return bool(UsdLux.LightAPI(prim).GetNormalizeAttr().Get(time))
+
+
+def _shape(
+    prim: Usd.Prim, kind: str, emission: Float, world_from_light: Double, time: Usd.TimeCode
+) -> ShapeLight:
+    if kind == "RectLight":
+        width, height = (prim.GetAttribute(f"inputs:{n}").Get(time) for n in ("width", "height"))
+        name, size = "rectangle", (width / 2, height / 2, 1.0)
+    else:
+        radius = prim.GetAttribute("inputs:radius").Get(time)
+        name, size = ("sphere" if kind == "SphereLight" else "disk"), (radius,) * 3
+    world_from_shape = world_from_light @ np.diag([*size, 1.0])
+    if _normalised(prim, time):
+        emission = emission / np.float32(_area(name, world_from_shape))
+    # UsdLux emits towards -z; turned about y, so that a rectangle keeps its up direction.
+    world_from_shape = world_from_shape @ np.diag([-1.0, 1, -1, 1])
+    image = constant_map(*emission)
+    texture = (
+        asset_file(prim.GetAttribute("inputs:texture:file"), time) if name == "rectangle" else None
+    )
+    if texture is not None:
+        image = np.asarray(read_texture(texture, "auto") * emission, np.float32)
+    metres = metres_from_units(prim.GetStage())
+    return ShapeLight(kind=name, world_from_here=metres @ world_from_shape, emission=image)
+
+
+def _area(kind: str, world_from_shape: Double) -> float:
+    """Area in square units of the stage, as UsdLux divides by."""
+    x, y, z = (np.linalg.norm(column) for column in world_from_shape[:3, :3].T)
+    if kind == "rectangle":
+        return float(4 * x * y)
+    return float(math.pi * x * y if kind == "disk" else 4 * math.pi * (x * y * z) ** (2 / 3))
+
+
+def _distant(
+    prim: Usd.Prim, emission: Float, world_from_light: Double, time: Usd.TimeCode
+) -> DistantLight:
+    half_angle = math.radians(UsdLux.DistantLight(prim).GetAngleAttr().Get(time)) / 2
+    size = math.pi * math.sin(half_angle) ** 2
+    if size > 0 and not _normalised(prim, time):
+        emission = emission * np.float32(size)
+    towards = world_from_light[:3, :3] @ np.array([0.0, 0, -1])
+    return DistantLight(
+        towards=towards / np.linalg.norm(towards), irradiance=emission, half_angle=half_angle
+    )
+
+
+def _dome(
+    prim: Usd.Prim, emission: Float, world_from_light: Double, time: Usd.TimeCode
+) -> SkyLight:
+    rotation = world_from_light[:3, :3] / np.linalg.norm(world_from_light[:3, :3], axis=0)
+    pole, up = prim.GetAttribute("poleAxis"), UsdGeom.GetStageUpAxis(prim.GetStage())
+    if pole and (up if pole.Get() == "scene" else pole.Get()) == UsdGeom.Tokens.z:
+        rotation = rotation @ turned_up("Y", "Z")[:3, :3]
+    image = constant_map(*emission)
+    texture = asset_file(prim.GetAttribute("inputs:texture:file"), time)
+    if texture is not None:
+        image = np.asarray(np.maximum(read_texture(texture, "auto"), 0) * emission, np.float32)
+    return SkyLight(image=image, world_from_here=rotation)

@@ -143,13 +143,15 @@ def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
     return bool(np.linalg.det(np.array(mesh.ComputeLocalToWorldTransform(_TIME))[:3, :3]) < 0)
 
 
-def authored_normals(mesh: UsdGeom.Mesh, fans: Triangulation) -> npt.NDArray[np.float64] | None:
+def authored_normals(
+    mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode = _TIME
+) -> npt.NDArray[np.float64] | None:
     """(T, 3, 3) authored normals in the mesh's frame; None where there are none to use."""
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")  # stronger than the attribute
     if primvar and primvar.HasAuthoredValue():
-        values, interpolation = primvar.ComputeFlattened(_TIME), primvar.GetInterpolation()
+        values, interpolation = primvar.ComputeFlattened(time), primvar.GetInterpolation()
     else:
-        values = mesh.GetNormalsAttr().Get(_TIME)
+        values = mesh.GetNormalsAttr().Get(time)
         interpolation = mesh.GetNormalsInterpolation()
     if not values:
         return None

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pxr import Usd, UsdGeom, UsdShade
 
 from usdbrdf.asset.readers.materials import (
-    PublishedMaterial,
-    mappings_of_materials,
-    published_material,
+    BoundMaterial,
+    fit_mappings,
+    material_from_usd,
 )
-from usdbrdf.asset.readers.scene import triangulation_of
+from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Double, Float
@@ -31,7 +32,16 @@ _MAX_SHOWN = 5
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
-def published_surfaces(
+class _Reading(NamedTuple):
+    """When the stage is looked at, how its fits were mapped to materials, and who is told what is
+    left out."""
+
+    time: Usd.TimeCode
+    mappings: Mapping[str, str]
+    warn: Callable[[str], None]
+
+
+def surfaces_from_stage(
     stage: Usd.Stage,
     time: Usd.TimeCode,
     warn: Callable[[str], None],
@@ -46,7 +56,7 @@ def published_surfaces(
     surfaces: list[Surface] = []
     transforms = UsdGeom.XformCache(time)
     left_out: list[Usd.Prim] = []
-    mappings = mappings_of_materials(stage)
+    reading = _Reading(time, fit_mappings(stage), warn)
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.PointInstancer):
             continue
@@ -59,7 +69,7 @@ def published_surfaces(
             left_out.append(prim)
             continue
         world_from_local = np.array(transforms.GetLocalToWorldTransform(prim)).T
-        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, time, mappings, warn)
+        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, reading)
     if left_out:
         about = subject or stage.GetRootLayer().identifier
         warn(f"{about}: only meshes are taken; left out: {paths_of(left_out)}.")
@@ -80,12 +90,9 @@ def metres_from_units(stage: Usd.Stage) -> Double:
 
 
 def _surfaces_of_mesh(
-    mesh: UsdGeom.Mesh,
-    world_from_local: Double,
-    time: Usd.TimeCode,
-    mappings: Mapping[str, str],
-    warn: Callable[[str], None],
+    mesh: UsdGeom.Mesh, world_from_local: Double, reading: _Reading
 ) -> list[Surface]:
+    time, warn = reading.time, reading.warn
     points = np.asarray(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
     fans = triangulation_of(mesh)
     if not len(fans.triangles) or fans.triangles.max() >= len(points):
@@ -100,7 +107,7 @@ def _surfaces_of_mesh(
     if normals is None:
         normals = corner_normals(np.asarray(points, np.float32), fans.triangles, _CREASE_ANGLE_DEG)
     parts = []
-    for faces, material in _faces_by_material(mesh, fans, time, mappings, warn):
+    for faces, material in _faces_by_material(mesh, fans, reading):
         colour = _primvar(mesh, material.colour_primvar, 3, fans, time)
         uv = _primvar(mesh, material.uv_primvar, 2, fans, time)
         if uv is None and material.uv_primvar:
@@ -132,50 +139,37 @@ def _tidy(part: Surface) -> Surface:
 
 
 def _faces_by_material(
-    mesh: UsdGeom.Mesh,
-    fans: Triangulation,
-    time: Usd.TimeCode,
-    mappings: Mapping[str, str],
-    warn: Callable[[str], None],
-) -> list[tuple[npt.NDArray[np.intp], PublishedMaterial]]:
+    mesh: UsdGeom.Mesh, fans: Triangulation, reading: _Reading
+) -> list[tuple[npt.NDArray[np.intp], BoundMaterial]]:
     """Triangles of each bound material; what no subset claims has the mesh's own."""
     own = UsdShade.MaterialBindingAPI(mesh.GetPrim())
     rest = np.ones(len(fans.triangles), np.bool_)
     found = []
     for subset in own.GetMaterialBindSubsets():
-        polygons = np.asarray(subset.GetIndicesAttr().Get(time) or [], np.int32)
+        polygons = np.asarray(subset.GetIndicesAttr().Get(reading.time) or [], np.int32)
         chosen = np.isin(fans.polygon, polygons) & rest
         rest &= ~chosen
         if chosen.any():
             bound = UsdShade.MaterialBindingAPI(subset.GetPrim())
-            found.append((np.flatnonzero(chosen), _bound(bound, time, mappings, warn)))
+            found.append((np.flatnonzero(chosen), _bound(bound, reading)))
     if rest.any():
-        found.append((np.flatnonzero(rest), _bound(own, time, mappings, warn)))
+        found.append((np.flatnonzero(rest), _bound(own, reading)))
     return found
 
 
-def _bound(
-    binding: UsdShade.MaterialBindingAPI,
-    time: Usd.TimeCode,
-    mappings: Mapping[str, str],
-    warn: Callable[[str], None],
-) -> PublishedMaterial:
+def _bound(binding: UsdShade.MaterialBindingAPI, reading: _Reading) -> BoundMaterial:
     material, _ = binding.ComputeBoundMaterial()
-    mapping = mappings.get(str(material.GetPath()), "measured") if material else "measured"
-    return published_material(material, time, warn, mapping)
+    mapping = reading.mappings.get(str(material.GetPath()), "") if material else ""
+    return material_from_usd(material, reading.time, reading.warn, mapping)
 
 
 def _normals(mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode) -> Float | None:
     """(T, 3, 3) authored unit normals; None where there are none to use."""
-    normals = _primvar(mesh, "normals", 3, fans, time)
-    if normals is None:
-        values = mesh.GetNormalsAttr().Get(time)
-        normals = _per_corner(values, mesh.GetNormalsInterpolation(), 3, fans)
-    if normals is None:
+    authored = authored_normals(mesh, fans, time)
+    if authored is None:
         return None
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    usable = bool(np.isfinite(normals).all() and (length > 1e-12).all())
-    return np.asarray(normals / length, np.float32) if usable else None
+    normals = np.asarray(authored, np.float32)
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True), np.float32)
 
 
 def _primvar(
@@ -185,18 +179,10 @@ def _primvar(
     primvar = UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name) if name else None
     if not primvar or not primvar.HasValue():
         return None
-    return _per_corner(primvar.ComputeFlattened(time), primvar.GetInterpolation(), width, fans)
-
-
-def _per_corner(
-    values: Sequence[object] | None, interpolation: str, width: int, fans: Triangulation
-) -> Float | None:
-    if not values:
-        return None
-    rows = np.asarray(values, np.float32)
-    if rows.size % width:
+    rows = np.asarray(primvar.ComputeFlattened(time) or [], np.float32)
+    if not rows.size or rows.size % width:
         return None
     rows = rows.reshape(-1, width)
-    row_of_corner = fans.element_of_corner(interpolation)
+    row_of_corner = fans.element_of_corner(primvar.GetInterpolation())
     # Too few of them: the file is wrong about these values, not about its shape.
     return rows[row_of_corner] if row_of_corner.max() < len(rows) else None
