@@ -12,7 +12,7 @@ from pxr import Sdf, Tf
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
 
-# The layers that the stages write, weakest first; each sees only those before it.
+# The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
 
 
@@ -75,7 +75,7 @@ class Asset:
         return self.folder / "layers" / "materialx.usda"
 
     def layer(self, role: str) -> Path:
-        """Path of a stage's layer; ``role`` is one of ``ROLES``."""
+        """Path of a task's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
         return self.folder / "layers" / f"{role}{suffix[role]}"
 

@@ -124,7 +124,7 @@ CAPTURE = Schema(
 )  # fmt: skip
 AOV = Schema(
     "Aov", f"usdBrdf:aov:{INSTANCE}", "Mesh", "file",
-    "One map over the texture space (primvars:st) of an object, for review and for the next stage.",
+    "One map over the texture space (primvars:st) of an object, for review and for the next task.",
 )  # fmt: skip
 TEXTURING = Schema(
     "Texturing", "usdBrdf:texturing", "Mesh", "texelSize",

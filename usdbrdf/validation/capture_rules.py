@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from usdbrdf.asset.layers.scan_layer import lens_from_pinhole
+from usdbrdf.asset.layers.scan_layer import LENS, lens_from_pinhole
 from usdbrdf.asset.readers.objects import authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
@@ -17,14 +17,6 @@ _TOLERANCE = 1e-3
 _UV_TOLERANCE = 1e-4
 
 _EXPOSURE = ("exposure", *(f"exposure:{n}" for n in ("time", "fStop", "iso", "responsivity")))
-
-_LENS = (
-    "focalLength",
-    "horizontalAperture",
-    "verticalAperture",
-    "horizontalApertureOffset",
-    "verticalApertureOffset",
-)
 
 _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
 
@@ -74,9 +66,9 @@ def camera_lens(scene: AssetStage) -> Iterator[Fault]:
     do not lie over each other."""
     metres = UsdGeom.GetStageMetersPerUnit(scene.stage)
     for prim in scene.cameras:
-        for time in _times(prim, (*_LENS, *_PINHOLE)):
+        for time in _times(prim, (*LENS, *_PINHOLE)):
             pinhole, size = (prim.GetAttribute(name).Get(time) for name in _PINHOLE)
-            lens = [prim.GetAttribute(name).Get(time) for name in _LENS]
+            lens = [prim.GetAttribute(name).Get(time) for name in LENS]
             if pinhole is None or size is None or not all([*list(size), *pinhole[:2]]):
                 yield Fault(prim, "it states no pinhole, or no size of the pictures.")
                 break

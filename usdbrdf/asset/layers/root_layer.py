@@ -57,7 +57,7 @@ def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:
 
 
 def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
-    """A layer without opinions, so that the root composes before the stage ``role`` has run."""
+    """A layer without opinions, so that the root composes before the task of its role has run."""
     layer = new_layer(header, Provenance(role=role, version=_VERSION), state="pending")
     over(layer, f"/{header.name}")
     export(layer, path, folder=path.parent)

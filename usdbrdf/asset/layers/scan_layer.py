@@ -41,6 +41,14 @@ from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
 
 Types = Sdf.ValueTypeNames
 
+LENS = (
+    "focalLength",
+    "horizontalAperture",
+    "verticalAperture",
+    "horizontalApertureOffset",
+    "verticalApertureOffset",
+)
+
 APERTURE_MM = 36.0
 
 NEAR_M, FAR_M = 0.01, 1000.0
@@ -76,11 +84,13 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
-    camera = scopes.path("cameras", "capture")
-    moved = source is not None and has_transform(source)
-    _author_capture_camera(
-        layer, camera, scan.frames, scan.meters_per_unit, folder, reset_transform=moved
-    )
+    camera = define(layer, scopes.path("cameras", "capture"), "Camera")
+    # The poses are in the world, whatever the default prim does.
+    reset_transform = source is not None and has_transform(source)
+    _author_pose(camera, scan.frames.world_from_camera, reset_transform)
+    _author_lens(camera, scan.frames, scan.meters_per_unit)
+    _author_exposure(camera, scan.frames.exposure_time)
+    _author_capture(camera, scan.frames, folder)
     _author_render_settings(layer, scopes, scan)
     export(layer, path, folder=folder)
 
@@ -99,10 +109,8 @@ def _author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
 def _author_root(root: Sdf.PrimSpec, asset: Asset, *, keep_kind: bool) -> None:
     if not keep_kind:
         root.SetInfo("kind", "assembly")
-    root.SetInfo(
-        "assetInfo",
-        {"identifier": Sdf.AssetPath(f"../{asset.root_layer.name}"), "name": asset.name},
-    )
+    identifier = Sdf.AssetPath(f"../{asset.root_layer.name}")
+    root.SetInfo("assetInfo", {"identifier": identifier, "name": asset.name})
     apply_schema(root, "ColorSpaceAPI")
     attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
 
@@ -173,31 +181,10 @@ def _author_render_settings(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> Non
     attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
 
 
-def _author_capture_camera(
-    layer: Sdf.Layer,
-    path: str,
-    frames: Frames,
-    meters_per_unit: float,
-    folder: Path,
-    *,
-    reset_transform: bool = False,
-) -> None:
-    """Define the camera; frame i is at time code i + 1, and the first is the default as well.
-
-    folder           where the layer will lie: the photographs' paths are relative to it
-    reset_transform  the poses are in the world, whatever the camera's ancestors do
-    """
-    prim = define(layer, path, "Camera")
-    _author_pose(prim, frames.world_from_camera, reset_transform)
-    _author_lens(prim, frames, meters_per_unit)
-    _author_exposure(prim, frames.exposure_time)
-    _author_capture(prim, frames, folder)
-
-
 def lens_from_pinhole(
     pinhole: Double, resolution: Sequence[int], meters_per_unit: float
 ) -> tuple[float, float, float, float, float]:
-    """focalLength, horizontal and vertical aperture, horizontal and vertical offset.
+    """The values of ``LENS``.
 
     In tenths of a scene unit, as USD wants them. Only ratios to the aperture mean anything, so the
     aperture is that of a full-frame camera.
@@ -213,6 +200,7 @@ def lens_from_pinhole(
 
 
 def _author_pose(prim: Sdf.PrimSpec, world_from_camera: Double, reset_transform: bool) -> None:
+    """Frame i is at time code i + 1, and the first is the default as well."""
     # USD multiplies row vectors from the left: its matrices are ours transposed.
     poses = [Gf.Matrix4d(pose.T.tolist()) for pose in np.asarray(world_from_camera, np.float64)]
     name = "xformOp:transform"
@@ -226,14 +214,7 @@ def _author_lens(prim: Sdf.PrimSpec, frames: Frames, meters_per_unit: float) -> 
         lens_from_pinhole(pinhole, resolution, meters_per_unit)
         for pinhole, resolution in zip(frames.intrinsics, frames.resolution, strict=True)
     ]
-    names = (
-        "focalLength",
-        "horizontalAperture",
-        "verticalAperture",
-        "horizontalApertureOffset",
-        "verticalApertureOffset",
-    )
-    for name, values in zip(names, zip(*lens, strict=True), strict=True):
+    for name, values in zip(LENS, zip(*lens, strict=True), strict=True):
         attribute_per_frame(prim, name, Types.Float, values)
     attribute(prim, "projection", Types.Token, "perspective")
     near, far = NEAR_M / meters_per_unit, FAR_M / meters_per_unit

@@ -29,7 +29,7 @@ def in_one_line(error: object) -> str:
 
 
 def open_weaker(asset: Asset, role: str) -> Usd.Stage:
-    """The stage that the stage ``role`` builds upon: only the layers weaker than its own.
+    """The stage that the task of a role builds upon: only the layers weaker than its own.
 
     Never edits.usda: what an artist overrides must not flow back into the measurement.
     """
@@ -90,8 +90,7 @@ def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
     for layer in layers:
         if not layer.is_file():
             raise InputRefused(
-                f"{layer}: the layer is missing. Run the stage that writes it first. "
-                "[stage.missing]"
+                f"{layer}: the layer is missing. Run the task that writes it first. [stage.missing]"
             )
     header = read_header(layers[0])
     root = new_layer(header, Provenance(role="view", version="1"))

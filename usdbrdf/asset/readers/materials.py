@@ -84,8 +84,8 @@ def material_from_usd(
     mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
              comes back is the lobe that was meant
     """
-    shader = _preview_surface(material)
-    if shader is None:
+    shader = material.ComputeSurfaceSource()[0] if material else None
+    if not shader or shader.GetShaderId() != "UsdPreviewSurface":
         if material:
             warn(f"<{material.GetPath()}>: no UsdPreviewSurface; shown in its display colour.")
         return BoundMaterial(material=_material_of({}), colour_primvar="displayColor")
@@ -131,13 +131,6 @@ def _material_of(inputs: dict[str, Float]) -> Material:
         ior=float(known["ior"].flat[0]),
         specular=known["specularColor"] if specular_workflow else None,
     )
-
-
-def _preview_surface(material: UsdShade.Material) -> UsdShade.Shader | None:
-    if not material:
-        return None
-    shader = material.ComputeSurfaceSource()[0]
-    return shader if shader and shader.GetShaderId() == "UsdPreviewSurface" else None
 
 
 @dataclass(kw_only=True)

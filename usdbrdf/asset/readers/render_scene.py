@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
@@ -27,10 +28,6 @@ from usdbrdf.model.light import DistantLight, Light, ShapeLight, SkyLight
 from usdbrdf.model.material import Surface, constant_map, turned_up
 
 _DEFAULT_WIDTH = 1280
-
-_SHAPES = ("RectLight", "DiskLight", "SphereLight")
-
-_DOMES = ("DomeLight", "DomeLight_1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,21 +145,16 @@ def lights_from_stage(
             continue
         if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
-        if kind not in (*_SHAPES, *_DOMES, "DistantLight"):
+        if kind not in _READERS:
             warn(f"<{prim.GetPath()}>: a {kind} is not rendered.")
             continue
         if prim.HasAPI(UsdLux.ShapingAPI):
             warn(f"<{prim.GetPath()}>: the shaping of the light is not rendered.")
         emission = _emission(prim, time)
-        if not emission.any():
-            continue
-        world_from_light = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)).T
-        if kind == "DistantLight":
-            lights.append(_distant(prim, emission, world_from_light, time))
-        elif kind in _DOMES:
-            lights.append(_dome(prim, emission, world_from_light, time))
-        else:
-            lights.append(_shape(prim, kind, emission, world_from_light, time))
+        if emission.any():
+            read = _READERS[kind]
+            world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)
+            lights.append(read(_Source(prim, time, emission, np.array(world).T)))
     return tuple(lights)
 
 
@@ -171,6 +163,25 @@ def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
     in a world with z up it is the y-up one turned by 90 degrees about x."""
     image = np.maximum(read_texture(file, "raw"), 0)
     return SkyLight(image=image, world_from_here=turned_up("Y", up_axis)[:3, :3])
+
+
+class _Source(NamedTuple):
+    """A light of the stage: emission (3,), world_from_light (4, 4) of column vectors."""
+
+    prim: Usd.Prim
+    time: Usd.TimeCode
+    emission: Float
+    world_from_light: Double
+
+    def value(self, name: str) -> Any:
+        return self.prim.GetAttribute(f"inputs:{name}").Get(self.time)
+
+    def picture(self) -> Float:
+        """(H, W, 3) radiance: the texture times the emission, or the emission alone."""
+        file = asset_file(self.prim.GetAttribute("inputs:texture:file"), self.time)
+        if file is None:
+            return constant_map(*self.emission)
+        return np.asarray(read_texture(file, "auto") * self.emission, np.float32)
 
 
 def _emission(prim: Usd.Prim, time: Usd.TimeCode) -> Float:
@@ -184,32 +195,21 @@ def _emission(prim: Usd.Prim, time: Usd.TimeCode) -> Float:
     return np.asarray(np.maximum(colour * scale, 0), np.float32)
 
 
-def _normalised(prim: Usd.Prim, time: Usd.TimeCode) -> bool:
-    return bool(UsdLux.LightAPI(prim).GetNormalizeAttr().Get(time))
-
-
-def _shape(
-    prim: Usd.Prim, kind: str, emission: Float, world_from_light: Double, time: Usd.TimeCode
-) -> ShapeLight:
-    if kind == "RectLight":
-        width, height = (prim.GetAttribute(f"inputs:{n}").Get(time) for n in ("width", "height"))
-        name, size = "rectangle", (width / 2, height / 2, 1.0)
+def _shape(source: _Source) -> ShapeLight:
+    kind, emission = _SHAPES[str(source.prim.GetTypeName())], source.emission
+    if kind == "rectangle":
+        size = (source.value("width") / 2, source.value("height") / 2, 1.0)
     else:
-        radius = prim.GetAttribute("inputs:radius").Get(time)
-        name, size = ("sphere" if kind == "SphereLight" else "disk"), (radius,) * 3
-    world_from_shape = world_from_light @ np.diag([*size, 1.0])
-    if _normalised(prim, time):
-        emission = emission / np.float32(_area(name, world_from_shape))
+        size = (source.value("radius"),) * 3
+    world_from_shape = source.world_from_light @ np.diag([*size, 1.0])
+    if source.value("normalize"):
+        emission = emission / np.float32(_area(kind, world_from_shape))
     # UsdLux emits towards -z; turned about y, so that a rectangle keeps its up direction.
     world_from_shape = world_from_shape @ np.diag([-1.0, 1, -1, 1])
-    image = constant_map(*emission)
-    texture = (
-        asset_file(prim.GetAttribute("inputs:texture:file"), time) if name == "rectangle" else None
-    )
-    if texture is not None:
-        image = np.asarray(read_texture(texture, "auto") * emission, np.float32)
-    metres = metres_from_units(prim.GetStage())
-    return ShapeLight(kind=name, world_from_here=metres @ world_from_shape, emission=image)
+    lit = source._replace(emission=emission)
+    image = lit.picture() if kind == "rectangle" else constant_map(*emission)
+    metres = metres_from_units(source.prim.GetStage())
+    return ShapeLight(kind=kind, world_from_here=metres @ world_from_shape, emission=image)
 
 
 def _area(kind: str, world_from_shape: Double) -> float:
@@ -220,28 +220,31 @@ def _area(kind: str, world_from_shape: Double) -> float:
     return float(math.pi * x * y if kind == "disk" else 4 * math.pi * (x * y * z) ** (2 / 3))
 
 
-def _distant(
-    prim: Usd.Prim, emission: Float, world_from_light: Double, time: Usd.TimeCode
-) -> DistantLight:
-    half_angle = math.radians(UsdLux.DistantLight(prim).GetAngleAttr().Get(time)) / 2
+def _distant(source: _Source) -> DistantLight:
+    half_angle, emission = math.radians(source.value("angle")) / 2, source.emission
     size = math.pi * math.sin(half_angle) ** 2
-    if size > 0 and not _normalised(prim, time):
+    if size > 0 and not source.value("normalize"):
         emission = emission * np.float32(size)
-    towards = world_from_light[:3, :3] @ np.array([0.0, 0, -1])
+    towards = source.world_from_light[:3, :3] @ np.array([0.0, 0, -1])
     return DistantLight(
         towards=towards / np.linalg.norm(towards), irradiance=emission, half_angle=half_angle
     )
 
 
-def _dome(
-    prim: Usd.Prim, emission: Float, world_from_light: Double, time: Usd.TimeCode
-) -> SkyLight:
-    rotation = world_from_light[:3, :3] / np.linalg.norm(world_from_light[:3, :3], axis=0)
-    pole, up = prim.GetAttribute("poleAxis"), UsdGeom.GetStageUpAxis(prim.GetStage())
+def _dome(source: _Source) -> SkyLight:
+    rotation = source.world_from_light[:3, :3]
+    rotation = rotation / np.linalg.norm(rotation, axis=0)
+    pole = source.prim.GetAttribute("poleAxis")
+    up = UsdGeom.GetStageUpAxis(source.prim.GetStage())
     if pole and (up if pole.Get() == "scene" else pole.Get()) == UsdGeom.Tokens.z:
         rotation = rotation @ turned_up("Y", "Z")[:3, :3]
-    image = constant_map(*emission)
-    texture = asset_file(prim.GetAttribute("inputs:texture:file"), time)
-    if texture is not None:
-        image = np.asarray(np.maximum(read_texture(texture, "auto"), 0) * emission, np.float32)
-    return SkyLight(image=image, world_from_here=rotation)
+    return SkyLight(image=np.maximum(source.picture(), 0), world_from_here=rotation)
+
+
+_SHAPES = {"RectLight": "rectangle", "DiskLight": "disk", "SphereLight": "sphere"}
+
+_READERS: dict[str, Callable[[_Source], Light]] = {
+    **dict.fromkeys(_SHAPES, _shape),
+    **dict.fromkeys(("DomeLight", "DomeLight_1"), _dome),
+    "DistantLight": _distant,
+}

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Usd, UsdGeom, Vt
 
+from usdbrdf.asset.properties import OBJECT, TEXTURING
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
@@ -35,7 +36,7 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
     if not prims:
         raise InputRefused(
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
-            "Run ingest again. [stage.objects]"
+            "Run `usdbrdf ingest` again. [stage.objects]"
         )
     crease_angle_deg = _crease_angle_deg(stage)
     meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
@@ -66,16 +67,16 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
 
 def is_object(prim: Usd.Prim) -> bool:
     """True for a mesh that ingest labelled."""
-    label = prim.GetAttribute("usdBrdf:label")
+    label = prim.GetAttribute(OBJECT.attribute(OBJECT.key))
     return bool(label and label.HasAuthoredValue() and prim.IsA(UsdGeom.Mesh))
 
 
 def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
-    """(T, 3, 2) texture coordinates that the texturing stage authored; None before it ran.
+    """(T, 3, 2) texture coordinates that the task texture authored; None before it.
 
     An input file's own primvars:st does not count: only ours go with our textures.
     """
-    ours = mesh.GetPrim().GetAttribute("usdBrdf:texturing:texelSize")
+    ours = mesh.GetPrim().GetAttribute(TEXTURING.attribute(TEXTURING.key))
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     if not (ours and ours.HasAuthoredValue() and primvar):
         return None
@@ -177,6 +178,6 @@ def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
         missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
         raise InputRefused(
             f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
-            "Run the stage texture again. [stage.st]"
+            "Run `usdbrdf texture` again. [stage.st]"
         )
     return np.concatenate(present)
