@@ -25,6 +25,7 @@ import numpy as np
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_shading
@@ -37,10 +38,10 @@ from usdbrdf.evaluation.truth import (
     true_albedo,
 )
 from usdbrdf.files.frames import read_frame
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
+from usdbrdf.options import Sampling
 from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -58,7 +59,7 @@ def main() -> int:
     options = parser.parse_args()
 
     stage = open_measured(Asset.at(options.asset))
-    atlas = atlas_from_stage(stage)
+    atlas = AssetMaps(stage)
     truth = known_objects(options.truth, atlas)
     shines = emitters(atlas, truth)
     owner = atlas.texels.object_index()
@@ -84,14 +85,14 @@ def main() -> int:
     return 0
 
 
-def some_patches(atlas: Atlas, share: int) -> tuple[np.ndarray, np.ndarray]:
+def some_patches(atlas: AssetMaps, share: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels of every ``share``-th patch, and their patch numbers."""
     order, patch = tiles_of_texels(atlas.texels)
     keep = patch % share == 0
     return order[keep], patch[keep]
 
 
-def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, float]:
+def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
     """L_d against the exact median of the samples that the streaming median saw."""
     frames = frames_from_stage(atlas.stage)
     scene, texels = atlas.scene, atlas.texels
@@ -118,7 +119,7 @@ def diffuse_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, flo
     }
 
 
-def irradiance_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, float]:
+def irradiance_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
     """S against a converged S from the same L_d."""
     scene, texels = atlas.scene, atlas.texels
     lit = atlas.map("lit")
@@ -143,7 +144,7 @@ def irradiance_error(atlas: Atlas, scored: np.ndarray, share: int) -> dict[str, 
     }
 
 
-def emitter_error(atlas: Atlas, shines: np.ndarray, owner: np.ndarray) -> dict[str, Any]:
+def emitter_error(atlas: AssetMaps, shines: np.ndarray, owner: np.ndarray) -> dict[str, Any]:
     emissive = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
     found = [read_shading(atlas.stage, o.prim_path) for o in atlas.scene.objects]
     lamps = np.array([bool(record and record.emitter) for record in found])

@@ -33,10 +33,10 @@ from scipy.spatial import cKDTree
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import aov_path
 from usdbrdf.files.arrays import load_arrays
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
@@ -69,7 +69,7 @@ def main() -> int:
     parser.add_argument("reference", type=Path)
     options = parser.parse_args()
 
-    atlas = atlas_from_stage(open_measured(Asset.at(options.asset)))
+    atlas = AssetMaps(open_measured(Asset.at(options.asset)))
     reference = load_arrays(options.reference)
     places = well_seen(atlas, places_on_asset(atlas, reference))
     if not len(places.row):
@@ -93,7 +93,7 @@ def main() -> int:
 # ---- where the points are ----------------------------------------------------------------------
 
 
-def places_on_asset(atlas: Atlas, reference: dict[str, Array]) -> Places:
+def places_on_asset(atlas: AssetMaps, reference: dict[str, Array]) -> Places:
     """The points that lie on our surface of the same object."""
     scene = atlas.scene
     normal = reference["normal"].astype(np.float32)
@@ -106,7 +106,7 @@ def places_on_asset(atlas: Atlas, reference: dict[str, Array]) -> Places:
     return Places(row, hits.face[row], hits.u[row], hits.v[row])
 
 
-def well_seen(atlas: Atlas, places: Places) -> Places:
+def well_seen(atlas: AssetMaps, places: Places) -> Places:
     """The places all of whose texels are seen often enough, inside a triangle and not emissive."""
     dark = ~(atlas.map_where_present("emission", 3) > 0).any(axis=1)
     usable = (atlas.map("samples")[:, 0] >= MIN_SAMPLES) & atlas.texels.interior & dark
@@ -115,7 +115,7 @@ def well_seen(atlas: Atlas, places: Places) -> Places:
     return places.take(share > 0.999)
 
 
-def near_others(atlas: Atlas, position: Array, owner: Array) -> Array:
+def near_others(atlas: AssetMaps, position: Array, owner: Array) -> Array:
     """(R,) bool: within CONTACT of a texel of another object."""
     near = np.zeros(len(position), bool)
     for i in range(len(atlas.scene.objects)):
@@ -131,7 +131,7 @@ def near_others(atlas: Atlas, position: Array, owner: Array) -> Array:
 
 
 def compared_maps(
-    atlas: Atlas, reference: dict[str, Array], places: Places
+    atlas: AssetMaps, reference: dict[str, Array], places: Places
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """The asset's maps and their truth at the places, (R, 3) each, by name."""
     light = reference["E"][places.row].astype(np.float64)
@@ -146,7 +146,7 @@ def compared_maps(
     return found, truth
 
 
-def everywhere(atlas: Atlas, aov: str) -> bool:
+def everywhere(atlas: AssetMaps, aov: str) -> bool:
     """Whether every object of the asset has the map."""
     return all(aov_path(atlas.stage, obj.prim_path, aov) is not None for obj in atlas.scene.objects)
 

@@ -29,6 +29,7 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.preview_surface import lobe, preview_surface_from_fit, scale_texture
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
 from usdbrdf.evaluation.evaluate_views import exposure_of_views
@@ -37,7 +38,6 @@ from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_radiance
-from usdbrdf.tasks.atlas import Atlas
 
 AS_WRITTEN = "as written"
 
@@ -71,7 +71,7 @@ def main() -> None:
     print(json.dumps(found, indent=2))
 
 
-def with_mapping(asset: Asset, atlas: Atlas, mapping: str, path: Path) -> Path:
+def with_mapping(asset: Asset, atlas: AssetMaps, mapping: str, path: Path) -> Path:
     """A layer over the asset that tells its materials phi and psi by this mapping."""
     layer = Sdf.Layer.CreateNew(str(path))
     layer.subLayerPaths = [str(asset.root_layer.absolute())]

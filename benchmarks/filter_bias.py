@@ -28,11 +28,11 @@ from against_reference import MIN_SAMPLES, Array, near_others, weighted_median
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
-from usdbrdf.tasks.lit import lit_scene
+from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 
 REFERENCE = Sampling(standard_error=0.0, max_rays=4096, seed=977)
 
@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument("--share", type=int, default=24, help="every n-th patch for the reference")
     options = parser.parse_args()
 
-    atlas = atlas_from_stage(open_measured(Asset.at(options.asset)))
+    atlas = AssetMaps(open_measured(Asset.at(options.asset)))
     if not atlas.has("irradiance_raw"):
         raise SystemExit(f"{options.asset}: not filtered. Run `usdbrdf shade --denoise oidn`")
     raw, filtered = (atlas.map(name).mean(axis=1) for name in ("irradiance_raw", "irradiance"))
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def changes(
-    atlas: Atlas, raw: Array, filtered: Array, scored: Array, contact: Array
+    atlas: AssetMaps, raw: Array, filtered: Array, scored: Array, contact: Array
 ) -> dict[str, Any]:
     """Relative changes of S (T,) by the filter."""
     area, owner = atlas.texels.area.astype(np.float64), atlas.texels.object_index()
@@ -93,14 +93,14 @@ def changes(
 
 
 def errors(
-    atlas: Atlas, raw: Array, filtered: Array, scored: Array, contact: Array, share: int
+    atlas: AssetMaps, raw: Array, filtered: Array, scored: Array, contact: Array, share: int
 ) -> dict[str, Any]:
     """Relative errors of S raw and filtered against a converged S of the same light."""
     order, patch = tiles_of_texels(atlas.texels)
     keep = patch % share == 0
     order, patch = order[keep], patch[keep]
     position, normal = atlas.texels.position[order], atlas.texels.normal[order]
-    lit = lit_scene(atlas, black_environment())
+    lit = atlas.lit_scene(black_environment())
     reference = irradiance_at(
         lit.rays, lit.radiance, lit.lights, lit.environment, position, normal, patch, REFERENCE,
         lit.size,

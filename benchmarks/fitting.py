@@ -24,9 +24,11 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.material import fit_objects
+from usdbrdf.material.fit_objects import ObjectFit
 from usdbrdf.material.fit_views import MIXTURE
 from usdbrdf.model.capture import Frames
-from usdbrdf.tasks import fit, fit_objects
+from usdbrdf.tasks import fit
 from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.lobe_radiance import LOBE_ALPHAS, Mixture
 
@@ -51,7 +53,7 @@ class Fitted:
     """One object: time, what was found, and the record that would be published."""
 
     spent: Spent
-    found: dict[str, np.ndarray]
+    found: ObjectFit
     record: Any
 
 
@@ -73,22 +75,22 @@ def fitted(
     """Time of the pass over the frames, and each object by its label."""
     frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
     options = fit_objects.FitOptions(seed=seed)
-    survey, surveying = timed(
-        lambda: fit_objects.survey_frames(NoCheckpoints(), lit.atlas, lit.scene, frames, options)
-    )
+    texels, usable = lit.atlas.texels, lit.atlas.coverage.measured & ~lit.atlas.emissive
+    given = NoCheckpoints(), lit.scene, texels, usable, frames, options
+    survey, surveying = timed(lambda: fit_objects.survey_frames(*given))
     chosen = np.unique(survey.observations.texel)[:: effort.of_texels]
     kept = np.flatnonzero(np.isin(survey.observations.texel, chosen))
     survey = replace(survey, observations=survey.observations.take(kept))
 
-    def fit_one(i: int) -> dict[str, np.ndarray]:
-        texels, mixture = lit.atlas.texels, effort.mixture
+    def fit_one(i: int) -> ObjectFit:
+        mixture = effort.mixture
         return fit_objects.fit_object(lit.scene, texels, frames, survey, i, options, mixture)
 
     fit_one(0)  # compiles
     objects = {}
     for i, obj in enumerate(lit.atlas.scene.objects[:most]):
         found, used = timed(lambda i=i: fit_one(i))
-        objects[obj.label] = Fitted(used, found, fit._record(lit.scene, i, found, options, True))
+        objects[obj.label] = Fitted(used, found, fit._record(obj, found.rounded(), options, True))
     return surveying, objects
 
 
@@ -109,10 +111,10 @@ def rays_per_sample(mixture: Mixture = MIXTURE) -> int:
 def measure(asset: Path, quick: bool) -> dict[str, Any]:
     surveying, objects = fitted(lit_asset(asset), asset, 6 if quick else None)
     # Objects without observations, as lamps, take no time and would flatter the mean.
-    used = {label: one for label, one in objects.items() if np.isfinite(one.found["numbers"][0])}
+    used = {label: one for label, one in objects.items() if np.isfinite(one.found.phi)}
     cpu = [one.spent.cpu for one in used.values()]
     wall = [one.spent.wall for one in used.values()]
-    samples = [int(one.found["used"]) for one in used.values()]
+    samples = [one.found.num_samples for one in used.values()]
     per_sample = rays_per_sample()
     return {
         "asset": {"objects": len(objects), "fitted": len(used)},
@@ -125,7 +127,7 @@ def measure(asset: Path, quick: bool) -> dict[str, Any]:
             "wall": {"mean": float(np.mean(wall)), "largest": max(wall)},
         },
         "objects": {
-            label: {"samples": int(one.found["used"]), **one.spent._asdict()}
+            label: {"samples": one.found.num_samples, **one.spent._asdict()}
             for label, one in used.items()
         },
         "figures": [

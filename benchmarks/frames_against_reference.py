@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.model.capture import Frames
+from usdbrdf.options import IngestOptions
 from usdbrdf.relighting.render import pinhole
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))

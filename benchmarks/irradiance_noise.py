@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from measure import Lit, timed
 
-from usdbrdf.tasks.trace import denoised_irradiance
+from usdbrdf.options import Sampling
+from usdbrdf.shading.irradiance_map import denoised_irradiance
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.denoise import OIDN, chosen_filter
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 
 PAPERS_RAYS = 10_000
 COUNTS = (16, 32, 64, 100, 128)

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
-from usdbrdf.tasks.lit import lit_scene
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene
 
@@ -81,13 +80,13 @@ def table(figures: Sequence[dict]) -> str:
 class Lit(NamedTuple):
     """An asset as shading sees it."""
 
-    atlas: Atlas
+    atlas: AssetMaps
     scene: LitScene
 
 
 def lit_asset(folder: Path) -> Lit:
-    atlas = atlas_from_stage(open_measured(Asset.at(folder)))
-    return Lit(atlas, lit_scene(atlas, black_environment()))
+    atlas = AssetMaps(open_measured(Asset.at(folder)))
+    return Lit(atlas, atlas.lit_scene(black_environment()))
 
 
 def saved_plot(drawing: Any, path: Path) -> Path:

@@ -187,7 +187,7 @@ def our_efforts(
 
 
 def parameters(objects: dict[str, Fitted]) -> dict[str, list[float]]:
-    return {name: one.found["numbers"][:2].tolist() for name, one in objects.items()}
+    return {name: [one.found.phi, one.found.psi] for name, one in objects.items()}
 
 
 def stored_course(path: Path, diffuse: str) -> Course:

@@ -93,12 +93,12 @@ def converted(size: Size, folder: Path) -> dict[str, Any]:
 
 
 def found(asset: Asset) -> dict[str, int]:
+    from usdbrdf.asset.maps import AssetMaps
     from usdbrdf.asset.readers.compose import open_measured
     from usdbrdf.asset.readers.frames import frames_from_stage
-    from usdbrdf.tasks.atlas import atlas_from_stage
 
     stage = open_measured(asset)
-    atlas = atlas_from_stage(stage)
+    atlas = AssetMaps(stage)
     return {
         "texels": len(atlas.texels),
         "triangles": len(atlas.scene.triangles),

@@ -45,10 +45,11 @@ from measure import (
 )
 
 import usdbrdf  # noqa: F401  (registers the schemas)
+from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.cosine_sampling import cosine_directions, frames_of
 from usdbrdf.transport.embree import closest_hits, closest_hits_of_groups, empty_hits
-from usdbrdf.transport.irradiance import Sampling, tiles_of_texels, whole_tiles
+from usdbrdf.transport.irradiance import tiles_of_texels, whole_tiles
 from usdbrdf.transport.light_sampling import (
     Met,
     Receivers,

@@ -31,11 +31,11 @@ from measure import figure
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.files.frames import read_frame
 from usdbrdf.model.capture import Frames
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.observe import Observation, radiance_from_frames
 from usdbrdf.texturing.samples import MIN_COSINE, SAMPLE, first_surfaces, samples_of_texels
@@ -65,7 +65,7 @@ def main() -> int:
 def measure(asset: Path, most: int | None) -> dict[str, Any]:
     """All figures, of the first ``most`` frames."""
     stage = open_measured(Asset.at(asset))
-    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
     count = min(most or len(frames), len(frames))
     rays = RayScene(atlas.scene.points, atlas.scene.triangles)
     streamed(atlas, rays, frames, Observation.empty(len(atlas.texels)), 2)  # compiles
@@ -113,7 +113,7 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def streamed(
-    atlas: Atlas, rays: RayScene, frames: Frames, observed: Observation, count: int
+    atlas: AssetMaps, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
     steps = radiance_from_frames(atlas.texels, atlas.scene, rays, frames, observed, QUANTILE)
@@ -125,7 +125,7 @@ def streamed(
 
 
 def by_parts(
-    atlas: Atlas, rays: RayScene, frames: Frames, count: int
+    atlas: AssetMaps, rays: RayScene, frames: Frames, count: int
 ) -> tuple[dict[str, float], list[tuple[np.ndarray, np.ndarray]]]:
     """CPU seconds of each part, one after the other; and every frame's texels and radiances."""
     spent: dict[str, float] = defaultdict(float)

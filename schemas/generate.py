@@ -93,7 +93,7 @@ def _class(schema: Schema, facts: Sequence[Fact]) -> str:
     lines = [
         f'class "{schema.identifier}" (',
         "    inherits = </APISchemaBase>",
-        f'    doc = """{schema.doc}"""',
+        f'    doc = """{_line(schema.doc)}"""',
         "    customData = {",
         f'        string className = "{schema.name}API"',
         f'        token apiSchemaType = "{kind}"',
@@ -114,10 +114,14 @@ def _attribute(fact: Fact) -> list[str]:
     tokens = [f"        allowedTokens = {json.dumps(fact.tokens)}"] if fact.tokens else []
     return [
         f"    {uniform}{fact.type} {name} = {_literal(fact)} (",
-        f'        doc = """{fact.documentation}"""',
+        f'        doc = """{_line(fact.doc)}"""',
         *tokens,
         "    )",
     ]
+
+
+def _line(doc: str) -> str:
+    return " ".join(doc.split())
 
 
 def _literal(fact: Fact) -> str:
@@ -147,10 +151,10 @@ def _document(generated: Sdf.Layer) -> None:
     """Restore the documentation, of which the generator keeps the first sentences in customData,
     where applications do not look for it."""
     for schema in SCHEMAS:
-        generated.GetPrimAtPath(f"/{schema.identifier}").documentation = schema.doc
+        generated.GetPrimAtPath(f"/{schema.identifier}").documentation = _line(schema.doc)
     for name, fact in facts_by_attribute().items():
         path = f"/{fact.schema.identifier}.{name}"
-        generated.GetAttributeAtPath(path).documentation = fact.documentation
+        generated.GetAttributeAtPath(path).documentation = _line(fact.doc)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,43 @@
-"""What many tests start from, and what none may leave behind for the next."""
+"""What many tests start from, what none may leave behind for the next, and which take long."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from tests.synthetic_asset import box, build, make_scan
 from usdbrdf.job.progress import set_quiet
+
+# Files and folders whose tests run the pipeline, kill processes, start other programs or fit
+# materials; `pytest -m "not slow"` leaves them out.
+SLOW = (
+    "dcc",
+    "evaluation/test_compare.py",
+    "evaluation/test_evaluate.py",
+    "faults/test_kill_resume.py",
+    "job/test_kill_resume.py",
+    "material/test_fit_lobe.py",
+    "nondestruction",
+    "physics/test_recovery.py",
+    "plugins",
+    "shading/test_denoise.py",
+    "shading/test_denoise_default.py",
+    "tasks/test_refine.py",
+    "test_cli.py",
+    "test_convert.py",
+    "test_identity.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is slow."""
+    here = Path(__file__).parent
+    for item in items:
+        place = item.path.relative_to(here).as_posix()
+        if any(place == slow or place.startswith(f"{slow}/") for slow in SLOW):
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(autouse=True)

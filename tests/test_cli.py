@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.scenes import make_capture
-from usdbrdf import cli
+from usdbrdf import pipeline
+from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import Adapter
 from usdbrdf.cli import main
 from usdbrdf.job.lock import folder_lock
@@ -296,7 +297,7 @@ def test_adapters_are_listed_one_per_line(monkeypatch, capsys):
     assert err == ""
 
     broken = Adapter(name="bad", description="", origin="p.m", module=None, problem="no\nread")
-    monkeypatch.setattr(cli, "list_adapters", lambda: (broken,))
+    monkeypatch.setattr(adapters, "list_adapters", lambda: (broken,))
     main(["adapters"])
     assert capsys.readouterr().out == "bad  broken: no read (p.m)\n"
 
@@ -405,7 +406,7 @@ def test_signals(number, status, capture, tmp_path, monkeypatch, capsys):
     def killed(*_arguments, **_options):
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(cli, "ingest", killed)
+    monkeypatch.setattr(pipeline, "ingest", killed)
     # What starts in the background inherits an interrupt that is ignored.
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -446,7 +447,7 @@ def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys)
     def broken(*_arguments, **_options):
         raise ZeroDivisionError("oops")
 
-    monkeypatch.setattr(cli, "ingest", broken)
+    monkeypatch.setattr(pipeline, "ingest", broken)
     assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == 1
     err = capsys.readouterr().err
     assert "Traceback" in err

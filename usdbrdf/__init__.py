@@ -1,26 +1,94 @@
-"""usdbrdf: measured materials for captured rooms and objects, as non-destructive USD layers."""
+"""usdbrdf: measured materials for captured rooms and objects, as non-destructive USD layers.
 
-from usdbrdf.asset.schema import register as _register
+What is named below is loaded when it is first used. ``import usdbrdf`` alone loads nothing, and
+makes OpenUSD know the schemas, whether that is loaded before or afterwards.
+"""
 
-_register()
+from __future__ import annotations
 
-from usdbrdf.capture.ingest_options import IngestOptions as IngestOptions  # noqa: E402
-from usdbrdf.delivery.package import PackageOptions as PackageOptions  # noqa: E402
-from usdbrdf.delivery.package import package as package  # noqa: E402
-from usdbrdf.evaluation.compare_assets import compare as compare  # noqa: E402
-from usdbrdf.evaluation.evaluate_views import EvaluateOptions as EvaluateOptions  # noqa: E402
-from usdbrdf.evaluation.evaluate_views import evaluate as evaluate  # noqa: E402
-from usdbrdf.pipeline import ConvertOptions as ConvertOptions  # noqa: E402
-from usdbrdf.pipeline import convert as convert  # noqa: E402
-from usdbrdf.pipeline import working_on as working_on  # noqa: E402
-from usdbrdf.relighting.insert import Insert as Insert  # noqa: E402
-from usdbrdf.relighting.relight import RelightOptions as RelightOptions  # noqa: E402
-from usdbrdf.relighting.relight import relight as relight  # noqa: E402
-from usdbrdf.tasks.fit import fit as fit  # noqa: E402
-from usdbrdf.tasks.fit_objects import FitOptions as FitOptions  # noqa: E402
-from usdbrdf.tasks.ingest import ingest as ingest  # noqa: E402
-from usdbrdf.tasks.shade import ShadeOptions as ShadeOptions  # noqa: E402
-from usdbrdf.tasks.shade import shade as shade  # noqa: E402
-from usdbrdf.tasks.texture import TextureOptions as TextureOptions  # noqa: E402
-from usdbrdf.tasks.texture import texture as texture  # noqa: E402
-from usdbrdf.transport.irradiance import Sampling as Sampling  # noqa: E402
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+
+    from usdbrdf.delivery.package import package as package
+    from usdbrdf.evaluation.compare_assets import compare as compare
+    from usdbrdf.evaluation.evaluate_views import evaluate as evaluate
+    from usdbrdf.options import ConvertOptions as ConvertOptions
+    from usdbrdf.options import EvaluateOptions as EvaluateOptions
+    from usdbrdf.options import FitOptions as FitOptions
+    from usdbrdf.options import IngestOptions as IngestOptions
+    from usdbrdf.options import Insert as Insert
+    from usdbrdf.options import PackageOptions as PackageOptions
+    from usdbrdf.options import RelightOptions as RelightOptions
+    from usdbrdf.options import Sampling as Sampling
+    from usdbrdf.options import ShadeOptions as ShadeOptions
+    from usdbrdf.options import TextureOptions as TextureOptions
+    from usdbrdf.pipeline import convert as convert
+    from usdbrdf.pipeline import fit as fit
+    from usdbrdf.pipeline import ingest as ingest
+    from usdbrdf.pipeline import shade as shade
+    from usdbrdf.pipeline import texture as texture
+    from usdbrdf.pipeline import working_on as working_on
+    from usdbrdf.relighting.relight import relight as relight
+
+_HOMES = {
+    "usdbrdf.options": (
+        *("ConvertOptions", "EvaluateOptions", "FitOptions", "IngestOptions", "Insert"),
+        *("PackageOptions", "RelightOptions", "Sampling", "ShadeOptions", "TextureOptions"),
+    ),
+    "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
+    "usdbrdf.delivery.package": ("package",),
+    "usdbrdf.evaluation.compare_assets": ("compare",),
+    "usdbrdf.evaluation.evaluate_views": ("evaluate",),
+    "usdbrdf.relighting.relight": ("relight",),
+}
+
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})
+
+
+class _WithUsd:
+    """Finds ``pxr.Usd`` in its usual place, and has the schemas registered as soon as it is loaded:
+    before anybody can ask USD's schema registry, and with it build it."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None, /
+    ) -> ModuleSpec | None:
+        if name != "pxr.Usd":
+            return None
+        sys.meta_path.remove(self)
+        from importlib.util import find_spec
+
+        spec = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            loader: Any = spec.loader
+            load = loader.exec_module
+
+            def exec_module(module: ModuleType) -> None:
+                load(module)
+                import_module("usdbrdf.asset")
+
+            loader.exec_module = exec_module
+        return spec
+
+
+if "pxr.Usd" in sys.modules:
+    import_module("usdbrdf.asset")
+else:
+    sys.meta_path.insert(0, _WithUsd())

@@ -1,18 +1,29 @@
-"""The commands of ``usdbrdf``, and which options each of them has."""
+"""Command lines from option classes: their fields are read by cyclopts, and told in help.
+
+A command is a class of options whose ``run`` does the work and whose docstring says what that is.
+An option that several classes in it have is given once, and reaches all of them.
+"""
 
 from __future__ import annotations
 
-import argparse
+import ast
+import inspect
+import math
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NamedTuple, get_origin
+
+from cyclopts import App, CycloptsError, Parameter
 
 from usdbrdf import options
-from usdbrdf.delivery.command_options import add_package_options
-from usdbrdf.errors import UsageError
-from usdbrdf.evaluation.command_options import add_compare_options, add_evaluate_options
-from usdbrdf.fit_options import add_fit_options
-from usdbrdf.job.stamp import code_version
-from usdbrdf.relighting.command_options import add_relight_options
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.options import REQUIRED, Insert, Option, OptionField, Options, option_fields
 
 EXIT_CODES = """exit codes:
   0 done   1 a defect of usdbrdf   2 wrong options   3 input refused (do not retry)
@@ -20,123 +31,267 @@ EXIT_CODES = """exit codes:
   6 asset folder is not ours, or files of ours were edited by hand   7 validate found errors
   130 interrupted   143 terminated"""
 
-# command -> (its steps, what it does)
-_STEP_COMMANDS = {
-    "convert": ("ingest texture shade fit", "do all four steps: capture in, USD asset out"),
-    "ingest": ("ingest", "read a capture into the layer scan.usdc"),
-    "texture": ("texture", "project the frames: lit diffuse radiance L_d per texel"),
-    "shade": ("shade", "trace irradiance S, divide for albedo, find the emitters"),
-    "fit": ("fit", "fit roughness and specular of each object"),
-}
+_INSERT_KEYS = {item.option.name: item for item in option_fields(Insert) if item.option}
 
 
-def command_parser() -> argparse.ArgumentParser:
-    """Its namespaces have ``command``; those of commands that run steps also ``steps``."""
-    parser = _Parser(
-        prog="usdbrdf",
-        description="Captured rooms and objects into USD assets with measured materials.",
-        epilog=EXIT_CODES,
-        formatter_class=_HelpFormatter,
+class Command(Options):
+    """What a command takes; its subclasses are dataclasses too."""
+
+    def run(self) -> int:
+        """Do it; returns the exit code."""
+        raise NotImplementedError
+
+
+Commands = Mapping[str, type[Command]]
+
+
+def parsed(arguments: Sequence[str], commands: Commands) -> Command:
+    """The command that is asked for, its options checked.
+
+    Raises UsageError, and InputRefused for files that are not there.
+    """
+    name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
+    if name not in commands:
+        raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
+    app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
+    app.default(_signed(commands[name]))
+    try:
+        _, given, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        found = " ".join(str(error).split()).rstrip(".")
+        raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
+    command: Command = _made(commands[name], given.arguments)
+    return command
+
+
+class _Said(NamedTuple):
+    """An option, the field that it becomes, that field's class, and the title in help."""
+
+    option: Option
+    field: OptionField
+    owner: type[Options]
+    title: str
+
+
+def _all_said(owner: type[Options], title: str = "") -> Iterator[_Said]:
+    for field in option_fields(owner):
+        if field.option is None:
+            yield from _all_said(field.kind, title or field.name.removeprefix("options"))
+        else:
+            yield _Said(field.option, field, owner, field.option.shared or title)
+
+
+def _said(owner: type[Options]) -> list[_Said]:
+    """All that can be said to a command, each once, what has no name first."""
+    found: dict[str, _Said] = {}
+    for said in _all_said(owner):
+        found.setdefault(said.option.name, said)
+    return sorted(found.values(), key=lambda said: not said.option.placed)
+
+
+def _key(option: Option) -> str:
+    return option.name.strip("-").replace("-", "_").lower()
+
+
+def _made(owner: type[Any], given: Mapping[str, Any]) -> Any:
+    """An object of an option class and of those in it; what is not given is its default."""
+    known = {}
+    for field in option_fields(owner):
+        if field.option is None:
+            known[field.name] = _made(field.kind, given)
+        elif (key := _key(field.option)) in given:
+            # A flag says the opposite of the default.
+            flag = field.kind is bool
+            known[field.name] = given[key] is not field.default if flag else given[key]
+    return owner(**known)
+
+
+def _signed(owner: type[Options]) -> Any:
+    """A function with the arguments of a command, for cyclopts to bind to."""
+
+    def command() -> None: ...
+
+    signed: Any = command
+    signed.__signature__ = inspect.Signature([_argument(*said) for said in _said(owner)])
+    return signed
+
+
+def _argument(option: Option, field: OptionField, *_: Any) -> inspect.Parameter:
+    kind, several = field.kind, get_origin(field.kind) is tuple
+
+    def read(_kind: Any, tokens: Any) -> Any:
+        return _value(field, option, [(token.index, token.value) for token in tokens])
+
+    parameter = Parameter(
+        name=option.names,
+        converter=None if kind is bool or field.choices else read,
+        negative=(),
+        allow_repeating=True,
+        json_list=False,
+        consume_multiple=(1, None) if kind == tuple[Insert, ...] else None,
     )
-    parser.add_argument("--version", action="version", version=f"usdbrdf {code_version()}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    return inspect.Parameter(
+        _key(option),
+        inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if field.default is REQUIRED else None,
+        annotation=Annotated[list[str] if several else kind, parameter],
+    )
 
-    def command(name: str, text: str) -> argparse.ArgumentParser:
-        added = commands.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=EXIT_CODES,
-            formatter_class=_HelpFormatter,
+
+def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> Any:
+    """What the words after an option mean, each with its number after that occurrence of it."""
+    if field.kind == tuple[Path, ...]:
+        return tuple(_path(word) for _, word in words)
+    if field.kind == tuple[Insert, ...]:
+        inserts: list[list[str]] = []
+        for number, word in words:
+            inserts = [*inserts, [word]] if number == 0 else [*inserts[:-1], [*inserts[-1], word]]
+        return tuple(_insert(*insert) for insert in inserts)
+    text = words[-1][1]
+    if text == option.none:
+        return None
+    if option.file and not Path(text).is_file():
+        # Said before any work is done; an input that is not there is refused as a capture would be.
+        raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")
+    return _checked(field, text, f"{option.name} {text}")
+
+
+def _checked(field: OptionField, text: str, subject: str) -> Any:
+    value: Any = text
+    counts = field.option.counts if field.option else ()
+    try:
+        if field.kind in (int, float):
+            value = field.kind(text)
+        elif counts:
+            value = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        value = () if counts else math.nan  # which are refused
+    field.check(value, subject)
+    return _path(text) if field.kind is Path else value
+
+
+def _path(text: str) -> Path:
+    try:
+        os.path.realpath(text).encode()
+    except UnicodeEncodeError as error:
+        raise UsageError(
+            f"{text}: the name of this file, or of a folder above it, is not UTF-8, as USD asks of "
+            "all names. Rename it. [usage.path]"
+        ) from error
+    return Path(text)
+
+
+def _insert(model: str, *settings: str) -> Insert:
+    """MODEL KEY=VALUE ..., as typed."""
+    known: dict[str, Any] = {"model": _path(model)}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or key not in _INSERT_KEYS:
+            keys = ", ".join(f"{key}=" for key in _INSERT_KEYS)
+            raise UsageError(f"--insert {model}: {setting!r} is none of {keys}. [relight.insert]")
+        field = _INSERT_KEYS[key]
+        subject = f"--insert {model}: {setting}"
+        known[field.name] = _matrix(text) if key == "matrix" else _checked(field, text, subject)
+    return Insert(**known)
+
+
+def _matrix(text: str) -> Any:
+    """(4, 4) float64, world from model."""
+    import numpy as np
+
+    path = Path(text)
+    if not path.is_file():
+        raise InputRefused(f"{path}: no such file. Check the path. [usage.file]")
+    try:
+        matrix = np.loadtxt(path).reshape(4, 4)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputRefused(
+            f"{path}: expected 4 rows of 4 numbers, world from model. Correct it. [relight.matrix]"
+        ) from error
+    singular = abs(np.linalg.det(matrix[:3, :3])) < 1e-12
+    if not np.isfinite(matrix).all() or singular or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputRefused(
+            f"{path}: no invertible affine matrix; its last row must be 0 0 0 1. Correct it. "
+            "[relight.matrix]"
         )
-        added.set_defaults(command=name)
-        return added
-
-    for name, (steps, text) in _STEP_COMMANDS.items():
-        _add_step_arguments(command(name, text), steps.split())
-    views = command("evaluate", "render views and compare them with photographs")
-    options.add_talk_options(views)
-    options.add_light_options(views)
-    add_evaluate_options(views)
-    pair = command("compare", "compare two assets of one scene, lit differently")
-    options.add_talk_options(pair)
-    add_compare_options(pair)
-    relit = command("relight", "path trace the published asset in its own or in other light")
-    options.add_talk_options(relit)
-    add_relight_options(relit)
-    packed = command("package", "write the asset as one file: .usdz or .glb")
-    options.add_talk_options(packed)
-    add_package_options(packed)
-    check = command("validate", "check an asset by our rules and those of USD")
-    check.add_argument("asset", type=Path, metavar="ASSET", help="asset folder")
-    check.add_argument(
-        "--fix",
-        type=Path,
-        metavar="LAYER",
-        help="write what can be cured beyond doubt into a new layer, such as ASSET/fixes.usda, "
-        "for you to add in front of edits.usda",
-    )
-    rules = command("rules", "list what validate looks for")
-    rules.add_argument("--json", action="store_true", help="with descriptions, as JSON")
-    command("adapters", "list the capture formats that can be read")
-    plugins = command("plugin-path", "print what to put into PXR_PLUGINPATH_NAME")
-    plugins.add_argument(
-        "--schemas",
-        action="store_true",
-        help="without the validators, for applications whose Python has no usdbrdf: USD reports an "
-        "error there when all validators are asked for",
-    )
-    return parser
+    return matrix
 
 
-def _add_step_arguments(parser: argparse.ArgumentParser, steps: list[str]) -> None:
-    parser.set_defaults(steps=steps)
-    add = parser.add_argument
-    if "ingest" in steps:
-        add("capture", type=Path, metavar="SCAN", help="capture folder or its main file")
-        add(
-            "-o",
-            "--output",
-            type=Path,
-            required=True,
-            metavar="ASSET",
-            help="asset folder, made if it is not there",
-        )
-    else:
-        add("output", type=Path, metavar="ASSET", help="asset folder made by ingest")
-    options.add_run_options(parser)
-    if "texture" in steps or "fit" in steps:
-        options.add_memory_option(parser)
-    if len(steps) > 1:
-        options.add_edit_options(parser)
-    if "ingest" in steps:
-        options.add_ingest_options(parser)
-    if "texture" in steps:
-        options.add_texture_options(parser)
-    if "shade" in steps:
-        options.add_shade_options(parser)
-    if "fit" in steps:
-        add_fit_options(parser)
-    if "shade" in steps or "fit" in steps:
-        options.add_light_options(parser)
+# Help
 
 
-class _Parser(argparse.ArgumentParser):
-    """Refuses wrong options with one sentence, by an exception; takes no abbreviations, which a
-    later version might have to read differently."""
+def help_text(arguments: Sequence[str], commands: Commands) -> str | None:
+    """The page that is asked for with --help or -h, of the program or of one of its commands, or
+    None."""
+    options_end = arguments.index("--") if "--" in arguments else len(arguments)
+    if not {"-h", "--help"} & set(arguments[:options_end]):
+        return None
+    title, entries = "commands", [(name, _about(owner)) for name, owner in commands.items()]
+    tables = {title: entries, "options": [("--version", "print the version")]}
+    usage, about = "COMMAND", "captured rooms and objects into USD assets with measured materials"
+    if (usage_of := arguments[0]) in commands:
+        owner, tables = commands[usage_of], {"options": []}
+        about = _about(owner)
+        needed = [said.option for said in _said(owner) if said.field.default is REQUIRED]
+        usage = " ".join((usage_of, *(f"{o.names[0]} {o.unit}".strip() for o in needed)))
+        for said in _said(owner):
+            tables.setdefault(said.title or "options", []).append(_entry(said))
+    tables["options"].append(("-h, --help", "print this"))
+    text = f"usage: usdbrdf {usage} [options]\n\n{about[0].upper()}{about[1:]}.\n\n"
+    return text + "".join(map(_table, tables, tables.values())) + EXIT_CODES
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **{**kwargs, "allow_abbrev": False})
 
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message}. See {self.prog} --help. [usage.option]")
+def _about(owner: type[Command]) -> str:
+    text = (owner.__doc__ or "").strip().rstrip(".")
+    return text[0].lower() + text[1:]
 
 
-class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults; leaves the epilog as it was written."""
+def _entry(said: _Said) -> tuple[str, str]:
+    option, field, owner, _ = said
+    unit = "{" + ",".join(field.choices) + "}" if field.choices else option.unit
+    text = option.help or _meaning(owner, field.name)
+    if field.kind == tuple[Insert, ...]:
+        keys = [(f"{k}={i.option.unit}", i.name) for k, i in _INSERT_KEYS.items() if i.option]
+        text += " " + "; ".join(f"{key}: {_meaning(Insert, name)}" for key, name in keys)
+    default = option.unset
+    if not default and not isinstance(field.default, bool):
+        default = "" if field.default in (REQUIRED, None, ()) else str(field.default)
+    text += f" (default: {default})" if default else ""
+    return f"{', '.join(option.names)} {unit}".rstrip(), text
 
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        told = action.default is None or action.default is False or action.default == []
-        if told or action.const is not None:
-            return action.help
-        return super()._get_help_string(action)
+
+def _meaning(owner: type[Options], name: str) -> str:
+    """Of a field: what the string below it says."""
+    classes = (base for base in owner.__mro__ if name in _meanings(base.__module__, base.__name__))
+    base = next(classes)
+    return _meanings(base.__module__, base.__name__)[name].format_map(vars(options))
+
+
+@cache
+def _meanings(module: str, owner: str) -> dict[str, str]:
+    found = {}
+    for statement in _source(module):
+        if isinstance(statement, ast.ClassDef) and statement.name == owner:
+            for field, below in pairwise(statement.body):
+                if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+                    text = ast.literal_eval(below.value)
+                    found[ast.unparse(field.target)] = " ".join(text.split())
+    return found
+
+
+@cache
+def _source(module: str) -> list[ast.stmt]:
+    return ast.parse(inspect.getsource(sys.modules[module])).body if module != "builtins" else []
+
+
+def _table(title: str, entries: Sequence[tuple[str, str]]) -> str:
+    column, width = 24, max(min(shutil.get_terminal_size().columns, 100), 48)
+    lines = [f"{title}:"]
+    for names, text in entries:
+        start = f"  {names}  ".ljust(column)
+        if len(start) > column:
+            lines.append(start.rstrip())
+            start = " " * column
+        wrapped = textwrap.wrap(text, width - column)
+        lines += [(" " * column if i else start) + line for i, line in enumerate(wrapped)]
+    return "\n".join(lines) + "\n\n"

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import numba
 
+from usdbrdf.kernel_cache import KernelCache
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # One kernel at a time runs on all cores: numba's own pool of threads, which is all that some
@@ -21,14 +23,13 @@ _turn = threading.Lock()
 
 def kernel(function: F) -> F:
     """Compile for one thread; may be called from other kernels."""
-    compiled: F = numba.njit(cache=True)(function)
-    return compiled
+    return _compiled(function)
 
 
 def parallel_kernel(function: F) -> F:
     """Compile with ``prange`` over all cores. Every iteration writes to places of its own, so that
     the result does not depend on the number of threads."""
-    compiled = numba.njit(cache=True, parallel=True)(function)
+    compiled = _compiled(function, parallel=True)
 
     @functools.wraps(function)
     def in_turn(*arguments: Any, **named: Any) -> Any:
@@ -42,5 +43,12 @@ def parallel_kernel(function: F) -> F:
 def loop(function: F) -> F:
     """Compile for one thread, without Python's lock. Divisions by 0 give infinities instead of
     exceptions: the test for them would keep a loop from using vector instructions."""
-    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    return _compiled(function, nogil=True, error_model="numpy")
+
+
+def _compiled(function: F, **options: Any) -> F:
+    compiled: Any = numba.njit(**options)(function)
+    if not numba.config.DISABLE_JIT:
+        compiled._cache = KernelCache(function)
+    result: F = compiled
+    return result

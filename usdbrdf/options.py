@@ -1,285 +1,450 @@
-"""What can be said on the command line: every option's name, unit and default, and the frozen
-option values of the steps that they become.
+"""Every option of the program, said once: name, unit, default, limits and, below it, its meaning.
 
-An option that several commands have is defined once, so it means the same everywhere.
+The frozen dataclasses are what the Python API takes; the command line and its help are made of them
+(``command_parser``). A value out of its limits is refused when they are made, by a UsageError.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import get_type_hints as resolved_types
 
-from usdbrdf.capture.ingest_options import IngestOptions
-from usdbrdf.errors import InputRefused
-from usdbrdf.tasks.shade import ShadeOptions
-from usdbrdf.tasks.texture import TextureOptions
-from usdbrdf.transport.denoise import CHOICES
-from usdbrdf.transport.irradiance import Sampling
+from usdbrdf import calibration
+from usdbrdf.errors import UsageError
 
-# The paper's number of independent directions per texel.
-_COSINE_RAYS = 10_000
+if TYPE_CHECKING:
+    from usdbrdf.model.arrays import Double
+else:
+    Double = Any  # its module loads NumPy, for which no list of options has to wait
+
+T = TypeVar("T")
+
+REQUIRED: Any = MISSING
+
+_COUNT = (1, 2**31 - 1)
+
+# Metres, or metres per unit: from an atom's size to more than the Earth's.
+_LENGTH = (1e-10, 1e10)
 
 
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """Options of every command that writes into an asset folder."""
-    add_talk_options(parser)
-    add = parser.add_argument
-    add(
-        "--wait",
-        type=finite_number,
-        default=0.0,
-        metavar="S",
-        help="wait up to this many seconds for a busy asset folder",
+class Option(NamedTuple):
+    """What is known of a field beside its type, its default and its meaning."""
+
+    names: tuple[str, ...]  # such as -o and --output; one word for what needs no name
+    unit: str  # of the value, or what kind of thing it is; "" for flags and choices
+    limits: tuple[float, float]  # of a number, both allowed
+    unset: str = ""  # what None, the default, amounts to
+    counts: tuple[int, ...] = ()  # how many numbers make up a value
+    file: bool = False  # a file must lie there before any work begins
+    none: str = ""  # the word for None on the command line
+    shared: str = ""  # title in help, of what several tasks have
+    help: str = ""  # its meaning, if that is not below the field
+
+    @property
+    def name(self) -> str:
+        return self.names[-1]
+
+    @property
+    def placed(self) -> bool:
+        """Whether it is told by its place, without a name."""
+        return not self.name.startswith("-")
+
+
+def option(said: str, default: T, limits: Any = (-math.inf, math.inf), **more: Any) -> T:
+    """A dataclass field with an ``Option``; ``said`` holds its names and its unit."""
+    words = said.split()
+    names = tuple(word for word in words if word.startswith("-")) or tuple(words[:1])
+    told = Option(names, " ".join(words[len(names) :]), limits, **more)
+    return field(default=default, metadata={"option": told})
+
+
+class OptionField(NamedTuple):
+    """A field of an option class: its type without None, and its option; without option, ``kind``
+    is an option class too."""
+
+    name: str
+    kind: Any
+    default: Any
+    option: Option | None
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        return get_args(self.kind) if get_origin(self.kind) is Literal else ()
+
+    def check(self, value: Any, subject: str) -> None:
+        """Raise UsageError for a value that is none of the choices or out of the limits."""
+        if value is None or self.option is None:
+            return
+        (low, high), counts = self.option.limits, self.option.counts
+        usable, expected = value in self.choices, ", ".join(self.choices)
+        if self.kind in (int, float) or counts:
+            numbers = value if counts else (value,)
+            usable = all(low <= n <= high and math.isfinite(n) for n in numbers)
+            usable &= not counts or len(numbers) in counts
+            expected = "a whole number" if self.kind is int else "a finite number"
+            expected = f"{' or '.join(map(str, counts))} finite numbers" if counts else expected
+            bounds = (("at least", low), ("at most", high))
+            told = [f"{word} {n:,}" for word, n in bounds if math.isfinite(n)]
+            expected += " of " * bool(told) + " and ".join(told)
+        elif not self.choices:
+            return
+        if not usable:
+            raise UsageError(f"{subject}: expected {expected}. [usage.option]")
+
+
+def option_fields(owner: type[Options]) -> list[OptionField]:
+    """All that can be said to an option class."""
+    types, found = resolved_types(owner), []
+    for item in fields(owner):
+        kind = types[item.name]
+        if get_origin(kind) in (Union, UnionType):
+            kind = next(part for part in get_args(kind) if part is not type(None))
+        found.append(OptionField(item.name, kind, item.default, item.metadata.get("option")))
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What option classes share: their values are checked when they are made."""
+
+    def __post_init__(self) -> None:
+        for item in option_fields(type(self)):
+            if item.option is not None:
+                value = getattr(self, item.name)
+                item.check(value, f"{item.option.name} {value}")
+
+
+# What several tasks or commands have.
+
+
+def _environment() -> Path | None:
+    text = "latitude-longitude picture of the surroundings, for rays that leave the scene"
+    more = {"file": True, "shared": "light transport", "help": text}
+    return option("--environment HDR", None, unset="black", **more)
+
+
+def _seed() -> int:
+    text = "seed of the random numbers"
+    return option("--seed N", 0, (0, 2**32 - 1), shared="light transport", help=text)
+
+
+def _memory() -> float | None:
+    """No result depends on it."""
+    text = (
+        "memory for texturing and for refining, which then take as many passes over the frames as "
+        "that asks for"
     )
-    parser.set_defaults(hand_edits="refuse")
+    more = {"unset": "three quarters of the machine's", "shared": "options", "help": text}
+    return option("--memory GIB", None, (1e-3, 2**20), **more)
 
 
-def add_talk_options(parser: argparse.ArgumentParser) -> None:
+def _allow_outside() -> tuple[Path, ...]:
+    text = "let the capture's documents name files in this folder too; may be given again"
+    return option("--allow-outside DIR", (), unset="none", help=text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TalkOptions(Options):
     """What is said while a command runs and at its end."""
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    parser.add_argument(
-        "--json", action="store_true", help="print a summary as JSON to stdout, nothing else"
-    )
+
+    quiet: bool = option("-q --quiet", False)
+    "print errors only"
+    json: bool = option("--json", False)
+    "print a summary as JSON to stdout, nothing else"
 
 
-def add_edit_options(parser: argparse.ArgumentParser) -> None:
-    """What to do about files of ours that somebody changed: only for the command that can write
-    all of them again."""
-    edits = parser.add_mutually_exclusive_group()
-    edits.add_argument(
-        "--adopt",
-        action="store_const",
-        const="adopt",
-        dest="hand_edits",
-        default="refuse",
-        help="keep changes made by hand to files of ours as adopted-N.usda; default: refuse to run",
-    )
-    edits.add_argument(
-        "--discard",
-        action="store_const",
-        const="discard",
-        dest="hand_edits",
-        help="drop changes made by hand to files of ours",
-    )
+HandEdits = Literal["refuse", "adopt", "discard"]
 
 
-def add_ingest_options(parser: argparse.ArgumentParser) -> None:
-    known = IngestOptions()
-    add = parser.add_argument_group("ingest").add_argument
-    add("--adapter", metavar="NAME", help="capture format; default: recognised by its content")
-    add("--no-plugins", action="store_true", help="use our own adapters only")
-    add("--mesh", type=existing_file, metavar="FILE", help="mesh; default: the capture's own")
-    add(
-        "--objects",
-        type=existing_file,
-        metavar="FILE",
-        help="object names; default: the capture's own",
-    )
-    add(
-        "--crease-angle",
-        type=finite_number,
-        default=known.crease_angle_deg,
-        metavar="DEG",
-        help="faces that meet at more degrees than this meet in a sharp edge",
-    )
-    add(
-        "--decimate",
-        type=int,
-        metavar="N",
-        help="reduce the mesh to about N triangles; default: keep all",
-    )
-    add(
-        "--min-component-area",
-        type=finite_number,
-        default=known.min_component_area_m2,
-        metavar="M2",
-        help="without labels, connected parts of at least this many m^2 become objects",
-    )
-    add(
-        "--assume-srgb",
-        action="store_true",
-        help="accept 8-bit photographs as sRGB; the result is then not radiometric",
-    )
-    add(
-        "--encoding",
-        metavar="NAME",
-        help="colour space of the images, e.g. lin_ap1_scene; default: as the format says",
-    )
-    add(
-        "--pose-scale",
-        type=finite_number,
-        metavar="S",
-        help="scale of the camera axes, to be divided out; default: 1, others are refused",
-    )
-    add(
-        "--max-nonfinite",
-        type=finite_number,
-        default=known.max_nonfinite,
-        metavar="SHARE",
-        help="drop a frame with a larger share of NaN or infinite pixels",
-    )
-    add(
-        "--allow-outside",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="let the capture name files in this folder too; may be given again; default: none",
-    )
-    add(
-        "--meters-per-unit",
-        type=finite_number,
-        metavar="M",
-        help="length of a scene unit in metres; default: as the format says",
-    )
-    add("--up-axis", choices=("Y", "Z"), help="axis that points up; default: as the format says")
+@dataclass(frozen=True, kw_only=True)
+class EditOptions(Options):
+    """What becomes of files of ours that somebody changed: only for the command that can write all
+    of them again."""
+
+    adopt: bool = option("--adopt", False)
+    "keep changes made by hand to files of ours as adopted-N.usda; default: refuse to run"
+    discard: bool = option("--discard", False)
+    "drop changes made by hand to files of ours"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.adopt and self.discard:
+            raise UsageError("--adopt, --discard: they exclude each other. [usage.option]")
+
+    @property
+    def hand_edits(self) -> HandEdits:
+        return "adopt" if self.adopt else "discard" if self.discard else "refuse"
 
 
-def add_texture_options(parser: argparse.ArgumentParser) -> None:
-    known = TextureOptions()
-    add = parser.add_argument_group("texture").add_argument
-    add(
-        "--texel-size",
-        type=finite_number,
-        metavar="M",
-        help="side of a texel in metres; default: the frames' median pixel footprint",
+# The four tasks.
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestOptions(Options):
+    """What a user may say about a capture that its files do not say; the same for every adapter."""
+
+    mesh: Path | None = option("--mesh FILE", None, unset="the capture's own", file=True)
+    "mesh, in any place"
+    objects: Path | None = option("--objects FILE", None, unset="the capture's own", file=True)
+    "object names (objects.json), in any place"
+    crease_angle_deg: float = option("--crease-angle DEG", 40.0, (0, 180))
+    "faces that meet at more degrees than this meet in a sharp edge"
+    decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")
+    "reduce the mesh to about N triangles"
+    min_component_area_m2: float = option("--min-component-area M2", 0.01)
+    "without labels, connected parts of at least this many m^2 become objects"
+    assume_srgb: bool = option("--assume-srgb", False)
+    "accept 8-bit photographs as sRGB; the result is then not radiometric"
+    encoding: str | None = option("--encoding NAME", None, unset="as the format says")
+    "colour space of the images by its OpenColorIO name, e.g. lin_ap1_scene"
+    pose_scale: float | None = option(
+        "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )
-    add(
-        "--quantile",
-        type=finite_number,
-        default=known.quantile,
-        metavar="P",
-        help="quantile of a texel's observations that becomes L_d, between 0 and 1",
+    "uniform scale of the camera axes, to be divided out; positions stay"
+    max_nonfinite: float = option("--max-nonfinite SHARE", 0.01, (0, 1))
+    "drop a frame with a larger share of NaN or infinite pixels"
+    allow_outside: tuple[Path, ...] = _allow_outside()
+    meters_per_unit: float | None = option(
+        "--meters-per-unit M", None, _LENGTH, unset="as the format says"
     )
-    add(
-        "--max-texels",
-        type=int,
-        default=known.max_texels,
-        metavar="N",
-        help="coarsen the default texel size so that the scene has at most N texels",
+    "length of a scene unit in metres"
+    up_axis: Literal["Y", "Z"] | None = option("--up-axis", None, unset="as the format says")
+    "axis that points up"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureOptions(Options):
+    """How frames become the lit diffuse texture L_d."""
+
+    texel_size: float | None = option(
+        "--texel-size M", None, (1e-6, 1e3), unset="the frames' median pixel footprint"
     )
+    "side of a texel in metres"
+    quantile: float = option("--quantile P", 0.5, (1e-6, 1 - 1e-6))
+    "quantile of a texel's observations that becomes L_d, between 0 and 1"
+    max_texels: int = option("--max-texels N", 1_000_000, _COUNT)
+    "coarsen the default texel size so that the scene has at most N texels"
+    memory: float | None = _memory()
 
 
-def add_memory_option(parser: argparse.ArgumentParser) -> None:
-    """Of the steps that read all frames."""
-    parser.add_argument(
-        "--memory",
-        type=finite_number,
-        metavar="GIB",
-        help="memory for texturing and for refining, which then take as many passes over the "
-        "frames as that asks for; default: three quarters of the machine's",
+# What the lightmap filter is given may have this many times the standard error asked for.
+BEFORE_FILTER = calibration.number("shade.before_filter")
+
+# Of "cosine": the paper's number of independent directions per texel.
+_RAYS = {"mis": 2048, "cosine": 10_000}
+
+_BY_ESTIMATOR: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling(Options):
+    """How irradiance S is estimated. "mis" doubles a tile's rays until its relative standard error
+    is small enough."""
+
+    estimator: Literal["mis", "cosine"] = option("--sampling", "mis")
+    "mis: lights and cosine combined, Sobol points; cosine: the paper's estimator"
+    standard_error: float = option("--standard-error E", 0.03, (0, math.inf))
+    """mis stops where the relative standard error of S is below this, or {BEFORE_FILTER} times as
+    much where S is filtered"""
+    # More Sobol points than 2^20 fill the memory, and improve nothing.
+    max_rays: int = option(
+        "--rays N",
+        _BY_ESTIMATOR,
+        (4, 1 << 20),
+        unset=", ".join(f"{rays} with {estimator}" for estimator, rays in _RAYS.items()),
     )
+    "rays per texel: with mis at most this many, with cosine exactly"
+    seed: int = _seed()
+
+    def __post_init__(self) -> None:
+        if self.max_rays is _BY_ESTIMATOR:
+            object.__setattr__(self, "max_rays", _RAYS.get(self.estimator))
+        super().__post_init__()
 
 
-def add_shade_options(parser: argparse.ArgumentParser) -> None:
-    known = ShadeOptions()
-    add = parser.add_argument_group("shade").add_argument
-    add(
-        "--sampling",
-        choices=("mis", "cosine"),
-        default=known.sampling.estimator,
-        help="mis: lights and cosine combined, Sobol points; cosine: the paper's estimator",
+Denoise = Literal["auto", "none", "oidn"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShadeOptions(Options):
+    """How L_d becomes irradiance, albedo and emitters."""
+
+    sampling: Sampling = field(default_factory=Sampling)
+    denoise: Denoise = option("--denoise", "auto")
+    "lightmap filter for S; oidn needs usdbrdf[denoise], auto takes it where it is there"
+    environment: Path | None = _environment()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions(Options):
+    """How roughness and specular are found, and who is told. Without evidence all methods but
+    "paper" write the prior of the object's class."""
+
+    method: Literal["views", "scaled", "paper"] = option("--fit", "views")
+    """views: many views per texel, L_d free, and refined with what was found; scaled: one target
+    frame, L_d times a free factor; paper: one target frame, the paper's residual"""
+    max_pixels: int = option("--max-pixels N", 1500, (50, 2**31 - 1))
+    "fit to at most this many pixels of an object's target frame"
+    mapping: Literal["measured", "matched"] = option("--material", "matched")
+    """what UsdPreviewSurface is told: measured: roughness and specular as fitted; matched: as
+    renderers need them to show that"""
+    materialx: bool = option("--materialx", False)
+    "write OpenPBR networks of MaterialX too, as layers/materialx.usda"
+    environment: Path | None = _environment()
+    memory: float | None = _memory()
+    seed: int = _seed()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(Options):
+    """The options of all four tasks."""
+
+    ingest: IngestOptions = field(default_factory=IngestOptions)
+    texture: TextureOptions = field(default_factory=TextureOptions)
+    shade: ShadeOptions = field(default_factory=ShadeOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+
+
+# What is done with an asset.
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(Options):
+    """How views are rendered, and what else is compared."""
+
+    samples_per_pixel: int = option("--samples-per-pixel N", 9, (1, 1 << 16))
+    "points that a rendered pixel is the mean of; a square number"
+    rays: int = option("--rays N", 144, (8, 1 << 24))
+    "rays per pixel for the specular light, shared among its points"
+    environment: Path | None = _environment()
+    seed: int = _seed()
+    truth: Path | None = option("--truth FOLDER", None, unset="none")
+    "compare with known materials: objects.json and albedo_vertex.npz"
+    mesh: Path | None = option("--mesh FILE", None, unset="mesh.ply beside --truth", file=True)
+    "mesh whose vertices the known albedo belongs to"
+    allow_outside: tuple[Path, ...] = _allow_outside()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.per_side**2 != self.samples_per_pixel:
+            raise UsageError(
+                f"--samples-per-pixel {self.samples_per_pixel}: not a square number (1, 4, 9, "
+                "16, ...). [usage.option]"
+            )
+        if self.rays < 8 * self.samples_per_pixel:
+            raise UsageError(
+                f"--rays {self.rays}: at least 8 for each of a pixel's points are needed, here "
+                f"{8 * self.samples_per_pixel}. [usage.option]"
+            )
+        if self.mesh is not None and self.truth is None:
+            raise UsageError("--mesh: belongs to --truth, which is not given. [usage.option]")
+
+    @property
+    def per_side(self) -> int:
+        """Points along a side of a pixel."""
+        return math.isqrt(self.samples_per_pixel)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Insert(Options):
+    """A model and what to do with it, lengths in units of the asset's stage. UsageError where it is
+    placed in two ways, or where a matrix comes with a scale or a rotation, which it holds itself.
+    """
+
+    model: Path
+    at: tuple[float, ...] | None = option("at X,Y,Z", None, counts=(3,))
+    "where the model's origin comes to lie"
+    drop: tuple[float, ...] | None = option("drop X,Y[,Z]", None, counts=(2, 3))
+    "let it fall there (from the height Z; default: from that of the highest capture camera)"
+    matrix: Double | None = option("matrix FILE", None)
+    "with 4 x 4 numbers, world from model, instead of the others"
+    scale: float = option("scale S", 1.0, (1e-9, math.inf))
+    "factor on the model's size"
+    rotate_deg: float = option("rotate DEG", 0.0)
+    "about the up axis, counter-clockwise seen from above"
+    up: Literal["Y", "Z"] | None = option("up Y|Z", None)
+    "up axis of an OBJ or PLY"
+    color: tuple[float, ...] | None = option("color R,G,B", None, (0, math.inf), counts=(3,))
+    "instead of the model's"
+    roughness: float | None = option("roughness R", None, (0, 1))
+    "instead of the model's"
+    ior: float | None = option("ior N", None, (1, math.inf))
+    "instead of the model's; alone it makes a dielectric"
+    metallic: float | None = option("metallic M", None, (0, 1))
+    "instead of the model's"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if sum(place is not None for place in (self.at, self.drop, self.matrix)) > 1:
+            raise UsageError(
+                f"--insert {self.model}: at=, drop= and matrix= exclude each other. "
+                "[relight.insert]"
+            )
+        if self.matrix is not None and (self.scale != 1.0 or self.rotate_deg != 0.0):
+            raise UsageError(
+                f"--insert {self.model}: scale= and rotate= have no effect beside matrix=. Put "
+                "them into the matrix. [relight.insert]"
+            )
+
+    @property
+    def falls_from_eye_height(self) -> bool:
+        return self.drop is not None and len(self.drop) == 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelightOptions(Options):
+    """What is rendered, in which light."""
+
+    lights: Path | None = option("--lights FILE", None, unset="capture", none="capture")
+    """capture: the recovered emitters; or a USD file with lights or glowing meshes, or a
+    latitude-longitude .exr or .hdr, in their place"""
+    keep_emitters: bool = option("--keep-emitters", False)
+    "leave the captured light on beside --lights"
+    inserts: tuple[Insert, ...] = option("--insert MODEL [KEY=VALUE ...]", ())
+    """put a model in (USD, OBJ, PLY, GLB), lengths in units of the stage; may be given again. Keys:
+    """
+    camera: str | None = option("--camera PRIM", None, unset="the capture's")
+    "path of a camera in the stage"
+    frame: float | None = option("--frame N", None, unset="the first")
+    "time code"
+    views: Path | None = option("--views FILE", None)
+    "nerfstudio document with poses to render from"
+    format: Literal["exr", "png", "jpg"] = option("--format", "exr")
+    "of the pictures of --views"
+    width: int | None = option("--width N", None, (1, 1 << 16), unset="the camera's")
+    "pixels across"
+    samples: int = option("--samples N", 256, (1, 1 << 24))
+    "paths per pixel"
+    # In a bright room the ninth reflection and later ones bring more than 1 % of the light.
+    bounces: int = option("--bounces N", 32, (4, 1 << 16))
+    "reflections along a path; light between surfaces needs at least 4"
+    seed: int = _seed()
+    denoise: Denoise = option("--denoise", "auto")
+    "filter the picture; oidn needs usdbrdf[denoise], auto takes it where it is there"
+    exposure: float | None = option(
+        "--exposure STOPS",
+        None,
+        (-100, 100),
+        unset="the 90th percentile of mean RGB becomes 0.8",
     )
-    add(
-        "--standard-error",
-        type=finite_number,
-        default=known.sampling.standard_error,
-        metavar="E",
-        help="mis stops where the relative standard error of S is below this, or 1.5 times as much "
-        "where S is filtered",
+    "of .png and .jpg"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackageOptions(Options):
+    """What one file of an asset holds."""
+
+    textures: Literal["exr", "png"] | None = option(
+        "--textures", None, unset="exr, but png in .glb and with --profile arkit"
     )
-    add(
-        "--rays",
-        type=int,
-        metavar="N",
-        help="rays per texel: with mis at most this many, "
-        f"default: {known.sampling.max_rays}; with cosine exactly, default: {_COSINE_RAYS}",
-    )
-    add(
-        "--denoise",
-        choices=CHOICES,
-        default=known.denoise,
-        help="lightmap filter for S; oidn needs usdbrdf[denoise], auto takes it where it is there",
-    )
-
-
-def add_light_options(parser: argparse.ArgumentParser) -> None:
-    """What all that traces light shares."""
-    add = parser.add_argument_group("light transport").add_argument
-    add(
-        "--environment",
-        type=existing_file,
-        metavar="HDR",
-        help="latitude-longitude picture of the surroundings; default: black",
-    )
-    add(
-        "--seed",
-        type=seed_number,
-        default=ShadeOptions().sampling.seed,
-        metavar="N",
-        help="seed of the random numbers",
-    )
-
-
-def ingest_options(chosen: argparse.Namespace) -> IngestOptions:
-    return IngestOptions(
-        mesh=chosen.mesh,
-        objects=chosen.objects,
-        crease_angle_deg=chosen.crease_angle,
-        decimate=chosen.decimate,
-        min_component_area_m2=chosen.min_component_area,
-        assume_srgb=chosen.assume_srgb,
-        encoding=chosen.encoding,
-        pose_scale=chosen.pose_scale,
-        max_nonfinite=chosen.max_nonfinite,
-        allow_outside=tuple(chosen.allow_outside),
-        meters_per_unit=chosen.meters_per_unit,
-        up_axis=chosen.up_axis,
-    )
-
-
-def texture_options(chosen: argparse.Namespace) -> TextureOptions:
-    return TextureOptions(
-        texel_size=chosen.texel_size,
-        quantile=chosen.quantile,
-        max_texels=chosen.max_texels,
-        memory=chosen.memory,
-    )
-
-
-def shade_options(chosen: argparse.Namespace) -> ShadeOptions:
-    rays = chosen.rays
-    if rays is None:
-        paper = chosen.sampling == "cosine"
-        rays = _COSINE_RAYS if paper else ShadeOptions().sampling.max_rays
-    sampling = Sampling(
-        estimator=chosen.sampling,
-        standard_error=chosen.standard_error,
-        max_rays=rays,
-        seed=chosen.seed,
-    )
-    return ShadeOptions(sampling=sampling, denoise=chosen.denoise, environment=chosen.environment)
-
-
-def seed_number(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 4294967295")
-    return int(text)
-
-
-def finite_number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
-    return value
-
-
-def existing_file(text: str) -> Path:
-    # Said before any work is done; an input that is not there is refused as a capture would be.
-    if not Path(text).is_file():
-        raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")
-    return Path(text)
+    "exr: as they are; png: 8 bits, colours in sRGB"
+    max_size: int | None = option("--max-size PIXELS", None, _COUNT)
+    "reduce textures to this longer side"
+    look: str | None = option("--look NAME", None, unset="the one it opens in")
+    "the look that is packed"
+    profile: Literal["default", "arkit"] = option("--profile", "default")
+    "arkit: y up, PNG, no cameras and lights, for AR Quick Look"

@@ -13,39 +13,28 @@ step, look, override in edits.usda, and go on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import wraps
+from inspect import signature
 from pathlib import Path
+from typing import ParamSpec
 
 from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import Asset
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import OwnershipConflict
-from usdbrdf.job.lock import folder_lock
-from usdbrdf.job.ownership import (
-    edited_files,
-    make_parents,
-    prepare_asset_folder,
-    removed_if_unused,
-)
+from usdbrdf.job.lock import is_held
+from usdbrdf.job.ownership import edited_files, owned_folder
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult
-from usdbrdf.tasks.fit import fit
-from usdbrdf.tasks.fit_objects import FitOptions
-from usdbrdf.tasks.ingest import ingest
-from usdbrdf.tasks.shade import ShadeOptions, shade
-from usdbrdf.tasks.texture import TextureOptions, texture
+from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.job.task import TaskResult
+from usdbrdf.options import ConvertOptions, HandEdits
+from usdbrdf.tasks.fit import fit as fit_task
+from usdbrdf.tasks.ingest import ingest as ingest_task
+from usdbrdf.tasks.shade import shade as shade_task
+from usdbrdf.tasks.texture import texture as texture_task
 
-
-@dataclass(frozen=True, kw_only=True)
-class ConvertOptions:
-    """The options of all four steps."""
-
-    ingest: IngestOptions = field(default_factory=IngestOptions)
-    texture: TextureOptions = field(default_factory=TextureOptions)
-    shade: ShadeOptions = field(default_factory=ShadeOptions)
-    fit: FitOptions = field(default_factory=FitOptions)
+P = ParamSpec("P")
 
 
 def convert(
@@ -54,20 +43,26 @@ def convert(
     options: ConvertOptions | None = None,
     *,
     adapter: str | None = None,
-) -> dict[str, StageResult]:
+    plugins: bool = True,
+    hand_edits: HandEdits = "refuse",
+    wait_s: float = 0.0,
+) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
     capture   folder or file that one of the adapters reads
     output    asset folder, made if absent; its root layer is OUTPUT/<name>.usda
+    adapter   name of the one that reads the capture; None: the first that recognises it, among
+              those of other packages too if ``plugins``
+    hand_edits, wait_s   as of ``working_on``
     returns   what each step found, by name
 
     Raises UsdBrdfError (see ``usdbrdf.errors``); an interrupted or failed call leaves what was
     valid before, and the same call again goes on where it stopped.
     """
     chosen = options or ConvertOptions()
-    with working_on(output) as asset:
+    with working_on(output, hand_edits=hand_edits, wait_s=wait_s) as asset:
         return {
-            "ingest": ingest(Path(capture), asset, chosen.ingest, adapter),
+            "ingest": ingest(Path(capture), asset, chosen.ingest, adapter, plugins=plugins),
             "texture": texture(asset, chosen.texture),
             "shade": shade(asset, chosen.shade),
             "fit": fit(asset, chosen.fit),
@@ -76,25 +71,54 @@ def convert(
 
 @contextmanager
 def working_on(
-    folder: str | Path, *, hand_edits: str = "refuse", wait_s: float = 0.0
+    folder: str | Path,
+    *,
+    hand_edits: HandEdits = "refuse",
+    wait_s: float = 0.0,
+    without_lock: bool = False,
 ) -> Iterator[Asset]:
-    """Prepare and lock an asset folder for one or more steps.
+    """Prepare and lock an asset folder for one or more tasks; once more in the same thread does
+    nothing.
 
     A folder that is made here, its parents too, is removed again if nothing gets written into it.
 
-    hand_edits  what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
-                "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
+    hand_edits    what to do with files of ours that somebody changed: "refuse" (OwnershipConflict),
+                  "adopt" (keep their content as adopted-N.usda beside edits.usda) or "discard"
+    wait_s        for how many seconds to wait for another run in this folder before FolderBusy
+    without_lock  go on where the file system has no locks, which is FolderBusy otherwise
     """
     place = Path(folder)
-    new = make_parents(place)
-    state = prepare_asset_folder(place)
-    with folder_lock(state, wait_s), removed_if_unused(new):
+    if is_held(place / STATE_FOLDER):
+        yield Asset.at(place)
+        return
+    with owned_folder(place, wait_s=wait_s, without_lock=without_lock):
         asset = Asset.at(place)
         _settle(asset, edited_files(asset.folder), hand_edits)
         yield asset
 
 
-def _settle(asset: Asset, edited: list[str], hand_edits: str) -> None:
+def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
+    """A task that works on the folder of its asset, alone there, and says if there was no need."""
+
+    @wraps(task)
+    def run(*given: P.args, **named: P.kwargs) -> TaskResult:
+        asset: Asset = signature(task).bind(*given, **named).arguments["asset"]
+        with working_on(asset.folder):
+            result = task(*given, **named)
+        if not result.reran:
+            say(f"{task.__name__}: up to date")
+        return result
+
+    return run
+
+
+ingest = _on_its_folder(ingest_task)
+texture = _on_its_folder(texture_task)
+shade = _on_its_folder(shade_task)
+fit = _on_its_folder(fit_task)
+
+
+def _settle(asset: Asset, edited: list[str], hand_edits: HandEdits) -> None:
     if edited and hand_edits == "refuse":
         raise OwnershipConflict(
             f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `convert` "

@@ -11,8 +11,8 @@ import pytest
 from tests.scenes import make_capture
 from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import list_adapters, read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.options import IngestOptions
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_ours_are_there_even_if_nothing_is_installed(announce):
 def test_ours_are_announced_in_the_same_way():
     tomllib = pytest.importorskip("tomllib")  # part of Python from 3.11 on
     project = tomllib.loads((Path(adapters.__file__).parents[2] / "pyproject.toml").read_text())
-    assert project["project"]["entry-points"][adapters.GROUP] == adapters._OURS
+    assert project["project"]["entry-points"][adapters.GROUP] == adapters.MODULES
 
 
 def test_theirs_is_found_and_used(announce, tmp_path):
@@ -99,7 +99,7 @@ def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_p
 
 def test_ours_cannot_be_replaced(announce):
     announce(transforms=_adapter())
-    assert [a.origin for a in list_adapters()] == list(adapters._OURS.values())
+    assert [a.origin for a in list_adapters()] == list(adapters.MODULES.values())
 
 
 def test_nothing_recognised_lists_what_would_be(tmp_path):

@@ -8,8 +8,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted import usd_meshes as foreign
 from usdbrdf.untrusted.usd_meshes import meshes_from_usd
 

@@ -12,10 +12,10 @@ import trimesh
 
 from tests.scenes import edited, make_capture, room_mesh
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr
+from usdbrdf.options import IngestOptions
 
 
 def make_export(folder: Path) -> tuple[Path, np.ndarray]:

@@ -9,10 +9,10 @@ import pytest
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_preview_png
+from usdbrdf.options import IngestOptions
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ import pytest
 from pxr import Sdf, Usd
 
 from usdbrdf.asset.readers.surfaces import surfaces_from_stage
-from usdbrdf.delivery.package import PackageOptions, package
+from usdbrdf.delivery.package import package
+from usdbrdf.options import PackageOptions
 
 TIME = Usd.TimeCode.EarliestTime()
 CHAIR_FILE = """over "room" {{ over "mtl" {{ over "Stuhl_No_1" {{ over "BaseColorTexture" {{

@@ -7,7 +7,8 @@ import zipfile
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
-from usdbrdf.delivery.package import PackageOptions, package
+from usdbrdf.delivery.package import package
+from usdbrdf.options import PackageOptions
 
 EDITS = """#usda 1.0
 (

@@ -17,9 +17,9 @@ import pytest
 
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.images import read_exr
+from usdbrdf.options import IngestOptions
 
 Recipe = Callable[[MadeCapture], None]
 

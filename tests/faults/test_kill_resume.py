@@ -17,21 +17,23 @@ from pathlib import Path
 
 import pytest
 
-import usdbrdf.tasks.fit_objects
+import usdbrdf.material.fit_objects
+import usdbrdf.shading.irradiance_map
 import usdbrdf.tasks.texture
-import usdbrdf.tasks.trace
+from tests.fault_injection import VARIABLE, inject
 from tests.scenes import make_capture
 from usdbrdf.cli import main
-from usdbrdf.files import atomic
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, sha256_of
 from usdbrdf.job.ownership import edited_files
 
 TILE = 64  # texels
 PROGRAM = f"""
 import sys
-import usdbrdf.tasks.trace
-usdbrdf.tasks.trace._TILE = {TILE}
+import usdbrdf.shading.irradiance_map
+usdbrdf.shading.irradiance_map._TILE = {TILE}
 from usdbrdf.cli import main
+from tests.fault_injection import arm_from_environment
+arm_from_environment()
 sys.exit(main(sys.argv[1:]))
 """
 NUM_FRAMES = 20
@@ -45,24 +47,24 @@ OPTIONS = {
 STEPS = tuple(OPTIONS)
 FAULTS = {
     "ingest": [
-        "stage:ingest:before_write:1",
-        "stage:ingest:before_publish",
+        "ingest:before_write:1",
+        "ingest:before_publish",
         "publish:before_replace:3",  # after job.json and the journal: scan.usdc
-        "stage:ingest:mid_publish",
+        "ingest:mid_publish",
     ],
     "texture": [
         "image:before_write:7",
-        "stage:texture:mid_publish:9",
-        "stage:texture:before_stamp",
+        "texture:mid_publish:9",
+        "texture:before_stamp",
     ],
     "shade": [
         "publish:before_replace:2",  # the second tile
         "image:before_write:5",
     ],
     "fit": [
-        "stage:fit:checkpoint:1",  # target frames
-        "stage:fit:before_write",
-        "stage:fit:mid_publish",
+        "fit:checkpoint:1",  # target frames
+        "fit:before_write",
+        "fit:mid_publish",
     ],
 }
 # More places are in the tests of what is computed again.
@@ -91,7 +93,7 @@ def undisturbed(base):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    monkeypatch.setattr(usdbrdf.tasks.trace, "_TILE", TILE)
+    monkeypatch.setattr(usdbrdf.shading.irradiance_map, "_TILE", TILE)
 
 
 @pytest.fixture
@@ -117,7 +119,7 @@ def command(name: str, base: Path, asset: Path) -> list[str]:
 def start(arguments: list[str], fault: str = "") -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *arguments],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "USDBRDF_FAULT": fault},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), VARIABLE: fault},
         stderr=subprocess.PIPE,
     )
 
@@ -150,7 +152,7 @@ def test_a_convert_killed_once_in_every_step_ends_in_the_same_bytes(base, undist
     asset = case("ingest")
     call = command("convert", base, asset)
     for step in STEPS:
-        killed_at(call, f"stage:{step}:mid_publish")
+        killed_at(call, f"{step}:mid_publish")
     assert main(call) == 0
     assert hashes(asset) == hashes(undisturbed["fit"])
 
@@ -176,9 +178,9 @@ def calls(monkeypatch):
 
     count(usdbrdf.tasks.texture, "unwrap")
     count(usdbrdf.tasks.texture, "radiance_from_frames")
-    count(usdbrdf.tasks.trace, "irradiance_at")
-    count(usdbrdf.tasks.fit_objects, "choose_target_frames")
-    count(usdbrdf.tasks.fit_objects, "fit_object")
+    count(usdbrdf.shading.irradiance_map, "irradiance_at")
+    count(usdbrdf.material.fit_objects, "choose_target_frames")
+    count(usdbrdf.material.fit_objects, "fit_object")
     return counted
 
 
@@ -189,7 +191,7 @@ def resumed(base, undisturbed, case, calls):
     def after(step: str, fault: str) -> Counter[str]:
         asset = case(step)
         call = command(step, base, asset)
-        killed_at(call, f"stage:{step}:{fault}")
+        killed_at(call, f"{step}:{fault}")
         calls.clear()
         assert main(call) == 0
         assert hashes(asset) == hashes(undisturbed[step])
@@ -229,11 +231,10 @@ def test_full_disk_while_publishing(base, undisturbed, case, monkeypatch, capsys
     asset = case("fit")
     before = hashes(asset)
     call = ["shade", str(asset), *OPTIONS["shade"], "--seed", "1"]
-    monkeypatch.setenv("USDBRDF_FAULT", f"enospc@stage:shade:{fault}")
-    atomic._passes.clear()
-    assert main([*call]) == 4
+    with monkeypatch.context() as patch:
+        inject(f"enospc@shade:{fault}", patch)
+        assert main([*call]) == 4
     assert "No space left on device" in capsys.readouterr().err
-    monkeypatch.delenv("USDBRDF_FAULT")
     now = {name: sha256_of(asset / name) for name in before}
     changed = {name for name in before if now[name] != before[name]}
     # What is not the old file is the new one, and whole.

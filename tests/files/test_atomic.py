@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import stat
@@ -12,10 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.fault_injection import VARIABLE, Fault
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.atomic import (
     environment_failures,
-    fault_point,
+    flush_folder,
     publish,
     sha256_of,
     temporary_beside,
@@ -29,7 +31,7 @@ def run_python(code, *arguments, fault=""):
     search = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": search, "USDBRDF_FAULT": fault},
+        env={**os.environ, "PYTHONPATH": search, VARIABLE: fault},
         capture_output=True,
         text=True,
         timeout=60,
@@ -83,20 +85,67 @@ def test_kill_around_the_rename(tmp_path, side):
     path.write_text("old")
     code = (
         "import sys; from pathlib import Path; from usdbrdf.files.atomic import write_text_atomic;"
+        "from tests.fault_injection import arm_from_environment; arm_from_environment();"
         "write_text_atomic(Path(sys.argv[1]), 'new')"
     )
     assert run_python(code, path, fault=f"kill@publish:{side}_replace").returncode == -9
     assert path.read_text() == ("old" if side == "before" else "new")
 
 
-def test_fault_at_the_kth_pass(monkeypatch):
-    monkeypatch.setenv("USDBRDF_FAULT", "enospc@test:kth:3")
+def test_fault_at_the_kth_pass():
+    fault = Fault("enospc@toy:kth:3")
     for _ in range(2):
-        fault_point("test:kth")
+        fault.point("toy:kth")
     with pytest.raises(OSError, match="No space left"):
-        fault_point("test:kth")
-    fault_point("test:kth")
-    fault_point("test:other")
+        fault.point("toy:kth")
+    fault.point("toy:kth")
+    fault.point("toy:other")
+
+
+@pytest.fixture
+def on_disk(monkeypatch):
+    """What reaches the disk, in order: names of files and folders that are flushed, and renames."""
+    events, fsync, replace = [], os.fsync, os.replace
+
+    def flushing(descriptor):
+        events.append(("flush", Path(os.readlink(f"/proc/self/fd/{descriptor}")).name))
+        fsync(descriptor)
+
+    def renaming(source, target):
+        events.append(("rename", Path(target).name))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", flushing)
+    monkeypatch.setattr(os, "replace", renaming)
+    return events
+
+
+def test_content_is_on_disk_before_the_name_and_the_name_before_publish_returns(tmp_path, on_disk):
+    staged, final = tmp_path / "staged", tmp_path / "final"
+    staged.write_text("new")
+    publish(staged, final)
+    assert on_disk == [("flush", "staged"), ("rename", "final"), ("flush", tmp_path.name)]
+
+
+def test_a_text_is_flushed_with_its_folder(tmp_path, on_disk):
+    write_text_atomic(tmp_path / "a.json", "{}")
+    (first, _), second, third = on_disk
+    assert (first, second, third) == (
+        "flush", ("rename", "a.json"), ("flush", tmp_path.name),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("error", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
+def test_folders_that_cannot_be_flushed(tmp_path, monkeypatch, error):
+    def failing(_descriptor):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(os, "fsync", failing)
+    if error == errno.EIO:
+        with pytest.raises(OSError, match="error"):
+            flush_folder(tmp_path)
+    else:
+        flush_folder(tmp_path)  # network file systems say so
 
 
 def test_really_full_disk(tmp_path):

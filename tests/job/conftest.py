@@ -1,4 +1,4 @@
-"""Run the toy stage here and in a process that may be killed, and hash what it leaves."""
+"""Run the toy task here and in a process that may be killed, and hash what it leaves."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from types import ModuleType
 
 import pytest
 
+from tests.fault_injection import VARIABLE
 from usdbrdf.files.atomic import sha256_of
 
-TOY = Path(__file__).with_name("toy_stage.py")
+TOY = Path(__file__).with_name("toy_task.py")
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
 def toy() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("toy_stage", TOY)
+    spec = importlib.util.spec_from_file_location("toy_task", TOY)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -32,7 +33,7 @@ def toy_process() -> Callable[..., subprocess.CompletedProcess[str]]:
         search = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         return subprocess.run(
             [sys.executable, str(TOY), str(asset), *arguments],
-            env={**os.environ, "PYTHONPATH": search, "USDBRDF_FAULT": fault},
+            env={**os.environ, "PYTHONPATH": search, VARIABLE: fault},
             capture_output=True,
             text=True,
             timeout=60,

@@ -1,4 +1,4 @@
-"""SIGKILL at every fault point of a stage, then the same command: the same bytes as undisturbed."""
+"""SIGKILL at every fault point of a task, then the same command: the same bytes as undisturbed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from usdbrdf.job.ownership import edited_files
 
 FAULTS = (
-    [f"stage:toy:checkpoint:{k}" for k in (1, 3, 4, 9)]
-    + [f"stage:toy:before_write:{k}" for k in (1, 2, 6)]
-    + ["image:before_write:2", "stage:toy:before_publish"]
-    + [f"stage:toy:mid_publish:{k}" for k in (1, 3, 5)]
-    + ["stage:toy:after_publish", "stage:toy:before_stamp"]
+    [f"toy:checkpoint:{k}" for k in (1, 3, 4, 9)]
+    + [f"toy:before_write:{k}" for k in (1, 2, 6)]
+    + ["image:before_write:2", "toy:before_publish"]
+    + [f"toy:mid_publish:{k}" for k in (1, 3, 5)]
+    + ["toy:after_publish", "toy:before_stamp", "toy:after_stamp"]
 )
 # every rename of the run: job.json, 9 checkpoints, 3 images, journal, 5 outputs, once, stamp
 RENAMES = [f"publish:{side}_replace:{k}" for side in ("before", "after") for k in (1, 2, 14, 21)]
@@ -47,7 +47,7 @@ def test_killed_regeneration_is_not_taken_for_an_edit(
     asset = tmp_path / "room"
     toy.run_toy(asset, 7)
     (asset / "edits.usda").write_text("#usda 1.0\n# mine\n")
-    assert toy_process(asset, "1", fault=f"kill@stage:toy:{fault}").returncode == -9
+    assert toy_process(asset, "1", fault=f"kill@toy:{fault}").returncode == -9
     assert edited_files(asset) == []
     assert toy.run_toy(asset).reason == "publish interrupted"
     assert (asset / "edits.usda").read_text() == "#usda 1.0\n# mine\n"
@@ -58,8 +58,8 @@ def test_killed_regeneration_is_not_taken_for_an_edit(
 def test_other_parameters_after_a_killed_publish(tmp_path, toy, toy_process, hashes, undisturbed):
     asset = tmp_path / "room"
     toy.run_toy(asset, 7)
-    assert toy_process(asset, "8", fault="kill@stage:toy:mid_publish:2").returncode == -9
-    assert toy_process(asset, "1", "--fewer", fault="kill@stage:toy:mid_publish").returncode == -9
+    assert toy_process(asset, "8", fault="kill@toy:mid_publish:2").returncode == -9
+    assert toy_process(asset, "1", "--fewer", fault="kill@toy:mid_publish").returncode == -9
     assert edited_files(asset) == []
     toy.run_toy(asset, 1, textures=2)
     assert not (asset / "textures/box2.lit.exr").exists()  # from seed 7 or 8, no longer made
@@ -69,7 +69,7 @@ def test_other_parameters_after_a_killed_publish(tmp_path, toy, toy_process, has
 
 def test_file_edited_after_a_killed_publish_is_regenerated(tmp_path, toy, toy_process, hashes):
     asset = tmp_path / "room"
-    assert toy_process(asset, fault="kill@stage:toy:mid_publish:1").returncode == -9
+    assert toy_process(asset, fault="kill@toy:mid_publish:1").returncode == -9
     (asset / "textures/box0.lit.exr").write_bytes(b"mine")
     assert edited_files(asset) == ["textures/box0.lit.exr"]
     assert toy.run_toy(asset).reason == "not done before"
@@ -78,7 +78,7 @@ def test_file_edited_after_a_killed_publish_is_regenerated(tmp_path, toy, toy_pr
 
 def test_finished_pieces_are_not_computed_again(tmp_path, toy, toy_process):
     asset = tmp_path / "room"
-    toy_process(asset, fault="kill@stage:toy:checkpoint:5")  # 3 tiles, frames 0 and 1
+    toy_process(asset, fault="kill@toy:checkpoint:5")  # 3 tiles, frames 0 and 1
     toy.run_toy(asset)
     computed = ast.literal_eval(asset.with_suffix(".computed").read_text())
     assert computed == [102, 103, 104, 105]
@@ -86,7 +86,7 @@ def test_finished_pieces_are_not_computed_again(tmp_path, toy, toy_process):
 
 def test_damaged_checkpoint_is_computed_again(tmp_path, toy, toy_process, hashes, undisturbed):
     asset = tmp_path / "room"
-    toy_process(asset, fault="kill@stage:toy:checkpoint:6")
+    toy_process(asset, fault="kill@toy:checkpoint:6")
     stored = sorted((asset / ".usdbrdf/work").glob("toy-*/checkpoints/*.npz"))
     assert [path.name[:5] for path in stored] == ["sum@0", "sum@0"] + 3 * ["tile%"]
     for path in stored[1:3]:  # the newer state and the first tile
@@ -99,6 +99,28 @@ def test_damaged_checkpoint_is_computed_again(tmp_path, toy, toy_process, hashes
     assert hashes(asset) == undisturbed
 
 
+def test_checkpoint_that_is_whole_but_not_what_was_saved_is_computed_again(
+    tmp_path, toy, toy_process, hashes, undisturbed
+):
+    asset = tmp_path / "room"
+    toy_process(asset, fault="kill@toy:checkpoint:3")
+    first, _, last = sorted((asset / ".usdbrdf/work").glob("toy-*/checkpoints/*.npz"))
+    first.write_bytes(last.read_bytes())  # arrays that can be read, of another tile
+    toy.run_toy(asset)
+    computed = ast.literal_eval(asset.with_suffix(".computed").read_text())
+    assert computed == [0, 100, 101, 102, 103, 104, 105]
+    assert hashes(asset) == undisturbed
+
+
+def test_work_for_other_parameters_is_swept_even_where_nothing_runs(tmp_path, toy, toy_process):
+    asset = tmp_path / "room"
+    toy.run_toy(asset)
+    toy_process(asset, "7", fault="kill@toy:checkpoint:3")
+    assert list((asset / ".usdbrdf/work").iterdir())
+    assert not toy.run_toy(asset).reran
+    assert not list((asset / ".usdbrdf/work").iterdir())
+
+
 @pytest.mark.parametrize(
     "fault",
     ["before_write:4", "checkpoint:2", "before_publish", "mid_publish:2", "before_stamp"],
@@ -109,9 +131,9 @@ def test_full_disk_keeps_the_previous_asset_and_resumes(
     asset = tmp_path / "room"
     toy.run_toy(asset, 7)
     before = hashes(asset)
-    failed = toy_process(asset, "1", fault=f"enospc@stage:toy:{fault}")
+    failed = toy_process(asset, "1", fault=f"enospc@toy:{fault}")
     assert failed.returncode == 1
-    assert "EnvironmentFailure: stage toy: No space left" in failed.stderr
+    assert "EnvironmentFailure: toy: No space left" in failed.stderr
     if "publish" not in fault and "stamp" not in fault:
         now = hashes(asset)
         assert {path: now[path] for path in before} == before

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from usdbrdf import working_on
 from usdbrdf.errors import FolderBusy
 from usdbrdf.job.lock import folder_lock
 
@@ -64,24 +68,108 @@ def test_waiting_for_the_first_run(tmp_path, holder):
         timer.join()
 
 
-def test_second_lock_in_one_process_is_refused_and_the_first_survives(tmp_path, toy_process):
+def in_thread(function):
+    with ThreadPoolExecutor() as pool:
+        return pool.submit(function).result()
+
+
+def locking_once(folder):
+    with folder_lock(folder):
+        pass
+
+
+def locked_by_another_process(folder):
+    said = subprocess.run(
+        [sys.executable, "-c", HOLD, str(folder)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        input="\n",
+        timeout=30,
+        check=False,
+    ).stderr
+    return "FolderBusy" in said
+
+
+def test_a_second_thread_is_refused_and_the_first_keeps_its_lock(tmp_path):
     with folder_lock(tmp_path):
-        with pytest.raises(FolderBusy, match="another thread"), folder_lock(tmp_path):
-            pass
-        attempt = subprocess.run(
-            [sys.executable, "-c", HOLD, str(tmp_path)],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            input="\n",
-            timeout=30,
-            check=False,
-        )
-        assert "FolderBusy" in attempt.stderr
+        with pytest.raises(FolderBusy, match="another thread"):
+            in_thread(lambda: locking_once(tmp_path))
+        assert locked_by_another_process(tmp_path)
     assert (tmp_path / "lock").read_bytes() == b""
+    in_thread(lambda: locking_once(tmp_path))
 
 
-def test_folder_busy_through_the_stage(tmp_path, toy, toy_process):
+def test_the_thread_that_holds_it_may_enter_again(tmp_path):
+    with folder_lock(tmp_path):
+        with folder_lock(tmp_path):
+            pass
+        assert locked_by_another_process(tmp_path)  # leaving the inner one frees nothing
+    assert not locked_by_another_process(tmp_path)
+
+
+FORK = """
+import os, sys
+from pathlib import Path
+from usdbrdf.errors import FolderBusy
+from usdbrdf.job.lock import folder_lock
+with folder_lock(Path(sys.argv[1])):
+    child = os.fork()
+    if child == 0:
+        try:
+            with folder_lock(Path(sys.argv[1])):
+                os._exit(0)
+        except FolderBusy:
+            os._exit(5)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    sys.stdin.readline()
+"""
+
+
+def test_a_forked_child_has_no_part_in_the_lock(tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", FORK, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout.readline() == "5\n"
+        assert locked_by_another_process(tmp_path)
+
+
+@pytest.mark.parametrize("error", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_without_locks_a_run_refuses_unless_told_otherwise(tmp_path, monkeypatch, error):
+    def no_locks(*_arguments):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(fcntl, "lockf", no_locks)
+    with (
+        pytest.raises(
+            FolderBusy, match=r"no working locks .+ --without-lock.+\[lock\.none\]$"
+        ) as e,
+        folder_lock(tmp_path, wait_s=60),
+    ):
+        pass
+    assert e.value.exit_code == 5
+    with folder_lock(tmp_path, without_lock=True):
+        assert str(os.getpid()) in (tmp_path / "lock").read_text()
+    with pytest.raises(FolderBusy), working_on(tmp_path / "room"):
+        pass
+    with working_on(tmp_path / "room", without_lock=True):
+        pass
+
+
+def test_other_errors_of_the_lock_are_not_hidden(tmp_path, monkeypatch):
+    def failing(*_arguments):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(fcntl, "lockf", failing)
+    with pytest.raises(OSError, match="Input/output"), folder_lock(tmp_path, without_lock=True):
+        pass
+
+
+def test_folder_busy_through_the_task(tmp_path, toy, toy_process):
     toy.run_toy(tmp_path / "room")
     with folder_lock(tmp_path / "room/.usdbrdf"):
         assert "FolderBusy" in toy_process(tmp_path / "room").stderr

@@ -2,35 +2,62 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
+import psutil
 import pytest
 
 from usdbrdf.job import memory
 
 
-def test_a_container_may_have_less_than_the_machine(tmp_path: Path, monkeypatch):
-    machine = memory.machine_bytes()
-    monkeypatch.setattr(memory, "_CONTAINER", tmp_path / "memory.max")
-    for text, expected in (("max", machine), (str(1 << 29), 1 << 29)):
-        (tmp_path / "memory.max").write_text(text + "\n")
-        assert memory.machine_bytes() == pytest.approx(expected, rel=0.5 if text == "max" else 0)
+@pytest.fixture
+def groups(tmp_path, monkeypatch):
+    """Writes a control group's limits and says which group this process is in."""
+
+    def write(own: str, limits: dict[str, str]) -> None:
+        (tmp_path / "own").write_text(own)
+        for name, text in limits.items():
+            (tmp_path / "cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "cgroup" / name).write_text(text + "\n")
+
+    monkeypatch.setattr(memory, "_CGROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "own")
+    return write
 
 
-def test_what_a_process_holds_is_known_where_the_system_tells(tmp_path: Path, monkeypatch):
-    if not memory.resident_bytes():
-        pytest.skip("this system has no /proc")
+V1 = "11:cpu,cpuacct:/batch\n7:memory:/batch/job\n0::/\n"
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "expected"),
+    [
+        ("0::/\n", {"memory.max": "max"}, None),
+        ("0::/\n", {"memory.max": str(1 << 29)}, 1 << 29),
+        ("0::/batch/job\n", {"batch/job/memory.max": "4096", "memory.max": "max"}, 4096),
+        ("0::/batch/job\n", {"batch/job/memory.max": "max", "batch/memory.max": "8192"}, 8192),
+        ("0::/docker/of-the-host\n", {"memory.max": "4096"}, 4096),
+        (V1, {"memory/batch/job/memory.limit_in_bytes": "4096"}, 4096),
+        (V1, {"memory/memory.limit_in_bytes": "4096", "memory.max": "max"}, 4096),
+        (V1, {"memory/batch/memory.limit_in_bytes": str((1 << 63) - 4096)}, None),
+        ("", {"memory.max": "4096"}, None),
+    ],
+)
+def test_a_container_or_batch_system_may_allow_less(groups, own, limits, expected):
+    groups(own, limits)
+    assert memory.machine_bytes() == (expected or psutil.virtual_memory().total)
+
+
+def test_systems_without_control_groups(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "none")
+    assert memory.machine_bytes() == psutil.virtual_memory().total
+
+
+def test_what_a_process_holds_is_known():
     before = memory.resident_bytes()
     held = np.ones(1 << 24)
     assert memory.resident_bytes() - before > 0.9 * held.nbytes
-    monkeypatch.setattr(memory, "_OF_PROCESS", tmp_path / "none")
-    assert memory.resident_bytes() == 0
 
 
 def test_freed_memory_goes_back():
-    if not memory.resident_bytes():
-        pytest.skip("this system has no /proc")
     # Blocks too small to be mapped one by one, the last of which keeps the heap from shrinking.
     blocks = [bytearray(60_000) for _ in range(4000)]
     full = memory.resident_bytes()

@@ -4,55 +4,66 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
+import threading
+import time
 
 import pytest
 
-from usdbrdf.errors import EnvironmentFailure, OwnershipConflict
-from usdbrdf.job.ownership import (
-    edited_files,
-    make_parents,
-    prepare_asset_folder,
-    removed_if_unused,
-)
+from usdbrdf.errors import EnvironmentFailure, FolderBusy, OwnershipConflict
+from usdbrdf.files.atomic import TEMPORARY_PREFIX
+from usdbrdf.job.ownership import edited_files, owned_folder
+
+
+def own(asset):
+    with owned_folder(asset) as state:
+        return state
+
+
+def names_in(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
 def test_new_and_empty_folders_become_ours(tmp_path):
     (tmp_path / "empty").mkdir()
-    for name in ("new", "empty", "new"):
-        state = prepare_asset_folder(tmp_path / name)
+    for name in ("new", "empty", "new", "above/it"):
+        state = own(tmp_path / name)
         assert json.loads((state / "job.json").read_text())["tool"] == "usdbrdf"
 
 
 def test_foreign_folder_is_refused_untouched(tmp_path):
     (tmp_path / "holiday.jpg").write_bytes(b"x")
     with pytest.raises(OwnershipConflict, match=r"not made by usdbrdf.+\[ownership.foreign\]"):
-        prepare_asset_folder(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
+        own(tmp_path)
+    assert names_in(tmp_path) == ["holiday.jpg"]
 
 
-def test_folder_of_a_run_killed_before_its_record_is_ours(tmp_path):
+def test_folder_of_a_run_killed_before_its_record_is_ours_and_is_swept(tmp_path):
     (tmp_path / ".usdbrdf/stamps").mkdir(parents=True)
-    (tmp_path / ".usdbrdf/.tmp-1-ab.json").write_text("{")
-    prepare_asset_folder(tmp_path)
+    (tmp_path / f".usdbrdf/{TEMPORARY_PREFIX}1-ab.json").write_text("{")
+    (tmp_path / f".usdbrdf/stamps/{TEMPORARY_PREFIX}1-cd.json").write_text("{")
+    own(tmp_path)
     assert (tmp_path / ".usdbrdf/job.json").is_file()
+    assert not [name for name in names_in(tmp_path) if TEMPORARY_PREFIX in name]
 
 
 def test_damaged_record_is_written_again_and_a_newer_one_refused(tmp_path):
-    state = prepare_asset_folder(tmp_path / "room")
+    state = own(tmp_path / "room")
     (state / "job.json").write_text("{")
-    prepare_asset_folder(tmp_path / "room")
+    own(tmp_path / "room")
     assert json.loads((state / "job.json").read_text())["schema"] == 1
     (state / "job.json").write_text('{"schema": 2}')
     with pytest.raises(OwnershipConflict, match=r"ownership\.newer"):
-        prepare_asset_folder(tmp_path / "room")
+        own(tmp_path / "room")
 
 
-def test_output_that_is_a_file_or_has_no_parent(tmp_path):
+def test_output_that_is_a_file_or_below_one(tmp_path):
     (tmp_path / "file").write_text("x")
-    for output in (tmp_path / "file", tmp_path / "file/room", tmp_path / "none/room"):
-        with pytest.raises(EnvironmentFailure):
-            prepare_asset_folder(output)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    for output in (tmp_path / "file", tmp_path / "file/room"):
+        with pytest.raises(EnvironmentFailure, match=r"is a file.+\[environment.output\]"):
+            own(output)
+    assert names_in(tmp_path) == ["file"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
@@ -60,7 +71,7 @@ def test_unwritable_parent(tmp_path):
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(EnvironmentFailure, match=r"not writable.+\[environment.output\]"):
-            prepare_asset_folder(tmp_path / "room")
+            own(tmp_path / "room")
     finally:
         tmp_path.chmod(0o700)
 
@@ -68,8 +79,8 @@ def test_unwritable_parent(tmp_path):
 def test_unwritable_parent_as_the_system_reports_it(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(EnvironmentFailure, match=r"not writable.+\[environment.output\]"):
-        prepare_asset_folder(tmp_path / "room")
-    assert not (tmp_path / "room").exists()
+        own(tmp_path / "above/room")
+    assert names_in(tmp_path) == []
 
 
 def test_edited_files_are_listed(tmp_path, toy):
@@ -85,18 +96,151 @@ def test_edited_files_are_listed(tmp_path, toy):
     assert edited_files(asset) == ["layers/toy.usda", "textures/box1.lit.exr"]
 
 
-def fail_in(asset):
-    new = make_parents(asset)
-    prepare_asset_folder(asset)
-    with pytest.raises(KeyError), removed_if_unused(new):
-        raise KeyError
+def fail_in(asset, meanwhile=lambda: None):
+    def work():
+        with owned_folder(asset):
+            meanwhile()
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        work()
 
 
 def test_what_was_not_there_before_a_failure_is_not_there_after_it(tmp_path):
     (tmp_path / "empty").mkdir()
     fail_in(tmp_path / "empty")
     fail_in(tmp_path / "new/room")
-    assert [path.name for path in tmp_path.rglob("*")] == ["empty"]
-    prepare_asset_folder(tmp_path / "empty")
+    assert names_in(tmp_path) == ["empty"]
+    own(tmp_path / "empty")
     fail_in(tmp_path / "empty")
     assert (tmp_path / "empty/.usdbrdf/job.json").is_file()
+
+
+def test_folders_that_hold_something_else_by_then_stay(tmp_path):
+    fail_in(tmp_path / "new/room", (tmp_path / "new/other").mkdir)
+    assert names_in(tmp_path) == ["new", "new/other"]
+
+
+# Two runs that begin in the same new folder
+
+
+def in_new_folder_while_another_waits(asset, second):
+    """Fail in a new folder while ``second`` waits for its lock."""
+    waiting = threading.Thread(target=second)
+
+    def begin():
+        waiting.start()
+        time.sleep(0.5)
+        assert waiting.is_alive()
+
+    fail_in(asset, begin)
+    waiting.join(timeout=20)
+
+
+def test_a_failed_run_takes_nothing_from_one_that_waits(tmp_path, toy):
+    asset = tmp_path / "new/room"
+
+    def second():
+        with owned_folder(asset, wait_s=20):
+            toy.run_toy(asset)
+
+    in_new_folder_while_another_waits(asset, second)
+    assert (asset / "layers/toy.usda").is_file()
+    assert (asset / ".usdbrdf/job.json").is_file()
+    assert (asset / ".usdbrdf/lock").is_file()
+    assert not toy.run_toy(asset).reran  # it is still ours
+
+
+def test_the_one_that_waited_holds_the_lock_that_others_see(tmp_path):
+    asset, seen = tmp_path / "room", []
+
+    def second():
+        with owned_folder(asset, wait_s=20) as state:
+            said = subprocess.run(
+                [sys.executable, "-c", TAKE, str(state)],
+                capture_output=True,
+                text=True,
+                check=False,
+            ).stderr
+            seen.append(said)
+
+    in_new_folder_while_another_waits(asset, second)
+    assert f"in use by pid {os.getpid()}" in seen[0]
+
+
+TAKE = """
+import sys
+from pathlib import Path
+from usdbrdf.job.lock import folder_lock
+with folder_lock(Path(sys.argv[1])):
+    pass
+"""
+
+
+def test_a_run_that_found_the_folder_busy_removes_nothing(tmp_path, toy):
+    asset = tmp_path / "room"
+    with owned_folder(asset):
+        thread = threading.Thread(target=lambda: refused(asset))
+        thread.start()
+        thread.join()
+        toy.run_toy(asset)
+    assert not toy.run_toy(asset).reran
+
+
+def refused(asset):
+    with pytest.raises(FolderBusy), owned_folder(asset):
+        pass
+
+
+# Links
+
+
+@pytest.mark.parametrize("name", [".usdbrdf", ".usdbrdf/stamps", ".usdbrdf/work", ".usdbrdf/lock"])
+def test_state_that_is_linked_out_of_the_asset_is_refused(tmp_path, toy, name):
+    asset, elsewhere = tmp_path / "room", tmp_path / "elsewhere"
+    toy.run_toy(asset)
+    (asset / name).rename(elsewhere)
+    (asset / name).symlink_to(elsewhere)
+    before = elsewhere.stat().st_size, names_in(elsewhere)
+    with pytest.raises(OwnershipConflict, match=r"leads out of .+\[ownership.link\]$"):
+        toy.run_toy(asset, 2)
+    assert (elsewhere.stat().st_size, names_in(elsewhere)) == before
+
+
+@pytest.mark.parametrize("name", ["textures", "layers"])
+def test_nothing_is_published_through_a_link_out_of_the_asset(tmp_path, toy, name):
+    asset, elsewhere = tmp_path / "room", tmp_path / "elsewhere"
+    toy.run_toy(asset)
+    (asset / name).rename(elsewhere)
+    (asset / name).symlink_to(elsewhere)
+    before = {path: path.read_bytes() for path in elsewhere.iterdir()}
+    with pytest.raises(OwnershipConflict, match=r"leads out of .+\[ownership.link\]$"):
+        toy.run_toy(asset, 2)
+    assert {path: path.read_bytes() for path in elsewhere.iterdir()} == before
+    (asset / name).unlink()
+    elsewhere.rename(asset / name)
+    assert toy.run_toy(asset, 2).reran
+
+
+def test_work_that_is_linked_out_is_not_emptied(tmp_path, toy, toy_process):
+    asset, elsewhere = tmp_path / "room", tmp_path / "elsewhere"
+    toy_process(asset, fault="kill@toy:before_publish")
+    (work,) = (asset / ".usdbrdf/work").iterdir()
+    work.rename(elsewhere)
+    work.symlink_to(elsewhere)
+    before = names_in(elsewhere)
+    with pytest.raises(OwnershipConflict, match=r"\[ownership.link\]$"):
+        toy.run_toy(asset)
+    assert names_in(elsewhere) == before
+
+
+def test_links_within_the_asset_and_of_the_asset_are_followed(tmp_path, toy):
+    (tmp_path / "disk/room/maps").mkdir(parents=True)
+    own_folder = tmp_path / "room"
+    own_folder.symlink_to(tmp_path / "disk/room")
+    (own_folder / "maps").rmdir()
+    toy.run_toy(own_folder)
+    (own_folder / "textures").rename(own_folder / "maps")
+    (own_folder / "textures").symlink_to("maps")
+    assert toy.run_toy(own_folder, 2).reran
+    assert not toy.run_toy(own_folder, 2).reran

@@ -14,8 +14,8 @@ from tests.scenes import ROOM
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_weaker
 from usdbrdf.asset.readers.scene import scene_from_stage
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.cli import main
+from usdbrdf.options import IngestOptions
 from usdbrdf.pipeline import working_on
 from usdbrdf.tasks.ingest import ingest
 from usdbrdf.untrusted.usd_meshes import meshes_from_usd

@@ -12,9 +12,10 @@ from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, estimates, quad, room, world_of
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import unwrap
+from usdbrdf.options import Sampling
 from usdbrdf.shading.albedo import albedo_from_irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 
 RHO = np.array([0.2, 0.5, 0.8])
 EMITTED = np.array([1.0, 0.5, 0.25])

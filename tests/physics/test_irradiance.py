@@ -8,8 +8,9 @@ from scipy import stats
 
 from tests.physics.chi2 import sidak
 from tests.physics.surfaces import World, box, estimates, room, world_of
+from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import Lights
 
 # Quads of the room and its two boxes; those of the lamp follow.

@@ -13,7 +13,8 @@ from tests.relighting.scenes import MATTE, cube, looking, material, photograph, 
 from usdbrdf.errors import UsageError
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import constant_map, preview_material
-from usdbrdf.relighting.insert import Insert, placed, with_material
+from usdbrdf.options import Insert
+from usdbrdf.relighting.insert import placed, with_material
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 
 _STUFF = material()

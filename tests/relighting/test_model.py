@@ -19,7 +19,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import Surface
-from usdbrdf.relighting.insert import Insert
+from usdbrdf.options import Insert
 from usdbrdf.relighting.inserted_models import surfaces_from_model
 from usdbrdf.relighting.relit_scene import relit_scene
 from usdbrdf.relighting.render import mitsuba_variant

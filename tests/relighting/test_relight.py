@@ -17,7 +17,8 @@ from tests.relighting.conftest import BASE
 from usdbrdf.cli import main
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.images import read_radiance
-from usdbrdf.relighting.relight import RelightOptions, relight
+from usdbrdf.options import RelightOptions
+from usdbrdf.relighting.relight import relight
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 
 # Half the fan of a square lamp, 3 m above: F = 4/(2 pi) * 2 * a/sqrt(1+a^2) atan(a/sqrt(1+a^2)).

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from usdbrdf.shading.clipped_groups import clipped_groups
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.shading.clipped_groups import clipped_groups
 
 WALL, LAMP = 2, 6
 BOUND = 3.0

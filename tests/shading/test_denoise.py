@@ -14,10 +14,11 @@ import pytest
 from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import give_back_freed, resident_bytes
-from usdbrdf.tasks.trace import denoised_irradiance
-from usdbrdf.transport.denoise import CHOICES, chosen_filter, denoise_lightmaps, denoise_picture
+from usdbrdf.options import Sampling
+from usdbrdf.shading.irradiance_map import denoised_irradiance
+from usdbrdf.transport.denoise import chosen_filter, denoise_lightmaps, denoise_picture
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 
 SIDE = 1.28  # m
 TEXELS = 64  # of the floor, along each side: 2 cm
@@ -176,7 +177,11 @@ def test_the_filter_gives_its_memory_back():
 
 def test_auto_is_the_filter_where_it_is_installed():
     pytest.importorskip("pyoidn", reason="the filter is Open Image Denoise's")
-    assert [chosen_filter(wanted) for wanted in CHOICES] == ["oidn", "none", "oidn"]
+    assert [chosen_filter(wanted) for wanted in ("auto", "none", "oidn")] == [
+        "oidn",
+        "none",
+        "oidn",
+    ]
 
 
 def test_without_the_package_auto_is_none_and_oidn_is_refused(monkeypatch):

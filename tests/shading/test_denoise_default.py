@@ -12,10 +12,10 @@ import usdbrdf
 from tests.scenes import make_capture
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.options import add_shade_options
-from usdbrdf.tasks.atlas import atlas_from_stage
 
 OPTIONS = usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64))
 
@@ -53,9 +53,9 @@ def test_the_asset_says_what_was_done_and_is_shaded_again_when_the_filter_appear
         patch.setitem(sys.modules, "pyoidn", None)
         assert _shaded(asset) == (True, "none", "none")
         assert _shaded(asset) == (False, "none", "none")
-    traced = atlas_from_stage(open_measured(asset)).map("irradiance")
+    traced = AssetMaps(open_measured(asset)).map("irradiance")
     assert _shaded(asset) == (True, "oidn", "oidn")
-    filtered = atlas_from_stage(open_measured(asset))
+    filtered = AssetMaps(open_measured(asset))
     np.testing.assert_array_equal(filtered.map("irradiance_raw"), traced)
     assert (filtered.map("irradiance") != traced).mean() > 0.5
     assert _shaded(asset) == (False, "oidn", "oidn")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +12,14 @@ import pytest
 import usdbrdf
 from tests.scenes import make_capture, ring_of_poses, write_ply
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import SceneObject
-from usdbrdf.tasks import texture as module
-from usdbrdf.tasks.atlas import MapWriter, TexelMap
+from usdbrdf.texturing import lit_texture as module
+from usdbrdf.texturing.lit_texture import LitTexture
 
 OPTIONS = usdbrdf.TextureOptions(texel_size=0.2)
 
@@ -37,14 +40,18 @@ def test_faces_wound_away_from_all_cameras_are_refused(tmp_path):
     assert not (tmp_path / "asset" / "textures").exists()
 
 
-def test_a_capture_that_shows_little_of_the_mesh_is_warned_about(capsys):
-    seen = np.arange(100) < 9
-    module._check_seen(seen, ~seen)
-    assert "91.0 % of the texels" in capsys.readouterr().err
-    module._check_seen(~seen, seen)
-    assert capsys.readouterr().err == ""
-    with pytest.raises(InputRefused, match="unseen"):
-        module._check_seen(np.zeros(3, bool), np.zeros(3, bool))
+def _texture_of(coverage: CoverageMap) -> LitTexture:
+    nothing = np.zeros((len(coverage.kind), 3), np.float32)
+    return LitTexture(
+        lit=nothing, mean=nothing, spread=nothing, samples=nothing[:, 0], coverage=coverage
+    )
+
+
+def test_a_capture_that_shows_little_of_the_mesh_is_warned_about():
+    some = np.arange(100) < 9
+    (doubt,) = _texture_of(CoverageMap.of(some, ~some)).doubts()
+    assert "91.0 % of the texels" in doubt
+    assert not [*_texture_of(CoverageMap.of(~some, some)).doubts()]
 
 
 def test_passes_for_lack_of_memory_change_no_byte(tmp_path, monkeypatch, capsys):
@@ -86,18 +93,18 @@ class _Picture:
 def test_large_values_are_kept_where_they_matter_and_counted_where_not(tmp_path, capsys):
     values = np.full((8, 3), 0.5, np.float32)
     values[3] = (70_001, 1, 70_003)
-    writer = MapWriter(StageRun(tmp_path, "texture", tmp_path / "work"), Asset(tmp_path, "a"),
-                       _Picture())  # fmt: skip
     obj = SceneObject(
         prim_path="/a/box", identifier="box", label="", class_name="", first_face=0, num_faces=1
     )
+    run = TaskRun(tmp_path, "texture", tmp_path / "work")
+    writer = MapWriter(run, Asset(tmp_path, "a"), SimpleNamespace(objects=[obj]), _Picture())
     writer.warn()
     assert capsys.readouterr().err == ""
     maps = {
         "lit": TexelMap(values, 1.0, "W/(m^2 sr)", exact=True),
         "mean": TexelMap(values, 1.0, "W/(m^2 sr)"),
     }
-    lit, mean = writer.write(0, obj, maps)
+    lit, mean = writer.write(0, maps)
     np.testing.assert_array_equal(read_exr(writer.run.output(lit.file)).reshape(8, 3), values)
     assert read_exr(writer.run.output(mean.file)).max() == 65_504
     assert writer.clamped == 2

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
+from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.light_sampling import Picked, PointDraws, Receivers, pick_triangles
 from usdbrdf.transport.lights import GROUP, LightGroups, Lights, TilePicks, weighed_groups
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, box, room, world_of
+from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Irradiance, Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 from usdbrdf.transport.light_sampling import turns
 from usdbrdf.transport.lights import picked
 from usdbrdf.transport.surface_texture import AHEAD

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 from pxr import Sdf, Usd
 
+from tests.fault_injection import inject
 from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
 from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.validation.cure_layer import write_cures
@@ -122,7 +123,7 @@ def test_a_file_that_appears_meanwhile_is_kept(built, monkeypatch):
 
 def test_a_disk_that_is_full_leaves_no_name_behind(built, monkeypatch):
     FAULTS["LookMaterial"](built)
-    monkeypatch.setenv("USDBRDF_FAULT", "enospc@publish:before_replace")
+    inject("enospc@publish:before_replace", monkeypatch)
     with pytest.raises(EnvironmentFailure, match="No space left"):
         write_cures(built.asset, built.asset.folder / "fixes.usda")
     assert not list(built.asset.folder.glob("*fixes*"))

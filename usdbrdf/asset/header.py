@@ -101,20 +101,17 @@ def read_provenance(layer: Path) -> dict[str, Any]:
 
 def open_metadata(layer: Path) -> Sdf.Layer:
     """A private copy of a layer's metadata, read from the file as it is now."""
-    try:
-        opened = Sdf.Layer.OpenAsAnonymous(str(layer), metadataOnly=True)
-    except Tf.ErrorException as error:
-        raise InputRefused(_unreadable(layer)) from error
-    if not opened:
-        raise InputRefused(_unreadable(layer))
-    return opened
-
-
-def _unreadable(layer: Path) -> str:
-    return (
+    refused = InputRefused(
         f"{layer}: this is not a readable USD layer. Run `usdbrdf convert` again, which makes it "
         "anew. [stage.unreadable]"
     )
+    try:
+        opened = Sdf.Layer.OpenAsAnonymous(str(layer), metadataOnly=True)
+    except Tf.ErrorException as error:
+        raise refused from error
+    if not opened:
+        raise refused
+    return opened
 
 
 def _dictionary(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -91,6 +91,12 @@ class Asset:
         """Path of an object's map, relative to the asset folder."""
         return f"textures/{identifier}.{aov}.exr"
 
+    def textures(self, *aovs: str) -> list[Path]:
+        """All objects' maps of these AOVs that are there, in the order of their names."""
+        endings = tuple(f".{aov}.exr" for aov in aovs)
+        files = (self.folder / "textures").glob("*.exr")
+        return sorted(file for file in files if endings and file.name.endswith(endings))
+
 
 def is_storable(path: Path) -> bool:
     """False if USD cannot hold the path: control characters, undecodable bytes, its own marks."""

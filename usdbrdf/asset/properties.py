@@ -13,7 +13,7 @@ from functools import cache
 from typing import Annotated, Any, Literal, get_type_hints
 
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
-from usdbrdf.model.arrays import Float
+from usdbrdf.model.arrays import Array, Float
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
 # away, not when one is added.
@@ -25,6 +25,12 @@ INSTANCE = "__INSTANCE_NAME__"
 Colour = tuple[float, float, float]
 
 
+def colour(values: Array) -> Colour:
+    """Three numbers as a record holds a colour."""
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
+
+
 @dataclass(frozen=True)
 class Schema:
     """An applied API schema, UsdBrdf<name>API.
@@ -32,6 +38,7 @@ class Schema:
     namespace  before the names of its attributes
     prims      the type of prim that it may be applied to
     key        the attribute that tells whether somebody measured what the schema is about
+    doc        what it is about; here and below line breaks count as spaces
     flag       the field of the record that says whether the schema applies; "": it always does
     """
 
@@ -64,7 +71,7 @@ class Fact:
 
     type      as USD spells it
     fallback  of the schema: what an application sees where nothing is authored
-    doc       documentation in the schema, with the unit of numbers; line breaks count as spaces
+    doc       documentation in the schema, with the unit of numbers
     tokens    all values that are allowed; () for any
     low, high  all values that make sense, bounds included, of each component
     samples   of a sequence with a value per frame: at "every" frame, or where it "changes"
@@ -91,10 +98,6 @@ class Fact:
     read: Callable[[Any], Any] = lambda value: value
 
     @property
-    def documentation(self) -> str:
-        return " ".join(self.doc.split())
-
-    @property
     def is_uniform(self) -> bool:
         return not (self.samples or self.varying)
 
@@ -113,46 +116,31 @@ class Fact:
         return self.schema.attribute(self.name, instance)
 
 
-OBJECT = Schema(
-    "Object", "usdBrdf", "Mesh", "label",
-    "One object of the capture's segmentation. A mesh without it is not one of ours.",
-)  # fmt: skip
-CAPTURE = Schema(
-    "Capture", "usdBrdf:capture", "Camera", "image",
-    "The photographs that a camera took, one per integer time code. Values between time codes mean "
-    "nothing.",
-)  # fmt: skip
-AOV = Schema(
-    "Aov", f"usdBrdf:aov:{INSTANCE}", "Mesh", "file",
-    "One map over the texture space (primvars:st) of an object, for review and for the next task.",
-)  # fmt: skip
-TEXTURING = Schema(
-    "Texturing", "usdBrdf:texturing", "Mesh", "texelSize",
-    "How well the photographs covered an object, and at which resolution its lit texture was "
-    "measured.",
-)  # fmt: skip
-SHADING = Schema(
-    "Shading", "usdBrdf:shading", "Mesh", "raysPerTexel",
-    "How the irradiance and the albedo of an object were estimated.",
-)  # fmt: skip
-FIT = Schema(
-    "MaterialFit", "usdBrdf:fit", "Mesh", "status",
-    "The fitted GGX lobe of one object. UsdPreviewSurface is derived from it as "
-    "usdBrdf:fit:mapping says.",
-)  # fmt: skip
-EMITTER = Schema(
-    "Emitter", "usdBrdf:emitter", "Mesh", "radiance",
-    "An object that emits light of its own. Its material has emissiveColor and no albedo.",
-    flag="emitter",
-)  # fmt: skip
+# Tables: one paragraph per row.
+# fmt: off
+OBJECT = Schema("Object", "usdBrdf", "Mesh", "label", """One object of the capture's segmentation. A
+    mesh without it is not one of ours.""")
+CAPTURE = Schema("Capture", "usdBrdf:capture", "Camera", "image", """The photographs that a camera
+    took, one per integer time code. Values between time codes mean nothing.""")
+AOV = Schema("Aov", f"usdBrdf:aov:{INSTANCE}", "Mesh", "file", """One map over the texture space
+    (primvars:st) of an object, for review and for the next task.""")
+TEXTURING = Schema("Texturing", "usdBrdf:texturing", "Mesh", "texelSize", """How well the
+    photographs covered an object, and at which resolution its lit texture was measured.""")
+SHADING = Schema("Shading", "usdBrdf:shading", "Mesh", "raysPerTexel", """How the irradiance and the
+    albedo of an object were estimated.""")
+FIT = Schema("MaterialFit", "usdBrdf:fit", "Mesh", "status", """The fitted GGX lobe of one object.
+    UsdPreviewSurface is derived from it as usdBrdf:fit:mapping says.""")
+EMITTER = Schema("Emitter", "usdBrdf:emitter", "Mesh", "radiance", """An object that emits light of
+    its own. Its material has emissiveColor and no albedo.""", flag="emitter")
 
 SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER)
 
 _CONFIDENCES = ("high", "low", "none")
 
+_CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
+    of the class the rest; none: {0} is the value of the class."""
 
-# A table: one paragraph per row.
-# fmt: off
+
 @dataclass(frozen=True, kw_only=True)
 class LabelledObject:
     """What makes a mesh one of our objects."""
@@ -309,12 +297,10 @@ class FittedObject(MeasuredObject):
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
-    phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none", """high: the
-        photographs determine phi; low: they say something of it, and the values of the class the
-        rest; none: phi is the value of the class.""", tokens=_CONFIDENCES)] = "none"
-    psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none", """high: the
-        photographs determine psi; low: they say something of it, and the values of the class the
-        rest; none: psi is the value of the class.""", tokens=_CONFIDENCES)] = "none"
+    phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none",
+        _CONFIDENCE.format("phi"), tokens=_CONFIDENCES)] = "none"
+    psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none",
+        _CONFIDENCE.format("psi"), tokens=_CONFIDENCES)] = "none"
     cost: Annotated[float, Fact(FIT, "cost", "float", 0.0, """Loss of the fit at its minimum: of
         method views per degree of freedom, in units of the errors' variance; of scaled the mean
         over the pixels used, relative to their squared radiance; of paper that in squared units of
@@ -345,6 +331,16 @@ class FittedObject(MeasuredObject):
     def is_known(self) -> bool:
         """Whether there is a lobe to show."""
         return math.isfinite(self.phi) and math.isfinite(self.psi)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What a summary says of the object, JSON."""
+        names = ("phi", "psi", "phi_error", "psi_error", "phi_confidence", "psi_confidence",
+                 "status", "evidence", "target_frame")
+        row = {name: getattr(self, name) for name in names}
+        row |= {name: round(value, 4) if math.isfinite(value) else None
+                for name, value in row.items() if isinstance(value, float)}
+        return row | {"evidence": row["evidence"] or 0.0}
 # fmt: on
 
 

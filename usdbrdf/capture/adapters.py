@@ -11,19 +11,17 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.formats import DESCRIPTIONS, MODULES
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.job.progress import say
-from usdbrdf.model.capture import Scan
+
+if TYPE_CHECKING:
+    from usdbrdf.model.capture import Scan
+    from usdbrdf.options import IngestOptions
 
 GROUP = "usdbrdf.adapters"
-
-_OURS = {
-    "transforms": "usdbrdf.capture.transforms",
-    "scanner-app": "usdbrdf.capture.scanner_app",
-}
 
 
 class AdapterModule(Protocol):
@@ -56,15 +54,33 @@ class Adapter:
     package: str = ""
 
 
+class _LoadedWhenUsed:
+    """A module whose members are there as soon as one of them is asked for."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, member: str) -> Any:
+        return getattr(import_module(self._name), member)
+
+
 def list_adapters(*, plugins: bool = True) -> tuple[Adapter, ...]:
     """Our adapters, then those of other packages by name (none of these if not ``plugins``).
 
     Broken ones are part of the list; they are reported once and never used.
     """
-    found = [_loaded(EntryPoint(name, module, GROUP)) for name, module in _OURS.items()]
+    found = [
+        Adapter(
+            name=name,
+            description=DESCRIPTIONS[name],
+            origin=origin,
+            module=cast(AdapterModule, _LoadedWhenUsed(origin)),
+        )
+        for name, origin in MODULES.items()
+    ]
     if plugins:
         # Installed, we are among the announced ourselves; our names cannot be taken over.
-        foreign = {p for p in entry_points(group=GROUP) if p.name not in _OURS}
+        foreign = {p for p in entry_points(group=GROUP) if p.name not in MODULES}
         found += [_loaded(p) for p in sorted(foreign, key=lambda p: (p.name, p.value))]
     return tuple(found)
 
@@ -88,7 +104,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
 def _loaded(point: EntryPoint) -> Adapter:
     try:
-        module: Any = import_module(point.value) if point.name in _OURS else point.load()
+        module: Any = point.load()
         missing = [
             name
             for name, kind in (("NAME", str), ("DESCRIPTION", str))
@@ -97,8 +113,6 @@ def _loaded(point: EntryPoint) -> Adapter:
         problem = f"it has no {', '.join(missing)}" if missing else ""
     # Foreign code runs here and may raise anything, SystemExit included.
     except (Exception, SystemExit) as error:
-        if point.name in _OURS:
-            raise
         module, problem = None, f"{type(error).__name__}: {error}"
     if problem:
         say(
@@ -112,7 +126,7 @@ def _loaded(point: EntryPoint) -> Adapter:
         description=module.DESCRIPTION,
         origin=point.value,
         module=cast(AdapterModule, module),
-        package="" if point.name in _OURS or point.dist is None else _name_of(point.dist),
+        package="" if point.dist is None else _name_of(point.dist),
     )
 
 
@@ -138,7 +152,7 @@ def _recognising(path: Path, adapters: tuple[Adapter, ...]) -> Adapter:
             if adapter.module.matches(path):
                 return adapter
         except Exception as error:
-            if adapter.name in _OURS:
+            if adapter.name in MODULES:
                 raise
             say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
     known = "; ".join(f"{a.name}: {a.description}" for a in adapters if a.module is not None)
@@ -156,7 +170,7 @@ def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     except UsdBrdfError:
         raise
     except Exception as error:
-        if adapter.name in _OURS:
+        if adapter.name in MODULES:
             raise
         raise InputRefused(
             f"{path}: adapter {adapter.name!r} ({adapter.origin}) failed: {error!r}. Report it to "

@@ -15,7 +15,6 @@ from usdbrdf.capture.checks import (
     rigid_records,
 )
 from usdbrdf.capture.findings import Findings, FrameRecord, frames_from_records
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.labels import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import known_encodings
@@ -25,6 +24,7 @@ from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
+from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import mesh_from_file
 from usdbrdf.untrusted.usd_meshes import meshes_from_usd
 

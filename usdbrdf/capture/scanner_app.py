@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.findings import Findings, FrameRecord
-from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -28,10 +28,11 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import image_size
 from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
 
 NAME = "scanner-app"
 
-DESCRIPTION = 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)'
+DESCRIPTION = DESCRIPTIONS[NAME]
 
 # The app's own names, the one with the whole surface first.
 _MESHES = ("export.obj", "textured_output.obj", "export.ply", "export_refined.obj")

@@ -12,7 +12,7 @@ import numpy as np
 
 from usdbrdf.capture.checks import refuse_photographs
 from usdbrdf.capture.findings import Findings, FrameRecord
-from usdbrdf.capture.ingest_options import IngestOptions
+from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -25,6 +25,7 @@ from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
 
 
 def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
@@ -39,7 +40,7 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
 
 NAME = "transforms"
 
-DESCRIPTION = "folder with transforms.json (nerfstudio), scene-linear images and a mesh"
+DESCRIPTION = DESCRIPTIONS[NAME]
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 

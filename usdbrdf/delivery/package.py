@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -43,25 +42,14 @@ from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsageError, Us
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.job.progress import warn
 from usdbrdf.model.material import turned_up
+from usdbrdf.options import PackageOptions
 
 USDZ, GLB = ".usdz", ".glb"
 
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
 _PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)
 
-DEFAULT, ARKIT = "default", "arkit"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PackageOptions:
-    """textures "exr" or "png"; None: exr, but png in .glb and for ARKit, which take nothing else.
-    max_size: pixels of a texture's longer side; look: which of the asset's, None: the one that it
-    opens in; profile: "default", or "arkit" for AR Quick Look."""
-
-    textures: str | None = None
-    max_size: int | None = None
-    look: str | None = None
-    profile: str = DEFAULT
+ARKIT = "arkit"
 
 
 def package(folder: Path, output: Path, options: PackageOptions | None = None) -> dict[str, Any]:
@@ -158,8 +146,6 @@ def _texture_options(output: Path, asset: Asset, options: PackageOptions) -> Pic
             f"--textures exr: {'ARKit' if suffix == USDZ else 'glTF'} knows PNG and JPEG only. "
             "[package.textures]"
         )
-    if options.max_size is not None and options.max_size < 1:
-        raise UsageError("--max-size: must be at least 1. [usage.option]")
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")
     asset.refuse_output(output, "package.output")

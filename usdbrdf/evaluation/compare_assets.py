@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.previews import camera_hits
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import MapError, map_error
@@ -24,7 +26,7 @@ from usdbrdf.evaluation.report import (
     table_text,
 )
 from usdbrdf.evaluation.truth import MIN_SAMPLES
-from usdbrdf.evaluation.viewed_asset import Atlas, camera_hits, measured_atlas
+from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.documents import write_json
@@ -131,7 +133,7 @@ def _percent(value: float | None) -> str:
     return "unknown" if value is None else f"{100 * value:.2f} %"
 
 
-def _in_both(a: Atlas, b: Atlas, maps: MapNames) -> bool:
+def _in_both(a: AssetMaps, b: AssetMaps, maps: MapNames) -> bool:
     return all(x.has(name) for x in (a, b) for name in maps)
 
 
@@ -166,7 +168,7 @@ class Relit:
     """On the texels of one asset, (T, 3) each: its radiance, the radiance predicted with the other
     asset's albedo, both albedos; the texels that are compared, (T,) bool."""
 
-    atlas: Atlas
+    atlas: AssetMaps
     measured: Float
     predicted: Float
     albedo: Float
@@ -182,7 +184,7 @@ class Relit:
         return map_error(self.predicted, self.measured, self.atlas.texels.area, part)
 
 
-def matched(atlas: Atlas, other: Atlas) -> tuple[Correspondence, Bool]:
+def matched(atlas: AssetMaps, other: AssetMaps) -> tuple[Correspondence, Bool]:
     """The other asset's texels on those of ``atlas``, and which are compared: (T,) bool, seen at
     least three times, inside a triangle and without emission, in both."""
     same = correspondence(atlas.scene, atlas.texels, other.scene, other.texels)
@@ -190,7 +192,9 @@ def matched(atlas: Atlas, other: Atlas) -> tuple[Correspondence, Bool]:
     return same, _comparable(atlas) & there & same.known()
 
 
-def relit(atlas: Atlas, other: Atlas, same: Correspondence, scored: Bool, maps: MapNames) -> Relit:
+def relit(
+    atlas: AssetMaps, other: AssetMaps, same: Correspondence, scored: Bool, maps: MapNames
+) -> Relit:
     """Predict the radiance of ``atlas`` with the albedo of ``other``."""
     theirs = same.interpolated(other.map_where_present(maps.albedo, 3))
     measured = atlas.map_where_present(maps.radiance, 3)
@@ -207,7 +211,7 @@ def relit(atlas: Atlas, other: Atlas, same: Correspondence, scored: Bool, maps: 
     )
 
 
-def _comparable(atlas: Atlas) -> Bool:
+def _comparable(atlas: AssetMaps) -> Bool:
     seen = atlas.map("samples")[:, 0] >= MIN_SAMPLES
     emits = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
     return np.asarray(seen & ~emits & atlas.texels.interior, np.bool_)

@@ -3,7 +3,6 @@ photographs: a row of figures and a sheet of pictures per view, and what is said
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ import numpy as np
 from scipy import ndimage
 
 from usdbrdf.asset.readers.views import Views, photographs_of_views
-from usdbrdf.errors import UsageError
 from usdbrdf.evaluation.metrics import Pair, finite, flip_maps, psnr, relative_l2
 from usdbrdf.evaluation.report import (
     FILES,
@@ -46,6 +44,7 @@ from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Byte, Float
 from usdbrdf.model.capture import Frames
+from usdbrdf.options import EvaluateOptions
 
 DOCUMENT = "evaluation.json"
 
@@ -59,46 +58,6 @@ _EXPOSURE_PIXELS = 1 << 24
 
 # Pixels of views that wait for FLIP together, at most: what bounds the memory.
 _WAITING_PIXELS = 1 << 23
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """How views are rendered, and what else is compared.
-
-    samples_per_pixel points that a pixel is the mean of, a square number
-    rays              per pixel, for the specular light
-    environment       latitude-longitude picture of the surroundings; None: black
-    truth             folder with objects.json and albedo_vertex.npz
-    mesh              the mesh that the truth's vertices belong to; None: mesh.ply beside ``truth``
-    allow_outside     folders that the views' document may point into
-    """
-
-    samples_per_pixel: int = 9
-    rays: int = 144
-    environment: Path | None = None
-    seed: int = 0
-    truth: Path | None = None
-    mesh: Path | None = None
-    allow_outside: tuple[Path, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.samples_per_pixel < 1 or self.per_side**2 != self.samples_per_pixel:
-            raise UsageError(
-                f"--samples-per-pixel {self.samples_per_pixel}: not a square number (1, 4, 9, "
-                "16, ...). [usage.option]"
-            )
-        if self.rays < 8 * self.samples_per_pixel:
-            raise UsageError(
-                f"--rays {self.rays}: at least 8 for each of a pixel's points are needed, here "
-                f"{8 * self.samples_per_pixel}. [usage.option]"
-            )
-        if self.mesh is not None and self.truth is None:
-            raise UsageError("--mesh: belongs to --truth, which is not given. [usage.option]")
-
-    @property
-    def per_side(self) -> int:
-        """Points along a side of a pixel."""
-        return math.isqrt(max(self.samples_per_pixel, 0))
 
 
 def evaluate(

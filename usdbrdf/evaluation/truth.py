@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import finite, map_error, nrmse
-from usdbrdf.evaluation.viewed_asset import Atlas
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.untrusted.mesh_files import mesh_from_file
@@ -38,7 +38,7 @@ Known: TypeAlias = Mapping[str, KnownObject]
 
 
 def compare_with_truth(
-    atlas: Atlas, folder: Path, mesh: Path | None, albedo: str
+    atlas: AssetMaps, folder: Path, mesh: Path | None, albedo: str
 ) -> dict[str, Any]:
     """NRMSE of the map named ``albedo`` and errors of phi and psi, whole and per object.
 
@@ -55,7 +55,7 @@ def compare_with_truth(
     }
 
 
-def known_objects(folder: Path, atlas: Atlas) -> Known:
+def known_objects(folder: Path, atlas: AssetMaps) -> Known:
     """The truth's objects by name; InputRefused where it lacks one of the asset's."""
     path = folder / "objects.json"
     try:
@@ -79,19 +79,19 @@ def known_objects(folder: Path, atlas: Atlas) -> Known:
     return known
 
 
-def emitters(atlas: Atlas, known: Known) -> Bool:
+def emitters(atlas: AssetMaps, known: Known) -> Bool:
     """(num_objects,) bool, objects that truly emit."""
     return np.array([known[obj.label].emits for obj in atlas.scene.objects])
 
 
-def scored_texels(atlas: Atlas, shines: Bool) -> Bool:
+def scored_texels(atlas: AssetMaps, shines: Bool) -> Bool:
     """(T,) bool: seen at least three times, on an object that does not emit, inside a triangle."""
     seen = atlas.map("samples")[:, 0] >= MIN_SAMPLES
     scored: Bool = seen & ~shines[atlas.texels.object_index()] & atlas.texels.interior
     return scored
 
 
-def albedo_error(atlas: Atlas, scored: Bool, found: Float, known: Float) -> dict[str, Any]:
+def albedo_error(atlas: AssetMaps, scored: Bool, found: Float, known: Float) -> dict[str, Any]:
     """NRMSE, area-weighted, and median relative errors of maps (T, 3) over the texels scored; NRMSE
     per object too."""
     area, owner = atlas.texels.area, atlas.texels.object_index()
@@ -103,7 +103,7 @@ def albedo_error(atlas: Atlas, scored: Bool, found: Float, known: Float) -> dict
     return {**map_error(found, known, area, scored)._asdict(), "objects": objects}
 
 
-def true_albedo(atlas: Atlas, folder: Path, mesh: Path) -> Float:
+def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
     """(T, 3), linear between the vertices of the capture's mesh, a PLY with ``object_id``: each
     face of ours is found in it by its centre, among those of the object of the same name."""
     source = mesh_from_file(mesh)
@@ -156,7 +156,7 @@ class _MaterialError(NamedTuple):
     measured: bool
 
 
-def material_error(atlas: Atlas, known: Known, shines: Bool) -> dict[str, Any]:
+def material_error(atlas: AssetMaps, known: Known, shines: Bool) -> dict[str, Any]:
     """Errors of phi and psi of each object that does not emit, and their means by status."""
     rows: dict[str, dict[str, Any]] = {}
     errors = []

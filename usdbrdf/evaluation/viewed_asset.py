@@ -15,16 +15,13 @@ import numpy as np
 
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.camera import Camera
-from usdbrdf.tasks.atlas import Atlas as Atlas
-from usdbrdf.tasks.atlas import atlas_from_stage
-from usdbrdf.tasks.lit import lit_scene
-from usdbrdf.tasks.preview import camera_hits as camera_hits
-from usdbrdf.tasks.surroundings import environment_from_file
+from usdbrdf.transport.environment import environment_from_file
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
@@ -65,18 +62,18 @@ class Quality(NamedTuple):
     seed: int
 
 
-def measured_atlas(folder: Path) -> tuple[Asset, Atlas]:
+def measured_atlas(folder: Path) -> tuple[Asset, AssetMaps]:
     """The maps of an asset that all steps have been through, without the artist's layer."""
     asset = Asset.made(folder)
-    return asset, atlas_from_stage(open_measured(asset))
+    return asset, AssetMaps(open_measured(asset))
 
 
-def map_or(atlas: Atlas, aov: str, otherwise: str) -> str:
+def map_or(atlas: AssetMaps, aov: str, otherwise: str) -> str:
     """The name of the first map where the asset has it, else of the second."""
     return aov if atlas.has(aov) else otherwise
 
 
-def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> ViewedAsset:
+def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Path | None) -> ViewedAsset:
     """Its light, its diffuse radiance (``diffuse``, else ``lit``), its lobes as the fit left them.
 
     environment  latitude-longitude picture of the surroundings, None: black
@@ -88,7 +85,7 @@ def viewed_asset(asset: Asset, atlas: Atlas, environment: Path | None) -> Viewed
             "first. [asset.incomplete]"
         )
     up_axis = read_header(asset.layer("scan")).up_axis
-    lit = lit_scene(atlas, environment_from_file(environment, up_axis))
+    lit = atlas.lit_scene(environment_from_file(environment, up_axis))
     diffuse = atlas.map_where_present(map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,

@@ -10,8 +10,6 @@ import errno
 import hashlib
 import os
 import secrets
-import signal
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +19,6 @@ from usdbrdf.errors import EnvironmentFailure
 TEMPORARY_PREFIX = ".tmp-"
 
 _BLOCK = 1 << 20  # bytes hashed at a time
-
-_passes: Counter[str] = Counter()  # how often each fault point was passed in this process
 
 
 def publish(staged: Path, final: Path) -> None:
@@ -39,9 +35,7 @@ def move(staged: Path, final: Path) -> None:
     """``publish`` of one of many files: the folder is still to be flushed."""
     with staged.open("rb") as file:
         os.fsync(file.fileno())
-    fault_point("publish:before_replace")
     os.replace(staged, final)
-    fault_point("publish:after_replace")
 
 
 def flush_folder(folder: Path) -> None:
@@ -82,25 +76,6 @@ def temporary_beside(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             staged.unlink()
-
-
-def fault_point(name: str) -> None:
-    """A place where the tests may kill this process or fill its disk; free otherwise.
-
-    Environment variable ``USDBRDF_FAULT``: ``kill@NAME`` (SIGKILL to ourselves) or
-    ``enospc@NAME`` (OSError ENOSPC); a ``:K`` after NAME means the K-th pass, counted from 1.
-    """
-    wanted = os.environ.get("USDBRDF_FAULT")
-    if not wanted:
-        return
-    _passes[name] += 1
-    action, _, where = wanted.partition("@")
-    if where not in (f"{name}:{_passes[name]}", name):
-        return
-    if action == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if action == "enospc":
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
-from usdbrdf.files.atomic import fault_point, publish, temporary_beside
+from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.model.arrays import Byte, Float
 
 MAX_SIDE = 65_536  # pixels
@@ -265,7 +265,6 @@ def _rgb_channels(names: Sequence[str]) -> list[int]:
 
 
 def _write(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
-    fault_point("image:before_write")
     output = oiio.ImageOutput.create(str(staged))
     done = output is not None and output.open(str(staged), spec) and output.write_image(pixels)
     message = "" if done else _message(output or oiio)

@@ -1,11 +1,12 @@
-"""Paths that a document names may not lead out of the folder that the document governs."""
+"""Paths that may not lead out of the folder that governs them: a document's, and our own writes."""
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, OwnershipConflict
 
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 
@@ -32,6 +33,20 @@ def contained(root: Path, candidate: str) -> Path:
     if not path.is_relative_to(home):
         raise _refused(root, candidate, "leads outside that folder")
     return path
+
+
+def inside(root: Path, place: Path) -> Path:
+    """``place`` itself; OwnershipConflict if links on the way to it lead out of ``root``.
+
+    To be asked right before each write below ``root``. Nothing need exist yet.
+    """
+    target = os.path.realpath(place)
+    if not Path(target).is_relative_to(os.path.realpath(root)):
+        raise OwnershipConflict(
+            f"{place}: a link that leads out of {root}, to {target}. Nothing is written through "
+            "it; put a folder in its place. [ownership.link]"
+        )
+    return place
 
 
 def _refused(root: Path, candidate: str, reason: str) -> InputRefused:

@@ -4,7 +4,7 @@ what is measured, or new ones by xatlas in a child process."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from scipy.sparse.csgraph import connected_components
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.child import run_child
+from usdbrdf.job.progress import say
 from usdbrdf.kernel import kernel
-from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.arrays import Array, Double, Float, Int
 from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.model.scene import Scene
 
@@ -108,6 +109,24 @@ def _paint(corners: Double, chart: Int, owner: Int) -> bool:
 PADDING = 4
 
 MAX_SIDE = 16384
+
+
+def charts_of_scene(
+    scene: Scene, given: Sequence[Float | None], texel_size: float
+) -> dict[str, Array]:
+    """New charts as ``unwrap`` makes them, but for objects that came with coordinates which are fit
+    for it: corner_uv (F, 3, 2), resolution (num_objects, 2).
+
+    given  per object (F_i, 3, 2), or None
+    """
+    corner_uv, resolution = unwrap(scene, texel_size)
+    for i, (obj, uv) in enumerate(zip(scene.objects, given, strict=True)):
+        corners = scene.points[scene.triangles[obj.faces]]
+        side = None if uv is None else atlas_side(uv, corners, texel_size)
+        if uv is not None and side is not None:
+            corner_uv[obj.faces], resolution[i] = uv, side
+            say(f"texture: {obj.identifier} keeps the texture coordinates that it came with")
+    return {"corner_uv": corner_uv, "resolution": resolution}
 
 
 def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:

@@ -1,4 +1,4 @@
-"""Finished pieces of an unfinished stage, each a file that carries its own hash in its name."""
+"""Finished pieces of an unfinished task, each a file that carries its own hash in its name."""
 
 from __future__ import annotations
 

@@ -15,37 +15,48 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from usdbrdf.errors import FolderBusy
-from usdbrdf.files.atomic import environment_failures
-from usdbrdf.job.progress import say
 
 _POLL_SECONDS = 0.2
 
-# POSIX record locks belong to the process: a second one from another thread would just succeed,
-# and closing any descriptor of the file would free the first.
-_held_here: set[Path] = set()
+# Which thread of this process has which lock file. POSIX record locks belong to the process: a
+# second one from another thread would just succeed, and closing any descriptor of the file would
+# free the first. A forked child has none of them.
+_holders: dict[str, int] = {}
 
-_guard = threading.Lock()
+os.register_at_fork(after_in_child=_holders.clear)
 
 
 @contextmanager
-def folder_lock(state_folder: Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold ``state_folder/lock``; FolderBusy, naming the holder, if it is taken after ``wait_s``.
+def folder_lock(
+    state_folder: Path, wait_s: float = 0.0, *, without_lock: bool = False
+) -> Iterator[None]:
+    """Hold ``state_folder/lock``; for the thread that holds it already, nothing happens.
 
-    ``fcntl.lockf`` and not ``flock``: a forked child would keep the latter alive. The file stays
-    and means nothing by itself; nobody ever has to delete it.
+    wait_s        how long to wait for another holder before FolderBusy, which names it
+    without_lock  go on where the file system has no locks, which is FolderBusy otherwise
+
+    The file stays and means nothing by itself; nobody ever has to delete it. FileNotFoundError: the
+    folder is not there, or was removed by the holder that this call waited for.
     """
+    # The library filelock gives none of this on all Pythons that we run on: its locks (flock)
+    # outlive us in forked children, its earlier versions empty the file of the one who waits for
+    # it, and where a file system has no locks it leaves a file that no death removes.
     path = state_folder.resolve() / "lock"
+    key, own = str(path), threading.get_ident()
+    if _holders.get(key) == own:
+        yield
+        return
     deadline = time.monotonic() + wait_s
-    while not _reserved(path):
+    while _holders.setdefault(key, own) != own:
         _wait_or_refuse(path, deadline, f"another thread of this process (pid {os.getpid()})")
     try:
-        with environment_failures(str(path)):
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         try:
-            while not _taken(descriptor, path):
+            while not _taken(descriptor, path, without_lock):
                 _wait_or_refuse(path, deadline, _holder(descriptor))
-            with environment_failures(str(path)):
-                _sign(descriptor)
+            if not os.path.samestat(os.fstat(descriptor), path.stat()):
+                raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
+            _sign(descriptor)
             try:
                 yield
             finally:
@@ -53,27 +64,28 @@ def folder_lock(state_folder: Path, wait_s: float = 0.0) -> Iterator[None]:
         finally:
             os.close(descriptor)
     finally:
-        _held_here.discard(path)
+        _holders.pop(key, None)
 
 
-def _reserved(path: Path) -> bool:
-    with _guard:
-        if path in _held_here:
-            return False
-        _held_here.add(path)
-        return True
+def is_held(state_folder: Path) -> bool:
+    """Whether this thread holds ``state_folder/lock``."""
+    return _holders.get(str(state_folder.resolve() / "lock")) == threading.get_ident()
 
 
-def _taken(descriptor: int, path: Path) -> bool:
+def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
     try:
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EAGAIN):
             return False
-        if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
-            say(f"{path}: this file system has no locks. See that nothing else writes here.")
-            return True
-        raise
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+            raise
+        if not without_lock:
+            raise FolderBusy(
+                f"{path.parent.parent}: this file system has no working locks ({error.strerror}), "
+                "so two runs could write here at once. See that nothing else does and run with "
+                "--without-lock, or name a folder on another disk. [lock.none]"
+            ) from error
     return True
 
 

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import ctypes
-import os
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 GIB = 1 << 30
 
-_CONTAINER = Path("/sys/fs/cgroup/memory.max")
+_CGROUPS = Path("/sys/fs/cgroup")
 
-_OF_PROCESS = Path("/proc/self/statm")
+_OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 def machine_bytes() -> int:
-    """The machine's memory, or less where a container may have less."""
-    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with suppress(OSError, ValueError):  # no such file, or "max"
-        machine = min(machine, int(_CONTAINER.read_text()))
-    return machine
+    """The machine's memory, or less where a container or a batch system allows less."""
+    return min([int(psutil.virtual_memory().total), *_limits()])
 
 
 def resident_bytes() -> int:
-    """What this process has now; 0 where the system does not tell."""
-    with suppress(OSError, ValueError, IndexError):
-        return int(_OF_PROCESS.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return 0
+    """What this process has now."""
+    return int(psutil.Process().memory_info().rss)
 
 
 def give_back_freed() -> None:
@@ -34,3 +31,26 @@ def give_back_freed() -> None:
     million texels two fifths of all that the process held."""
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def _limits() -> Iterator[int]:
+    """The limits of this process's control group and of all above it (versions 2 and 1).
+
+    Lines are ``0::/GROUP`` and ``N:memory:/GROUP``. In a container GROUP may be the host's name
+    for it, of which nothing is mounted but the root.
+    """
+    with suppress(OSError):
+        for line in _OWN_CGROUPS.read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            if controllers == "":
+                top, file = _CGROUPS, "memory.max"
+            elif "memory" in controllers.split(","):
+                top, file = _CGROUPS / "memory", "memory.limit_in_bytes"
+            else:
+                continue
+            place = top / group.strip("/")
+            for folder in (place, *place.parents):
+                with suppress(OSError, ValueError):  # no such file, or "max"
+                    yield int((folder / file).read_text())
+                if folder == top:
+                    break

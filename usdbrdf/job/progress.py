@@ -1,13 +1,19 @@
-"""What a waiting person sees: a bar on a terminal, now and then a plain line in a log."""
+"""What is told while a run works: a bar on a terminal or now and then a line in a log, on stderr;
+results on stdout.
+
+A reader that goes away, or a full disk behind stderr, never changes the work or its status.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from contextlib import suppress
+from typing import Any, TextIO, TypeVar
 
-from tqdm import tqdm
+from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 
 T = TypeVar("T")
 
@@ -23,10 +29,65 @@ def set_quiet(quiet: bool) -> None:
 
 
 def say(line: str) -> None:
-    """One plain line to stderr, above a running bar; control characters are shown, not obeyed."""
-    if _quiet or sys.stderr is None:
+    """One plain line to stderr unless quiet, above a running bar; control characters are shown, not
+    obeyed."""
+    if not _quiet:
+        tell(line)
+
+
+def tell(line: str) -> None:
+    """The same for what must be said, quiet or not."""
+    if sys.stderr is None:
         return
-    tqdm.write(printable(line), file=sys.stderr)
+    # No bar is running where it was never loaded.
+    tqdm: Any = sys.modules.get("tqdm")
+    try:
+        if tqdm is None:
+            sys.stderr.write(f"{printable(line)}\n")
+            sys.stderr.flush()
+        else:
+            tqdm.tqdm.write(printable(line), file=sys.stderr)
+    except (OSError, ValueError):  # the latter where it is closed
+        _give_up(sys.stderr)
+
+
+def show(text: str) -> None:
+    """Lines to stdout, for a person: who stops reading has seen enough. EnvironmentFailure where
+    they cannot be written."""
+    with suppress(BrokenPipeError):
+        _write(text)
+
+
+def hand_over(document: str) -> None:
+    """A whole document to stdout, for a program. Raises UsdBrdfError where nobody reads it, and
+    EnvironmentFailure where it cannot be written."""
+    try:
+        _write(document)
+    except BrokenPipeError as error:
+        raise UsdBrdfError(
+            "stdout: its reader went away before all was written. [environment.output]"
+        ) from error
+
+
+def _write(text: str) -> None:
+    try:
+        sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _give_up(sys.stdout)
+        raise
+    except OSError as error:
+        _give_up(sys.stdout)
+        raise EnvironmentFailure(
+            f"stdout cannot be written ({error.strerror}). [environment.output]"
+        ) from error
+
+
+def _give_up(stream: TextIO) -> None:
+    """Send what is left in a stream nowhere: the interpreter would try it once more at its end, and
+    make a status of the failure."""
+    with suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def warn(sentence: str) -> None:
@@ -39,6 +100,8 @@ def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Ite
     if _quiet or sys.stderr is None:
         yield from iterable
     elif sys.stderr.isatty():
+        from tqdm import tqdm
+
         yield from tqdm(
             iterable, total=total, desc=printable(label), unit=f" {unit}", file=sys.stderr
         )

@@ -1,6 +1,6 @@
-"""Run a stage so that it can be killed at any moment and started again by the same command.
+"""Run a task so that it can be killed at any moment and started again by the same command.
 
-Work happens in ``.usdbrdf/work/<stage>-<fingerprint>``: checkpoints of finished pieces, and the
+Work happens in ``.usdbrdf/work/<task>-<fingerprint>``: checkpoints of finished pieces, and the
 outputs under their final names. Only complete, verified outputs are published; a journal written
 before the first replacement lets the next run finish a publish that was interrupted half-way.
 The stamp comes last. Hold ``folder_lock`` around it: nothing here expects company.
@@ -15,18 +15,21 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, fault_point, sha256_of
+from usdbrdf.files.atomic import environment_failures, flush_folder, move, sha256_of
 from usdbrdf.files.documents import json_text
+from usdbrdf.files.paths import inside
 from usdbrdf.job.checkpoints import Checkpoints
 from usdbrdf.job.memory import give_back_freed
-from usdbrdf.job.publishing import can_publish, publish_stage
 from usdbrdf.job.stamp import (
+    STATE_FOLDER,
     Stamp,
     check_relative,
+    hashes_in,
     journal_path,
     read_stamp,
     stamp_of,
@@ -40,9 +43,12 @@ from usdbrdf.model.arrays import Array
 # takes: what a kill can cost, and what saving may.
 _SAVE_AFTER, _SAVE_SELDOM = 2.0, 30
 
+# What a layer points at is there before the layer: textures, binary layers, text layers.
+_RANK = {".usdc": 1, ".usd": 1, ".usda": 2}
+
 
 @dataclass(frozen=True, kw_only=True)
-class StageResult:
+class TaskResult:
     """summary: what the work returned, now or when it was done; reason: why it (re)ran or not."""
 
     summary: dict[str, Any]
@@ -50,8 +56,8 @@ class StageResult:
     reason: str
 
 
-class StageRun:
-    """What the work of a stage gets: places for its outputs, and checkpoints."""
+class TaskRun:
+    """What the work of a task gets: places for its outputs, and checkpoints."""
 
     def __init__(self, asset: Path, name: str, folder: Path) -> None:
         self.asset = asset
@@ -75,7 +81,7 @@ class StageRun:
         return self._place(relative, self.once)
 
     def checkpoint(self, key: str, compute: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
-        """The arrays of ``compute``, from an earlier run of the same stage if it got that far."""
+        """The arrays of ``compute``, from an earlier run of the same task if it got that far."""
         stored = self.checkpoint_if(key)
         if stored is not None:
             return stored
@@ -88,9 +94,8 @@ class StageRun:
         return self._checkpoints.load(key)
 
     def save(self, key: str, arrays: Mapping[str, Array]) -> None:
-        """Store arrays under ``key`` for a later run of the same stage."""
+        """Store arrays under ``key`` for a later run of the same task."""
         self._checkpoints.save(key, arrays)
-        fault_point(f"stage:{self.name}:checkpoint")
 
     def latest(self, prefix: str) -> tuple[int, dict[str, Array]] | None:
         """Index and arrays of the newest intact state that ``save_latest`` stored, or None."""
@@ -103,7 +108,6 @@ class StageRun:
     def save_latest(self, prefix: str, index: int, arrays: Mapping[str, Array]) -> None:
         """Store the state of a running computation after step ``index``; older ones are deleted."""
         self._checkpoints.save(prefix, arrays, index)
-        fault_point(f"stage:{self.name}:checkpoint")
         for other in self._checkpoints.indices(prefix):
             if other != index:
                 self._checkpoints.drop(prefix, other)
@@ -125,90 +129,131 @@ class StageRun:
             register.append(relative)
         path = self.staged / relative
         path.parent.mkdir(parents=True, exist_ok=True)
-        fault_point(f"stage:{self.name}:before_write")
         return path
 
 
-def run_stage(
+def run_task(
     asset: Path,
     name: str,
     *,
     order: int,
     parameters: Mapping[str, Any],
     inputs: Mapping[str, str],
-    work: Callable[[StageRun], dict[str, Any]],
-) -> StageResult:
-    """Bring one stage of an asset up to date.
+    work: Callable[[TaskRun], dict[str, Any]],
+) -> TaskResult:
+    """Bring what one task makes of an asset up to date.
 
     order        its place in the chain, part of the stamp's name
     parameters   all options that its outputs depend on (JSON)
     inputs       label -> SHA-256 of all that it reads
-    work         writes to ``StageRun.output`` places and returns a summary (JSON)
+    work         writes to ``TaskRun.output`` places and returns a summary (JSON)
 
     A run that was interrupted and resumed gives the same bytes as one that was not, provided that
     ``work`` depends on nothing but parameters, inputs and checkpoints.
+
+    Raises OwnershipConflict where a link leads out of the asset, EnvironmentFailure for what the
+    machine lacks, and whatever ``work`` raises; what was published before stays valid.
     """
     wanted = stamp_of(name, parameters, inputs)
-    folder = asset / ".usdbrdf" / "work" / f"{name}-{wanted.fingerprint}"
-    with environment_failures(f"stage {name}"):
+    work_folder = asset / STATE_FOLDER / "work"
+    folder = work_folder / f"{name}-{wanted.fingerprint}"
+    stamp, journal = stamp_path(asset, order, name), journal_path(asset, name)
+    with environment_failures(name):
+        for place in (stamp.parent, folder / "staged", folder / "checkpoints"):
+            inside(asset, place)
+        for place in (stamp.parent, work_folder):
+            place.mkdir(parents=True, exist_ok=True)
         reason = why_rerun(asset, order, wanted)
-        journal = read_stamp(journal_path(asset, name))
-        interrupted = journal is not None and journal.fingerprint == wanted.fingerprint
+        noted = read_stamp(journal)
+        interrupted = noted is not None and noted.fingerprint == wanted.fingerprint
+        for path in work_folder.iterdir():  # this task's work for other parameters
+            if re.fullmatch(rf"{re.escape(name)}-[0-9a-f]{{12}}", path.name) and path != folder:
+                shutil.rmtree(path, ignore_errors=True)
         if reason is None:
             if interrupted:
-                journal_path(asset, name).unlink()
+                journal.unlink()
             shutil.rmtree(folder, ignore_errors=True)
-            done = read_stamp(stamp_path(asset, order, name))
-            return StageResult(summary=done.summary if done else {}, reran=False, reason="done")
-        _sweep(asset, name, keep=folder)
-        if journal and interrupted and can_publish(asset, folder / "staged", journal):
-            publish_stage(asset, folder, journal, order)
-            return StageResult(summary=journal.summary, reran=True, reason="publish interrupted")
-        run = StageRun(asset, name, folder)
+            done = read_stamp(stamp)
+            return TaskResult(summary=done.summary if done else {}, reran=False, reason="done")
+        if noted and interrupted and _can_publish(asset, folder / "staged", noted):
+            _publish(asset, folder, noted, order)
+            return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
+        run = TaskRun(asset, name, folder)
         summary = json.loads(json_text(work(run)))
-        finished = replace(wanted, summary=summary, **_staged(run))
-        finished = replace(finished, earlier=_earlier(asset, order, finished))
-        fault_point(f"stage:{name}:before_publish")
-        write_stamp(journal_path(asset, name), finished)
-        publish_stage(asset, folder, finished, order)
+        outputs = _hashes_of_staged(run)
+        # The hashes of this task's files as they may lie there now, and of what is about to be
+        # replaced, such as an empty layer that another task put there.
+        earlier = hashes_in([read_stamp(stamp), noted])
+        for relative in outputs:
+            if (asset / relative).is_file():
+                earlier.setdefault(relative, set()).add(sha256_of(asset / relative))
+        finished = replace(
+            wanted,
+            outputs=outputs,
+            once=sorted(run.once),
+            summary=summary,
+            earlier={relative: sorted(hashes) for relative, hashes in earlier.items()},
+        )
+        write_stamp(journal, finished)
+        _publish(asset, folder, finished, order)
         give_back_freed()
-        return StageResult(summary=summary, reran=True, reason=reason)
+        return TaskResult(summary=summary, reran=True, reason=reason)
 
 
-def _staged(run: StageRun) -> dict[str, Any]:
+def _hashes_of_staged(run: TaskRun) -> dict[str, str]:
     for relative in (*run.outputs, *run.once):
         if not (run.staged / relative).is_file():
-            raise UsdBrdfError(f"stage {run.name} did not write {relative}. [stage.output]")
-    hashes = {relative: sha256_of(run.staged / relative) for relative in run.outputs}
-    return {"outputs": hashes, "once": sorted(run.once)}
+            raise UsdBrdfError(f"the task {run.name} did not write {relative}. [task.output]")
+    return {relative: sha256_of(run.staged / relative) for relative in run.outputs}
 
 
-def _earlier(asset: Path, order: int, finished: Stamp) -> dict[str, list[str]]:
-    """The hashes of this stage's files as they may lie there now: from its stamp and journal, and
-    of what is about to be replaced, such as an empty layer that another stage put there."""
-    earlier: dict[str, set[str]] = {}
-    for stamp in (
-        read_stamp(stamp_path(asset, order, finished.stage)),
-        read_stamp(journal_path(asset, finished.stage)),
-    ):
-        for relative, sha256 in (stamp.outputs if stamp else {}).items():
-            earlier.setdefault(relative, set()).add(sha256)
-        for relative, hashes in (stamp.earlier if stamp else {}).items():
-            earlier.setdefault(relative, set()).update(hashes)
-    for relative in finished.outputs:
-        if (asset / relative).is_file():
-            earlier.setdefault(relative, set()).add(sha256_of(asset / relative))
-    return {relative: sorted(hashes) for relative, hashes in earlier.items()}
+def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
+    """Whether every output of an interrupted publish is in the asset or still waits, intact."""
+    return all(
+        any(f.is_file() and sha256_of(f) == sha256 for f in (asset / relative, staged / relative))
+        for relative, sha256 in journal.outputs.items()
+    ) and all(
+        (asset / relative).is_file() or (staged / relative).is_file() for relative in journal.once
+    )
 
 
-def _sweep(asset: Path, name: str, keep: Path) -> None:
-    """Delete this stage's work for other parameters, and what killed processes left half."""
-    ours = re.compile(re.escape(name) + r"-[0-9a-f]{12}")
-    state = asset / ".usdbrdf"
-    for folder in ("stamps", "work"):
-        (state / folder).mkdir(parents=True, exist_ok=True)
-    for path in (state / "work").iterdir():
-        if ours.fullmatch(path.name) and path != keep:
-            shutil.rmtree(path, ignore_errors=True)
-    for litter in (*state.glob(f"{TEMPORARY_PREFIX}*"), *state.glob(f"*/{TEMPORARY_PREFIX}*")):
-        litter.unlink(missing_ok=True)
+def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
+    """Replace the outputs, delete those that are no longer made, write the stamp, clean up; every
+    step can be repeated."""
+    staged = folder / "staged"
+    for _, outputs in groupby(sorted(journal.outputs, key=_place_in_order), key=_rank):
+        for changed in {_moved_into(asset, staged, relative) for relative in outputs}:
+            flush_folder(changed)
+    for relative in journal.once:
+        if not (asset / relative).exists():
+            flush_folder(_moved_into(asset, staged, relative))
+    _retire(asset, journal)
+    write_stamp(stamp_path(asset, order, journal.stage), replace(journal, earlier={}))
+    journal_path(asset, journal.stage).unlink()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _moved_into(asset: Path, staged: Path, relative: str) -> Path:
+    """The folder of an output that has been moved there, or had been already."""
+    folder = inside(asset, (asset / relative).parent)
+    if (staged / relative).is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        move(staged / relative, asset / relative)
+    return folder
+
+
+def _retire(asset: Path, journal: Stamp) -> None:
+    """Delete what earlier runs made and this one did not, unless somebody edited it."""
+    for relative, hashes in journal.earlier.items():
+        path = asset / relative
+        if relative not in journal.outputs and path.is_file() and sha256_of(path) in hashes:
+            inside(asset, path.parent)
+            path.unlink()
+
+
+def _rank(relative: str) -> int:
+    return _RANK.get(Path(relative).suffix, 0)
+
+
+def _place_in_order(relative: str) -> tuple[int, str]:
+    return _rank(relative), relative

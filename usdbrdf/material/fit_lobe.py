@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.material.lobe_posterior import (
     NOTHING_KNOWN,
     LobeEstimate,
@@ -26,7 +27,8 @@ Pair = tuple[Float, Float]
 
 # Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
 # many with rays of their own.
-_NOISY, _REPEATS = 0.5, 4
+_NOISY = calibration.number("fit.noisy_rays")
+_REPEATS = 4
 
 
 def error_of_rays(

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.material.target_frames import mirror_hits_emitter, object_pixels
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.transport.lit_scene import (
@@ -27,8 +28,7 @@ Projection = Callable[[Double], Double]
 
 GRID = 11
 
-# Costs this close, relatively, are not told apart by some thousand noisy pixels.
-_FLAT = 0.01
+_FLAT = calibration.number("fit_of_frame.flat_cost")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,8 +131,7 @@ Residual = Literal["paper", "scaled"]
 # turns within a pixel; taken at its centre alone, the highlight looks rougher than it is.
 _SUB_PIXEL = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
 
-# Fewer pixels than this say nothing about two parameters.
-MIN_PIXELS = 12
+MIN_PIXELS = calibration.count("fit_of_frame.min_pixels")
 
 
 def fit_target_frame(

@@ -13,6 +13,7 @@ from functools import reduce
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
 from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.observations import Observations
@@ -24,40 +25,28 @@ from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
-# A sample spreads over the pixels, by this many of standard deviation: half a pixel for a camera's
-# own blur, 0.4 for bilinear reading, 0.3 for the pixel's area.
-_FOOTPRINT = 0.7
+_FOOTPRINT = calibration.number("fit.footprint")
 
-# Pictures are often smoothed besides. On curved objects, whose highlights that widens, these are
-# tried as well, as long as so many of the samples keep the whole footprint on the object.
-_WIDER = (0.5, 1.0, 1.4, 2.0)
+_WIDER = calibration.numbers("fit.wider_footprints")
 
-_KEPT = 0.4
+_KEPT = calibration.number("fit.kept_in_footprint")
 
-# How likely each is follows a normal distribution of the logarithm about the width that the
-# pictures' noise tells: what smooths noise may leave bright highlights sharper.
-_SPREAD_OF_WIDTHS = math.log(1.5)
+_SPREAD_OF_WIDTHS = math.log(calibration.number("fit.spread_of_footprints"))
 
-# From this deviation of the normal over a footprint on, in radians, an object counts as curved.
-_CURVED = 0.01
+_CURVED = calibration.number("fit.curved_from")
 
-# Fewer samples do not tell the variances of their errors: with 54 a ring was measured, and off by
-# three times what was stated.
-MIN_OBSERVATIONS = 100
+MIN_OBSERVATIONS = calibration.count("fit.min_observations")
 
-_MIN_VIEWS = 3
+_MIN_VIEWS = calibration.count("fit.min_views")
 
-# A frame in which the texel's mean is not this many times the noise floor is left out: there only
-# the brighter samples would be valid.
-_ABOVE_NOISE = 4.0
+_ABOVE_NOISE = calibration.number("fit.above_noise")
 
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 
 _TIMES_FOR_CURVED = 2
 
-# Frames' errors hang together over about this many pixels.
-_PATCH_PIXELS = 16.0
+_PATCH_PIXELS = calibration.number("fit.shared_error_size")
 
 
 def fit_views(

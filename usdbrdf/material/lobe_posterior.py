@@ -8,18 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Double
 
 _PSI_GRID = np.linspace(0, 1, 201)
 
-# Differences of the cost by this share of the whole are not told apart, however many the samples:
-# on captures with known materials, errors of the model explained 0.2 to 3 % of the cost of objects
-# that show no lobe.
-_MODEL_DISCREPANCY = 0.01
+_MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 
-# How much pictures are smoothed is known badly: a footprint this many times as wide may be the true
-# one, and what it would add to phi is left open.
-_BADLY_KNOWN = 1.5
+_BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
 
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import SAMPLE, first_surfaces, samples_from_frame
@@ -22,12 +23,10 @@ from usdbrdf.transport.warps import shifts_of
 # Side of the squares in texels, which are about as large as pixels.
 SIDE = 4.0
 
-# Normals this far apart, as a cosine, do not count as one plane's: 0.02 radians.
-_FLAT = 0.9998
+_FLAT = calibration.number("observations.flat_cosine")
 
-# An object is seen in squares if so many of its texels have one, and these are no wider than this
-# share of the scene: from within it a few hundredths of a radian.
-_MOST, _WIDEST = 0.5, 0.02
+_MOST = calibration.number("observations.squares_share")
+_WIDEST = calibration.number("observations.widest_square")
 
 
 def sides_of_samples(texels: Texels, usable: Bool, diagonal_m: float) -> tuple[Float, Bool]:
@@ -61,15 +60,13 @@ def on_flat_squares(texels: Texels, reach: int) -> Bool:
 # The noise is looked at in tiles of so many pixels that show one object alone, so many per frame.
 _TILE, _TILES = 24, 60
 
-_FEWEST_TILES = 30
+_FEWEST_TILES = calibration.count("observations.noise.min_tiles")
 
 _LAGS = 3
 
-# Errors of the model hang together a little too: less than this at neighbouring pixels is nothing,
-# and what hangs together farther than any smoothing, in pixels, is structure of the surface.
-_WHITE = 0.05
+_WHITE = calibration.number("observations.noise.white")
 
-_WIDEST_BLUR = 3.0
+_WIDEST_BLUR = calibration.number("observations.noise.widest_blur")
 
 
 def noise_correlation(lit: LitScene, view: View) -> Double:
@@ -137,7 +134,7 @@ _KEPT = 200
 
 _VIEWS = 12
 
-_MIN_VIEWS = 3
+_MIN_VIEWS = calibration.count("observations.min_views")
 
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
 # whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
@@ -147,7 +144,8 @@ _FEWEST = 40
 
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
-_PROXY_RAYS, _PROXY_ALPHA = 4, 0.15
+_PROXY_RAYS = 4
+_PROXY_ALPHA = calibration.number("observations.proxy_alpha")
 
 # How far pictures were smoothed is measured on about so many frames.
 _FRAMES_OF_NOISE = 20

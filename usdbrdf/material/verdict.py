@@ -5,28 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from usdbrdf import calibration
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN
 
-# How far objects of one class lie apart, as a standard deviation.
-PRIOR_ERROR = 0.25
+PRIOR_ERROR = calibration.number("prior.error")
 
-NEUTRAL = (0.5, 0.5)
+NEUTRAL = calibration.pair("prior.neutral")
 
-_OF_WORD: dict[str, tuple[float, float]] = {
-    # Matte paint and plaster.
-    "ceiling": (0.8, 0.2), "wall": (0.6, 0.3), "column": (0.6, 0.3),
-    # Fabric and fibres.
-    "sofa": (0.9, 0.1), "couch": (0.9, 0.1), "cushion": (0.9, 0.1), "pillow": (0.9, 0.1),
-    "curtain": (0.9, 0.1), "bed": (0.9, 0.1), "carpet": (0.9, 0.1), "rug": (0.9, 0.1),
-    "fabric": (0.9, 0.1), "towel": (0.9, 0.1), "cloth": (0.9, 0.1), "armchair": (0.9, 0.1),
-    "paper": (0.7, 0.3), "book": (0.5, 0.4), "cardboard": (0.8, 0.2),
-    # Varnished or coated boards.
-    "table": (0.3, 0.5), "desk": (0.3, 0.5), "cabinet": (0.3, 0.5), "shelf": (0.3, 0.5),
-    "door": (0.3, 0.5), "wood": (0.3, 0.5), "floor": (0.3, 0.5), "chair": (0.4, 0.5),
-    # Glass, screens, glazed ware.
-    "screen": (0.02, 0.5), "tv": (0.02, 0.5), "monitor": (0.02, 0.5), "window": (0.01, 0.5),
-    "glass": (0.01, 0.5), "mirror": (0.01, 1.0), "vase": (0.1, 0.5), "ceramic": (0.1, 0.5),
-}  # fmt: skip
+_OF_WORD = calibration.pairs("prior.classes")
 
 
 def class_prior(class_name: str, label: str) -> tuple[float, float]:
@@ -50,24 +36,17 @@ def with_prior(
     return mean, (precision + of_prior) ** -0.5
 
 
-# From this evidence on a fit is a measurement; below the lower one the frames do not tell one
-# material from another. On fifteen captures with known materials, most of them halves and thirds of
-# others, frames' errors alone reached 0.15 on objects without a highlight, and fits of flat objects
-# with 0.2 to 0.3 were off by up to 0.21 in psi, those with 0.35 to 0.5 by at most 0.05 and 0.08.
-MIN_EVIDENCE, SOME_EVIDENCE = 0.35, 0.2
+MIN_EVIDENCE = calibration.number("verdict.min_evidence")
+SOME_EVIDENCE = calibration.number("verdict.some_evidence")
 
-# A parameter is known if its standard deviation is at most this.
-MAX_PHI_ERROR, MAX_PSI_ERROR = 0.1, 0.17
+MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
+MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 
-# A blurred highlight is wider, but holds the same light: of the share of phi that the footprint may
-# account for, this much counts for psi too.
-_PSI_SHARE = 1 / 3
+_PSI_SHARE = calibration.number("verdict.footprint_in_psi")
 
-# The fit of a single frame has no errors of its own: roughnesses that far apart must not fit alike,
-# and its evidence counts from here on.
-_MAX_FLAT_PHI = 0.4 / math.sqrt(12)
+_MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 
-_MIN_EVIDENCE_OF_FRAME = 0.1
+_MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, sparse
 
+from usdbrdf import calibration
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 
@@ -179,8 +180,8 @@ def _frame(
     )
 
 
-# Independent errors, relative to the radiance and to its specular part, before they are scaled.
-_INDEPENDENT, _OF_SPECULAR = 0.012, 0.05
+_INDEPENDENT = calibration.number("errors.independent")
+_OF_SPECULAR = calibration.number("errors.of_specular")
 
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
@@ -188,11 +189,9 @@ _FIRST_GUESS, _LEAST = 0.02, 1e-4
 # With more shared errors than this, patches are made larger, up to the object.
 _MOST_EFFECTS = 2500
 
-# Degrees of freedom of Student's t.
-_TAIL = 15.0
+_TAIL = calibration.number("errors.student_freedom")
 
-# A texel's own diffuse radiance is taken to be at least this share of its mean radiance.
-_LEAST_LEVEL = 0.1
+_LEAST_LEVEL = calibration.number("errors.least_diffuse")
 
 
 @dataclass(frozen=True, kw_only=True)

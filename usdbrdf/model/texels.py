@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -77,6 +77,11 @@ class Texels:
         own = self.pixel[self.of_object(index)] - self.first_pixel[index]
         values: npt.NDArray[Number] = image.reshape(-1, *image.shape[2:])[own]
         return values
+
+    def mean_of_object(self, index: int, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(...): the mean over one object's surface of per-texel values (T, ...)."""
+        own = self.of_object(index)
+        return np.average(values[own], axis=0, weights=np.maximum(self.area[own], 1e-12))
 
     def object_index(self) -> Int:
         """(T,) int32, the object of each texel."""

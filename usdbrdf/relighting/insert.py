@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,49 +16,10 @@ from usdbrdf.model.material import (
     normal_reflectance,
     preview_material,
 )
+from usdbrdf.options import Insert
 from usdbrdf.transport.rays import RayScene
 
 _UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Insert:
-    """A model and what to do with it. Lengths in units of the asset's stage.
-
-    at          (3,) where the model's origin comes to lie; None: the stage's origin
-    drop        (2,) or (3,) the horizontal coordinates over which it falls, and from what height
-    matrix      (4, 4) world from model, column vectors, instead of these, of scale and of rotation
-    scale       factor on the model's size
-    rotate_deg  about the up axis, counter-clockwise seen from above
-    up          the model's up axis, "Y" or "Z"; None: as its format says
-    roughness, ior, metallic, color   of the material, instead of the model's own; ior alone makes
-                a dielectric
-
-    UsageError where a matrix comes with a scale or a rotation, which it holds itself.
-    """
-
-    model: Path
-    at: tuple[float, ...] | None = None
-    drop: tuple[float, ...] | None = None
-    matrix: Double | None = None
-    scale: float = 1.0
-    rotate_deg: float = 0.0
-    up: str | None = None
-    roughness: float | None = None
-    ior: float | None = None
-    metallic: float | None = None
-    color: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if self.matrix is not None and (self.scale != 1.0 or self.rotate_deg != 0.0):
-            raise UsageError(
-                f"--insert {self.model}: scale= and rotate= have no effect beside matrix=. Put "
-                "them into the matrix. [relight.insert]"
-            )
-
-    @property
-    def falls_from_eye_height(self) -> bool:
-        return self.drop is not None and len(self.drop) == 2
 
 
 def rotation_about(up_axis: str, degrees: float) -> Double:

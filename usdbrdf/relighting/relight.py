@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,52 +25,15 @@ from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
 from usdbrdf.job.progress import say, warn
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.camera import Camera
-from usdbrdf.relighting.insert import Insert
+from usdbrdf.options import RelightOptions
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
 from usdbrdf.relighting.render import mitsuba_variant, render_view
-from usdbrdf.transport.denoise import AUTO, OIDN, chosen_filter, denoise_picture
-
-MIN_BOUNCES = 4
+from usdbrdf.transport.denoise import OIDN, chosen_filter, denoise_picture
 
 LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
 
 _LEVELS = 1 << 16  # pixels of a picture that the exposure is taken from
-
-
-@dataclass(frozen=True, kw_only=True)
-class RelightOptions:
-    """What to render.
-
-    lights         USD file with lights or glowing meshes, or latitude-longitude .exr or .hdr; None
-                   is the light of the asset itself
-    keep_emitters  leave the asset's own light on beside ``lights``
-    inserts        models to put in
-    camera         prim path of a camera; None is the capture's
-    frame          time code; None is the earliest
-    views          document with poses, instead of a camera
-    samples        paths per pixel
-    bounces        reflections along a path, at least 4; in a bright room the ninth and later ones
-                   bring more than 1 % of the light
-    width          pixels; None is the camera's own
-    denoise        "none", "oidn", or "auto": oidn where it is installed
-    exposure       stops, for PNG and JPEG; None is automatic
-    format         extension of the pictures of ``views``
-    """
-
-    lights: Path | None = None
-    keep_emitters: bool = False
-    inserts: tuple[Insert, ...] = ()
-    camera: str | None = None
-    frame: float | None = None
-    views: Path | None = None
-    samples: int = 256
-    bounces: int = 32
-    width: int | None = None
-    seed: int = 0
-    denoise: str = AUTO
-    exposure: float | None = None
-    format: str = "exr"
 
 
 def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
@@ -196,13 +158,6 @@ def write_picture(path: Path, radiance: Float, stops: float) -> None:
 
 def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
     """Everything that can be refused before the renderer is started."""
-    if options.bounces < MIN_BOUNCES:
-        raise UsageError(
-            f"--bounces {options.bounces}: light between surfaces needs at least {MIN_BOUNCES}. "
-            "[relight.bounces]"
-        )
-    if options.samples < 1 or (options.width is not None and options.width < 1):
-        raise UsageError("--samples and --width must be at least 1. [relight.size]")
     if options.views is None and output.suffix.lower() not in (*LINEAR, *DISPLAYED):
         raise UsageError(
             f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}. Choose one of "

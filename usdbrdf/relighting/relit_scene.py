@@ -18,7 +18,8 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
 from usdbrdf.model.material import Surface, turned_up
-from usdbrdf.relighting.insert import Insert, placed, with_material
+from usdbrdf.options import Insert
+from usdbrdf.relighting.insert import placed, with_material
 from usdbrdf.relighting.inserted_models import surfaces_from_model
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their

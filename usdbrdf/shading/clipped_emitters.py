@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.shading.lamp_evidence import (
     AMBIENT_SPREAD,
@@ -31,29 +32,23 @@ from usdbrdf.shading.lamp_evidence import (
     weight_without_mean,
 )
 
-# With a larger relative standard error nothing is claimed.
-MAX_ERROR = 0.5
+MAX_ERROR = calibration.number("lamps.max_error")
 
-# What surfaces that obey the model exactly would still not tell: errors of the geometry, of the
-# Lambertian model, of a lamp that is not evenly bright.
-_LEAST_ERROR = 0.02
+_LEAST_ERROR = calibration.number("lamps.least_error")
 
-# Fewer objects than this are too few to tell from them how much objects differ.
-_FEW_OBJECTS = 8
+_FEW_OBJECTS = calibration.count("lamps.few_objects")
 
-_STUDENT_FREEDOM = 4.0
+_STUDENT_FREEDOM = calibration.number("lamps.student_freedom")
 
 _ROUNDS = 6
 
 _STEPS = 30
 
-# Of log g, log-normal and wide: keeps the undetermined ones finite.
-LAMP_PRIOR = (1.4, 1.5)
+LAMP_PRIOR = calibration.pair("lamps.prior")
 
-# First noise, agreeing part (both of log L_d) and its length in metres; and their limits.
-_START = np.log([0.05, 0.05, 0.5])
+_START = np.log(calibration.numbers("lamps.errors.start"))
 
-_LIMITS = np.log([[0.003, 1.0], [0.003, 1.0], [0.05, 5.0]])
+_LIMITS = np.log(calibration.numbers("lamps.errors.limits")).reshape(3, 2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,18 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.texels import Texels
 
-# pi L_d / S above this is emission. Specular light kept in L_d reaches about 1.1 on glossy dark
-# surfaces; lamps start near 3: between the two the exact value does not matter.
-EMITTER_RATIO = 1.2
+EMITTER_RATIO = calibration.number("emitters.ratio")
 
-# An object more than half of whose seen surface shines is a lamp as a whole, its unseen back too.
-_WHOLE_LAMP = 0.5
+_WHOLE_LAMP = calibration.number("emitters.whole_lamp")
 
-# A lit part of an object must hang together over this many texels: single ones are noise.
-_MIN_PATCH = 16
+_MIN_PATCH = calibration.count("emitters.min_texels")
 
 
 @dataclass(frozen=True, kw_only=True)

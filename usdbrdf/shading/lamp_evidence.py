@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from usdbrdf import calibration
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double, Float, Int
 
@@ -104,16 +105,13 @@ def restricted_cost(matrix: Double, residual: Double) -> float:
     return cost
 
 
-# A segment needs this many texels to say anything about differences on it.
-_MIN_SEGMENT = 6
+_MIN_SEGMENT = calibration.count("lamps.min_segment")
 
-# L_d holds the specular light that all frames see: that of the surroundings, at about the normal
-# reflectance of a dielectric. It does not follow the lamps, so it must not be taken for albedo. Its
-# share of S_0 / pi, how much that differs between surfaces, and how wrong it may be for them all.
-_AMBIENT, AMBIENT_SPREAD, _AMBIENT_ERROR = 0.015, 0.02, 0.015
+_AMBIENT = calibration.number("lamps.ambient")
+AMBIENT_SPREAD = calibration.number("lamps.ambient_spread")
+_AMBIENT_ERROR = calibration.number("lamps.ambient_error")
 
-# It is never more than this share of L_d.
-_MOSTLY_AMBIENT = 0.75
+_MOSTLY_AMBIENT = calibration.number("lamps.mostly_ambient")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,24 +7,25 @@ import math
 import numpy as np
 from trimesh.bounds import oriented_bounds_2D
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.light import LampShape
+from usdbrdf.model.scene import Scene
+from usdbrdf.model.texels import Texels
 
 # A lamp is replaced by at most so many flat lights (a box has six sides), which together must
 # carry this share of its power.
-_MAX_PARTS, _COVERED = 6, 0.98
+_MAX_PARTS = 6
+_COVERED = calibration.number("lamp_shapes.covered")
 
-# Faces of one flat part: normals within this angle of its own, and no further from its plane than
-# this share of its diagonal.
-_SAME_DIRECTION, _FLAT = math.cos(math.radians(15)), 0.02
+_SAME_DIRECTION = math.cos(math.radians(calibration.number("lamp_shapes.same_direction")))
+_FLAT = calibration.number("lamp_shapes.flat")
 
-# Share of the bounding rectangle, or of the disc about the farthest corner, that a part must fill.
-# A polygon of 12 corners fills 0.955 of its disc, a square 0.64.
-_RECTANGLE_FILL, _DISK_FILL = 0.95, 0.93
+_RECTANGLE_FILL = calibration.number("lamp_shapes.rectangle_fill")
+_DISK_FILL = calibration.number("lamp_shapes.disk_fill")
 
-# Of a sphere: how far corners may be off its radius, and the share of its surface that must be
-# there (a rod or a socket may take the rest).
-_ROUND, _SPHERE_FILL = 0.05, 0.9
+_ROUND = calibration.number("lamp_shapes.round")
+_SPHERE_FILL = calibration.number("lamp_shapes.sphere_fill")
 
 # Lights lie this share of their size off the lamp's surface, which would shade them otherwise.
 _GAP = 1e-3
@@ -48,6 +49,22 @@ def lamp_shapes(points: Float, triangles: Int, radiance: Float) -> tuple[LampSha
     normals = cross / (2 * area[:, None])
     sphere = _sphere(corners, normals, area, light)
     return (sphere,) if sphere else _flat_parts(corners, normals, area, light)
+
+
+def shapes_of_object(
+    scene: Scene, texels: Texels, shines: Float, index: int
+) -> tuple[LampShape, ...]:
+    """Lights in place of one object, if it has a shape for that; shines (T, 3): emitted radiance,
+    W/(m^2 sr)."""
+    own, faces = texels.of_object(index), scene.objects[index].faces
+    area, face = texels.area[own], texels.face[own] - faces.start
+    triangles = scene.triangles[faces]
+    weight = np.bincount(face, area, len(triangles))
+    power = np.stack([np.bincount(face, area * c, len(triangles)) for c in shines[own].T], axis=1)
+    # Faces smaller than a texel may have none: they shine as the lamp does on the whole.
+    mean = power.sum(axis=0) / max(weight.sum(), 1e-12)
+    radiance = np.where(weight[:, None] > 0, power / np.maximum(weight, 1e-12)[:, None], mean)
+    return lamp_shapes(scene.points, triangles, radiance.astype(np.float32))
 
 
 def _sphere(corners: Double, normals: Double, area: Double, light: Double) -> LampShape | None:

@@ -1,4 +1,4 @@
-"""Step 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
+"""Task 1: a capture's files become scan.usdc, and the asset's folder is laid out."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pendi
 from usdbrdf.asset.layers.scan_layer import write_scan_layer
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.progress import say
-from usdbrdf.job.task import StageResult, StageRun
-from usdbrdf.tasks.step import Step, hash_of_files
+from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.task import Task
 from usdbrdf.untrusted.usd_paths import layers_of_usd
 
 
@@ -27,7 +28,7 @@ def ingest(
     adapter: str | None = None,
     *,
     plugins: bool = True,
-) -> StageResult:
+) -> TaskResult:
     """Read and check a capture and write it as the weakest layer of ``asset``.
 
     Raises InputRefused for a capture that cannot be used; nothing is published then.
@@ -42,7 +43,7 @@ def ingest(
     if chosen.package:
         # Our own adapters change with the version of the code, which every stamp holds.
         parameters["adapter_package"] = chosen.package
-    step = Step(
+    task = Task(
         asset=asset,
         name="ingest",
         role="scan",
@@ -54,13 +55,13 @@ def ingest(
         inputs=inputs,
     )
 
-    def work(run: StageRun) -> dict[str, Any]:
+    def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         for warning in scan.warnings:
             say(f"warning: {warning}")
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
-        draft = Draft(asset=asset, header=header, provenance=step.provenance)
+        draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
@@ -77,7 +78,7 @@ def ingest(
             "warnings": list(scan.warnings),
         }
 
-    return step.run(work)
+    return task.run(work)
 
 
 def _places(capture: Path, options: IngestOptions, asset: Asset) -> dict[str, str]:

@@ -7,6 +7,7 @@ import numpy as np
 from numba import prange
 from scipy import ndimage
 
+from usdbrdf import calibration
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
@@ -132,12 +133,9 @@ def _blur(
                 out[t, c] += ((1 - fy) * upper + fy * lower) / len(offsets)
 
 
-# Standard deviation of a sample's blur in pixels: the camera's own, bilinear reading, the pixel. A
-# little less than the fit of highlights takes: what was not blurred must not be sharpened.
-SAMPLE_BLUR = 0.6
+SAMPLE_BLUR = calibration.number("refine.sample_blur")
 
-# What is detail and what is noise is decided over three blurs of this many pixels.
-_NEIGHBOURHOOD = 2.0
+_NEIGHBOURHOOD = calibration.number("refine.neighbourhood")
 
 
 def restored(

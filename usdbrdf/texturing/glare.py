@@ -6,14 +6,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from usdbrdf import calibration
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Float, Int
 
 Count = npt.NDArray[np.int64]
 
-# Pixels this many times brighter than the frame's median reach this many pixels far. Of such light
-# some per cent arrive two pixels off.
-_GLARING, _REACH = 10.0, 3
+_GLARING = calibration.number("glare.from")
+_REACH = calibration.count("glare.reach")
 
 
 def brightest_glare(radiance: Float, valid: Bool, clipped: Bool) -> Float:

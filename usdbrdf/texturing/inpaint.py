@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Float, Long
 from usdbrdf.model.texels import Texels
 
 _NEIGHBOURS = 8
 
-# A normal that differs by 90 degrees counts as this share of the object's size in distance: the
-# unseen back of a box is filled from its own sides before the far end of its front.
-_NORMAL_WEIGHT = 0.25
+_NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
 
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6

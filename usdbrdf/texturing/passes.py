@@ -3,8 +3,9 @@ frames. What a texel gets does not depend on its group."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
@@ -93,6 +96,25 @@ def by_parts(
                 whole[name] = np.empty((count, *values.shape[1:]), values.dtype)
             whole[name][part] = values
     return whole
+
+
+def in_passes(
+    run: TaskRun,
+    name: str,
+    groups: Sequence[slice],
+    count: int,
+    observe: Callable[[slice], Mapping[str, Array]],
+) -> dict[str, Array]:
+    """Arrays of ``count`` texels, of which one pass observes each of the ``groups``; of several
+    passes those that are done are kept under ``name`` for a run that goes on."""
+    if len(groups) == 1:
+        return by_parts(groups, count, observe)
+    say(f"{run.name}: {len(groups)} passes over the frames, for lack of memory")
+
+    def kept(part: slice) -> dict[str, Array]:
+        return run.checkpoint(f"{name}-{part.start}-{part.stop}", partial(observe, part))
+
+    return by_parts(groups, count, kept)
 
 
 def groups_of_texels(

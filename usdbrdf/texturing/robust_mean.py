@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from usdbrdf import calibration
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Float, Int
 from usdbrdf.texturing.passes import by_parts
@@ -27,10 +28,10 @@ from usdbrdf.texturing.passes import by_parts
 _BATCH = 5
 
 # Deviations from which a sample loses weight, and steps of the reweighting.
-_OUTLYING, _STEPS = 2.5, 6
+_OUTLYING = calibration.number("robust_mean.outlying")
+_STEPS = 6
 
-# A sample whose distance from the mean is less than this share of its error says nothing of it.
-_LEFT = 0.05
+_LEFT = calibration.number("robust_mean.left")
 
 # Texels whose mean is worked out at a time.
 _AT_A_TIME = 1 << 18

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
+from usdbrdf import calibration
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -23,14 +24,12 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.glare import brightest_glare
 from usdbrdf.transport.rays import RayScene
 
-# Seen flatter than this a texel's footprint is smeared over its neighbours.
-MIN_COSINE = 0.1
+MIN_COSINE = calibration.number("samples.min_cosine")
 
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
 
-# Light this many times brighter than a sample spoils it (see ``brightest_glare``).
-_GLARE_CONTRAST = 3.0
+_GLARE_CONTRAST = calibration.number("samples.glare_contrast")
 
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 

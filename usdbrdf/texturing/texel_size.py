@@ -6,6 +6,7 @@ from decimal import ROUND_CEILING, Context
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import doubled_areas
@@ -14,8 +15,7 @@ from usdbrdf.transport.rays import RayScene
 
 _RAYS_PER_FRAME = 600
 
-# An atlas is never full; this share of its area is charts.
-_PACKING = 0.7
+_PACKING = calibration.number("texel_size.packing")
 
 _DIGITS = 2
 

@@ -17,8 +17,6 @@ NONE: Final = "none"
 
 OIDN: Final = "oidn"
 
-CHOICES: Final = (AUTO, NONE, OIDN)
-
 # Larger pictures than this suffices for are filtered in tiles.
 _MOST_MEGABYTES = 512
 

@@ -22,13 +22,14 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
 from usdbrdf.transport.cosine_sampling import add_cosine_samples
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, add_light_samples
@@ -51,22 +52,6 @@ _FIRST_ROUND, _BLOCKS = 64, 4
 
 # Points that a thread takes at a time: near points' nearly parallel rays follow each other.
 _POINTS = 1 << 12
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How S is estimated.
-
-    estimator       "mis" or "cosine"
-    standard_error  "mis" doubles a tile's rays until its relative standard error is below this
-    max_rays        per texel; "cosine" traces exactly this many
-    seed            of the random bits
-    """
-
-    estimator: Literal["mis", "cosine"] = "mis"
-    standard_error: float = 0.03
-    max_rays: int = 2048
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,10 @@ from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture
+from usdbrdf.transport.textured_scene import TexturedScene
+
+# Lobes pick among all lights alike, by power: each of the few rays is to meet one that shows.
+_BRIGHTER_THAN = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +88,24 @@ class LitScene:
     def owner(self, face: Int) -> Int:
         """The object of each face (R,), -1 where the face is -1."""
         return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
+
+
+def lit_scene(
+    surface: TexturedScene, light: Float, emissive: Bool, environment: Environment
+) -> LitScene:
+    """The scene with its light (T, 3), W/(m^2 sr): L_d, and where texels are ``emissive`` (T,) the
+    radiance with which they shine."""
+    radiance = surface.texture(light)
+    shines = np.repeat(emissive[:, None].astype(np.float32), 3, axis=1)
+    return LitScene(
+        scene=surface.scene,
+        rays=surface.rays,
+        radiance=radiance,
+        lights=surface.lights(light, _BRIGHTER_THAN),
+        emission=radiance.showing(surface.texels, shines),
+        environment=environment,
+        diagonal_m=surface.diagonal_m,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

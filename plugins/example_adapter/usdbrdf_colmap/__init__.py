@@ -15,7 +15,6 @@ from pathlib import Path
 
 from usdbrdf.capture.checks import refuse_photographs
 from usdbrdf.capture.findings import Findings, FrameRecord
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -25,6 +24,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
 from usdbrdf_colmap.text_model import Camera, Image, read_cameras, read_images
 
 NAME = "colmap"

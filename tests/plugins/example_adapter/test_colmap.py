@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from tests.scenes import make_capture
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.properties import Fact, known_facts
@@ -68,11 +69,14 @@ def attribute(
     samples: Mapping[float, Any] | None = None,
     interpolation: str = "",
 ) -> Sdf.AttributeSpec:
-    """An attribute with a default value and, per time code, samples."""
+    """An attribute with a default value and, per time code, samples. A numpy array becomes the
+    array of its type; its numbers are of that type already."""
     variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
     spec = prim.attributes.get(name)
     if spec is None:
         spec = Sdf.AttributeSpec(prim, name, type_name, variability, declaresCustom=False)
+    if isinstance(value, np.ndarray):
+        value = type(type_name.defaultValue).FromNumpy(np.ascontiguousarray(value))
     if value is not None:
         spec.default = value
     for time, sample in (samples or {}).items():
@@ -166,7 +170,10 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
 
 
 def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
-    UsdUtils.ModifyAssetPaths(stored, lambda asset: _absolute(asset, folder))
+    def absolute(asset: str) -> str:
+        return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
+
+    UsdUtils.ModifyAssetPaths(stored, absolute)
     # Sublayers that are not there yet are published later, or by another task.
     stored.subLayerPaths = [sub for sub in stored.subLayerPaths if Path(sub).is_file()]
     stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
@@ -176,7 +183,3 @@ def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
             f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of usdbrdf; "
             "please report it. [stage.composition]"
         )
-
-
-def _absolute(asset: str, folder: Path) -> str:
-    return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset

@@ -122,9 +122,8 @@ def _author_normals(prim: Sdf.PrimSpec, mesh: UsdGeom.Mesh, in_world: Float) -> 
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
     if left_handed != bool(np.linalg.det(world_from_local) < 0):
         local = local[:, [0, 2, 1]]  # the triangles in the world are wound the other way
-    values = np.ascontiguousarray((local / size).reshape(-1, 3), np.float32)
-    array = Vt.Vec3fArray.FromNumpy(values)
-    attribute(prim, "normals", Types.Normal3fArray, array, interpolation="faceVarying")
+    unit = (local / size).reshape(-1, 3).astype(np.float32)
+    attribute(prim, "normals", Types.Normal3fArray, unit, interpolation="faceVarying")
     stronger = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if stronger and stronger.HasAuthoredValue():
         blocked = attribute(prim, stronger.GetName(), stronger.GetTypeName())
@@ -143,10 +142,8 @@ def _author_triangles(layer: Sdf.Layer, path: str, mesh: UsdGeom.Mesh, *, always
     # The winding stays as the file says: its orientation still applies.
     fans = triangulate(counts, indices, holes=holes)
     prim = over(layer, path)
-    threes = np.full(len(fans.triangles), 3, np.int32)
-    attribute(prim, "faceVertexCounts", Types.IntArray, Vt.IntArray.FromNumpy(threes))
-    points = Vt.IntArray.FromNumpy(fans.triangles.reshape(-1))
-    attribute(prim, "faceVertexIndices", Types.IntArray, points)
+    attribute(prim, "faceVertexCounts", Types.IntArray, np.full(len(fans.triangles), 3, np.int32))
+    attribute(prim, "faceVertexIndices", Types.IntArray, fans.triangles.reshape(-1))
     if len(holes):
         attribute(prim, "holeIndices", Types.IntArray, Vt.IntArray())
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
@@ -156,9 +153,8 @@ def _author_triangles(layer: Sdf.Layer, path: str, mesh: UsdGeom.Mesh, *, always
     for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.face:
             chosen = np.isin(fans.polygon, np.asarray(subset.GetIndicesAttr().Get(time) or []))
-            faces = Vt.IntArray.FromNumpy(np.flatnonzero(chosen).astype(np.int32))
             child = over(layer, f"{path}/{subset.GetPrim().GetName()}")
-            attribute(child, "indices", Types.IntArray, faces)
+            attribute(child, "indices", Types.IntArray, np.flatnonzero(chosen).astype(np.int32))
 
 
 def _author_gathered(

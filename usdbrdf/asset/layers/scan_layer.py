@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.header import Draft, Scopes
 from usdbrdf.asset.layers.author import (
@@ -155,16 +155,13 @@ def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
 def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:
     """The triangles ``faces`` with only the points that they use."""
     used, corners = np.unique(mesh.triangles[faces], return_inverse=True)
-    points = np.ascontiguousarray(mesh.points[used], np.float32)
-    normals = np.ascontiguousarray(mesh.corner_normals[faces], np.float32).reshape(-1, 3)
-    extent = Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
-    counts = Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32))
-    indices = Vt.IntArray.FromNumpy(corners.reshape(-1).astype(np.int32))
-    attribute(prim, "points", Types.Point3fArray, Vt.Vec3fArray.FromNumpy(points))
-    attribute(prim, "faceVertexCounts", Types.IntArray, counts)
-    attribute(prim, "faceVertexIndices", Types.IntArray, indices)
-    values = Vt.Vec3fArray.FromNumpy(normals)
-    attribute(prim, "normals", Types.Normal3fArray, values, interpolation="faceVarying")
+    points = mesh.points[used].astype(np.float32)
+    normals = mesh.corner_normals[faces].astype(np.float32).reshape(-1, 3)
+    extent = np.stack([points.min(axis=0), points.max(axis=0)])
+    attribute(prim, "points", Types.Point3fArray, points)
+    attribute(prim, "faceVertexCounts", Types.IntArray, np.full(len(faces), 3, np.int32))
+    attribute(prim, "faceVertexIndices", Types.IntArray, corners.reshape(-1).astype(np.int32))
+    attribute(prim, "normals", Types.Normal3fArray, normals, interpolation="faceVarying")
     attribute(prim, "extent", Types.Float3Array, extent)
     attribute(prim, "subdivisionScheme", Types.Token, UsdGeom.Tokens.none, uniform=True)
     # A scan has holes, and cameras look through them at the backs of things.

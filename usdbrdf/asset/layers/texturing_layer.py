@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Vt
+from pxr import Sdf, Usd, Vt
 
 from usdbrdf.asset.header import Draft
 from usdbrdf.asset.layers.author import apply_schema, attribute, author_record, export, over
 from usdbrdf.asset.layers.looks import LIT, aov_looks, author_looks
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.properties import TexturedObject
-from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.model.arrays import Float
 
 Types = Sdf.ValueTypeNames
@@ -25,12 +24,14 @@ THUMBNAIL = "previews/lit.png"  # in the asset folder
 
 
 def write_texturing_layer(
-    path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject]
+    path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject], scanned: Usd.Stage
 ) -> None:
-    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``."""
+    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``.
+
+    scanned  the composed stage of the weaker layers
+    """
     asset, scopes = draft.asset, draft.scopes
     folder = asset.layer("texturing").parent
-    scanned = open_weaker(asset, "texturing")
     coordinates, layer = draft.new_layer(), draft.new_layer()
     layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
     with Sdf.ChangeBlock():
@@ -59,11 +60,9 @@ def author_texture_coordinates(
     # Two floats as one integer: equal bits, much faster than rows.
     _, first, index = np.unique(corners.view(np.uint64), return_index=True, return_inverse=True)
     kind = declared if type(declared.defaultValue) in _PAIRS else Types.TexCoord2fArray
-    array = type(kind.defaultValue)
-    values = array.FromNumpy(corners[first].astype(_PAIRS[array]))
-    indices = Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32))
+    values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
     attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
-    attribute(prim, "primvars:st:indices", Types.IntArray, indices)
+    attribute(prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32))
 
 
 def _author_thumbnail(root: Sdf.PrimSpec) -> None:

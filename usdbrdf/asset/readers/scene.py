@@ -9,12 +9,12 @@ import numpy.typing as npt
 from pxr import Usd, UsdGeom, Vt
 
 from usdbrdf.asset.properties import OBJECT, TEXTURING
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.options import IngestOptions
 
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 

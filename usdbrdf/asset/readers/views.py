@@ -23,7 +23,6 @@ from usdbrdf.capture.checks import (
     rigid_records,
 )
 from usdbrdf.capture.findings import Findings, FrameRecord, frames_from_records
-from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.capture.parts import frames_at
 from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
@@ -33,6 +32,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
+from usdbrdf.options import IngestOptions
 
 # A reference may leave much of a picture unknown; a view that holds next to nothing is dropped.
 _MAX_UNKNOWN = 0.999

@@ -16,21 +16,20 @@ from scipy import stats
 import usdbrdf
 from tests.scenes import MadeCapture, make_capture, poses_down_and_up
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr, write_exr
-from usdbrdf.job import task as stage_module
+from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material import refine
+from usdbrdf.material.refine import Refined, refined_light
+from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.capture import Frames
-from usdbrdf.tasks import refine, trace
-from usdbrdf.tasks.atlas import Atlas, atlas_from_stage
-from usdbrdf.tasks.lit import lit_scene
-from usdbrdf.tasks.refine import refined_maps
-from usdbrdf.tasks.refined_irradiance import Lobes, refined_irradiance
-from usdbrdf.tasks.texture import MEASURED
+from usdbrdf.shading import irradiance_map
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
@@ -57,7 +56,7 @@ class Room:
     """clean, glossy: the same room with diffuse radiance alone and with lobes, both shaded."""
 
     folder: Path
-    clean: Atlas
+    clean: AssetMaps
     glossy: Asset
 
 
@@ -71,14 +70,27 @@ def _shaded(capture: MadeCapture, folder: Path) -> Asset:
         return asset
 
 
-def _atlas(asset: Asset) -> Atlas:
-    return atlas_from_stage(open_measured(asset))
+def _atlas(asset: Asset) -> AssetMaps:
+    return AssetMaps(open_measured(asset))
 
 
-def _lobes(atlas: Atlas) -> Lobes:
+def _lobes(atlas: AssetMaps) -> Lobes:
     rows = [LOBE.get(item.label, (1.0, 0.0)) for item in atlas.scene.objects]
     phi, psi = np.array(rows, np.float32).T
     return Lobes(phi=phi, psi=psi)
+
+
+def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
+    return refined_light(run, lit, atlas.texels, frames, atlas, _lobes(atlas), "none", None, 0)
+
+
+def _irradiance(
+    run: TaskRun, atlas: AssetMaps, lit: LitScene, diffuse: Float, lobes: Lobes
+) -> Float:
+    """S of the asset, with the diffuse radiance and the lobes as the light instead of its L_d."""
+    change = np.where(atlas.emissive[:, None], 0, diffuse - atlas.lit).astype(np.float32)
+    traced = atlas.irradiance
+    return refined_irradiance(run, lit, atlas.texels, traced, change, lobes, "none", 0)
 
 
 def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, seed: int) -> Float:
@@ -93,9 +105,9 @@ def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, see
     return result
 
 
-def _add_specular(capture: MadeCapture, atlas: Atlas, frames: Frames) -> None:
+def _add_specular(capture: MadeCapture, atlas: AssetMaps, frames: Frames) -> None:
     """To the photographs of the diffuse room."""
-    lit, lobes = lit_scene(atlas, black_environment()), _lobes(atlas)
+    lit, lobes = atlas.lit_scene(black_environment()), _lobes(atlas)
     for i, path in enumerate(sorted((capture.folder / "frames").iterdir())):
         image = read_exr(path)
         height, width = image.shape[:2]
@@ -139,10 +151,10 @@ def fitted(room: Room) -> Asset:
     return _fitted(room, "fitted", usdbrdf.FitOptions())
 
 
-def _reflecting(room: Room, atlas: Atlas) -> np.ndarray:
+def _reflecting(room: Room, atlas: AssetMaps) -> np.ndarray:
     """(T,): measured and no lamp."""
     owner = np.array([item.label for item in atlas.scene.objects])[atlas.texels.object_index()]
-    measured = (atlas.map("coverage")[:, 0] == MEASURED) & (room.clean.map("coverage")[:, 0] == 1)
+    measured = atlas.coverage.measured & room.clean.coverage.measured
     return measured & (owner != "lamp")
 
 
@@ -151,10 +163,10 @@ def _off(found: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.median(np.abs(found - wanted).sum(axis=1) / wanted.sum(axis=1)))
 
 
-def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
+def _true_irradiance(clean: AssetMaps, which: np.ndarray) -> np.ndarray:
     """S of some texels in the glossy room: that of the diffuse one, and pi times the mean specular
     radiance that arrives along 64 cosine-distributed rays."""
-    lit, texels = lit_scene(clean, black_environment()), clean.texels
+    lit, texels = clean.lit_scene(black_environment()), clean.texels
     normal = texels.normal[which].astype(np.float64)
     u = stats.qmc.Sobol(2, rng=0).random(64)
     height = np.sqrt(1 - u[:, 0])
@@ -177,15 +189,15 @@ def _true_irradiance(clean: Atlas, which: np.ndarray) -> np.ndarray:
 
 def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_path: Path):
     stage = open_measured(room.glossy)
-    atlas, frames = atlas_from_stage(stage), frames_from_stage(stage)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
-    lit = lit_scene(atlas, black_environment())
-    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    lit = atlas.lit_scene(black_environment())
+    found = _refined_light(run, atlas, lit, frames)
     which = _reflecting(room, atlas)
     truth = room.clean.map("lit")[which]
     before = _off(atlas.map("lit")[which], truth)
     assert before > 0.05
-    assert _off(found["diffuse"].values[which], truth) < 0.1 * before
+    assert _off(found.diffuse[which], truth) < 0.1 * before
 
 
 def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset):
@@ -210,13 +222,13 @@ def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset)
 
 def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Path):
     """From S of the glossy room's lit texture to that of its diffuse radiance and lobes."""
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     some = np.flatnonzero(_reflecting(room, atlas))
     some = np.random.default_rng(1).choice(some, 400, replace=False)
     wanted = _true_irradiance(room.clean, some)
-    lit, diffuse = lit_scene(room.clean, black_environment()), room.clean.map("lit")
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
-    found = refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)[some]
+    lit, diffuse = room.clean.lit_scene(black_environment()), room.clean.map("lit")
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    found = _irradiance(run, atlas, lit, diffuse, _lobes(atlas))[some]
     before = atlas.map("irradiance")[some]
     off = [(some.sum() / wanted.sum() - 1, _off(some, wanted)) for some in (before, found)]
     assert abs(off[0][0]) > 0.008
@@ -226,7 +238,7 @@ def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Pat
 
 def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
     atlas = _atlas(fitted)
-    unseen = atlas.map("coverage")[:, 0] == 0
+    unseen = ~atlas.coverage.observed
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
     assert unseen.sum() > 50
     wanted = (atlas.map("base_color") * atlas.map("refined_irradiance") / np.pi)[unseen]
@@ -235,29 +247,29 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
 
 def _refined(room: Room, folder: Path) -> np.ndarray:
     """Refined irradiance of the glossy room in its own lit texture."""
-    atlas = atlas_from_stage(open_measured(room.glossy))
-    run = StageRun(folder, "fit", folder / "work")
-    lit, diffuse = lit_scene(atlas, black_environment()), 0.8 * atlas.map("lit")
-    return refined_irradiance(run, atlas, lit, diffuse, _lobes(atlas), "none", 0)
+    atlas = AssetMaps(open_measured(room.glossy))
+    run = TaskRun(folder, "fit", folder / "work")
+    lit, diffuse = atlas.lit_scene(black_environment()), 0.8 * atlas.map("lit")
+    return _irradiance(run, atlas, lit, diffuse, _lobes(atlas))
 
 
 def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: Path, monkeypatch):
-    atlas = atlas_from_stage(open_measured(room.glossy))
-    frames, lit = frames_from_stage(atlas.stage), lit_scene(atlas, black_environment())
+    atlas = AssetMaps(open_measured(room.glossy))
+    frames, lit = frames_from_stage(atlas.stage), atlas.lit_scene(black_environment())
     given = []
 
-    def spied(run, atlas, lit, diffuse, *others):
-        given.append(diffuse)
-        return refined_irradiance(run, atlas, lit, diffuse, *others)
+    def spied(run, lit, texels, traced, change, *others):
+        given.append(atlas.lit + change)
+        return refined_irradiance(run, lit, texels, traced, change, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
-    run = StageRun(tmp_path, "fit", tmp_path / "work")
-    found = refined_maps(run, atlas, lit, frames, _lobes(atlas), "none", None, 0)
-    unseen = atlas.map("coverage")[:, 0] == 0
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    found = _refined_light(run, atlas, lit, frames)
+    unseen = ~atlas.coverage.observed
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
     # The base colour is filled in alike, whichever irradiance it is made with.
-    share = given[0][unseen] / found["diffuse"].values[unseen]
-    change = atlas.map("irradiance")[unseen] / found["refined_irradiance"].values[unseen]
+    share = given[0][unseen] / found.diffuse[unseen]
+    change = atlas.map("irradiance")[unseen] / found.irradiance[unseen]
     assert np.median(np.abs(share / change - 1)) < 0.05
     lit_there = atlas.map("lit")[unseen]
     assert np.median(np.abs(given[0][unseen] / lit_there - 1)) > 0.1
@@ -265,24 +277,24 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
 
 def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):
     whole = _refined(room, tmp_path / "whole")
-    monkeypatch.setattr(trace, "_TILE", 300)
+    monkeypatch.setattr(irradiance_map, "_TILE", 300)
     np.testing.assert_array_equal(_refined(room, tmp_path / "tiles"), whole)
 
 
 def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
     """A lamp of which more is known than the lit texture shows has lit S already."""
-    by_name = Atlas.map_where_present
+    by_name = AssetMaps.map_where_present
 
-    def brighter(atlas: Atlas, aov: str, channels: int) -> Float:
+    def brighter(atlas: AssetMaps, aov: str, channels: int) -> Float:
         return by_name(atlas, aov, channels) * (2 if aov == "emission" else 1)
 
-    monkeypatch.setattr(Atlas, "map_where_present", brighter)
+    monkeypatch.setattr(AssetMaps, "map_where_present", brighter)
     lobes = Lobes(phi=np.ones(5, np.float32), psi=np.zeros(5, np.float32))
-    atlas = atlas_from_stage(open_measured(room.glossy))
+    atlas = AssetMaps(open_measured(room.glossy))
     emission = atlas.map_where_present("emission", 3)
     diffuse = np.where(emission > 0, emission, atlas.map("lit"))
-    run, lit = StageRun(tmp_path, "fit", tmp_path / "work"), lit_scene(atlas, black_environment())
-    found = refined_irradiance(run, atlas, lit, diffuse, lobes, "none", 0)
+    run, lit = TaskRun(tmp_path, "fit", tmp_path / "work"), atlas.lit_scene(black_environment())
+    found = _irradiance(run, atlas, lit, diffuse, lobes)
     traced = atlas.map("irradiance")
     reflects = _reflecting(room, atlas)
     # No lobe but its grazing part, so nothing is added but a few per cent.
@@ -294,7 +306,7 @@ def test_the_base_colour_is_the_refined_radiance_over_the_refined_irradiance(fit
     base_color = atlas.map("base_color")
     assert base_color.min() >= 0
     assert base_color.max() <= 1
-    measured = atlas.map("coverage")[:, 0] == MEASURED
+    measured = atlas.coverage.measured
     dark = measured & (atlas.map_where_present("emission", 3) == 0).all(axis=1)
     wanted = np.pi * atlas.map("diffuse") / atlas.map("refined_irradiance")
     np.testing.assert_allclose(base_color[dark], np.clip(wanted, 0, 1)[dark], atol=2e-3)
@@ -331,7 +343,7 @@ def test_the_material_shows_the_base_colour(fitted: Asset):
 def test_other_fits_leave_the_albedo(room: Room):
     paper = _fitted(room, "paper", usdbrdf.FitOptions(method="paper", max_pixels=60))
     stage = open_measured(paper)
-    for item in atlas_from_stage(stage).scene.objects:
+    for item in AssetMaps(stage).scene.objects:
         names = {aov.name for aov in read_aovs(stage, item.prim_path)}
         assert "lit" in names
         assert not names & {"diffuse", "refined_irradiance", "base_color"}
@@ -355,8 +367,8 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
             if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(stage_module, "_SAVE_AFTER", 0.0)
-    monkeypatch.setattr(stage_module, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())
@@ -393,11 +405,13 @@ def test_too_little_memory_is_no_reason_to_stop_at_the_end(room: Room, fitted: A
 def test_of_texels_that_many_frames_see_some_samples_are_enough():
     texel = np.arange(40_000, dtype=np.int32)
     samples = np.repeat(np.float32([5, 24, 48, 96]), 10_000)
-    frames = [refine._taken(texel, samples, frame, 7) for frame in range(48)]
+    frames = [refine._subsample(texel, samples, frame, 7) for frame in range(48)]
     share = np.mean(frames, axis=0).reshape(4, -1)
     assert (share[:2] == 1).all()
     np.testing.assert_allclose(share[2:].mean(axis=1), [0.5, 0.25], atol=0.005)
     # Independent from frame to frame, and of what else is asked for.
     np.testing.assert_allclose(share[2:].std(axis=1), np.sqrt([0.25 / 48, 0.1875 / 48]), rtol=0.05)
     some = np.arange(25_000, 40_000, 7)
-    np.testing.assert_array_equal(refine._taken(texel[some], samples[some], 3, 7), frames[3][some])
+    np.testing.assert_array_equal(
+        refine._subsample(texel[some], samples[some], 3, 7), frames[3][some]
+    )

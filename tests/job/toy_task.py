@@ -1,6 +1,6 @@
-"""A stage with tiles, a running state, textures, layers and a once-only file; run as a script.
+"""A task with tiles, a running state, textures, layers and a once-only file; run as a script.
 
-python toy_stage.py ASSET [seed] [--fewer]
+python toy_task.py ASSET [seed] [--fewer]
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.fault_injection import arm_from_environment
 from usdbrdf.files.images import write_exr
-from usdbrdf.job.lock import folder_lock
-from usdbrdf.job.ownership import prepare_asset_folder
-from usdbrdf.job.task import StageResult, StageRun, run_stage
+from usdbrdf.job.ownership import owned_folder
+from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 TILES = 3
 FRAMES = 6
 
 
-def toy_work(run: StageRun, seed: int, textures: int) -> dict[str, object]:
+def toy_work(run: TaskRun, seed: int, textures: int) -> dict[str, object]:
     computed = []
 
     def tile(index: int) -> dict[str, np.ndarray]:
@@ -43,9 +43,9 @@ def toy_work(run: StageRun, seed: int, textures: int) -> dict[str, object]:
     return {"total": total.tolist(), "textures": textures}
 
 
-def run_toy(asset: Path, seed: int = 1, *, textures: int = 3) -> StageResult:
-    with folder_lock(prepare_asset_folder(asset)):
-        return run_stage(
+def run_toy(asset: Path, seed: int = 1, *, textures: int = 3) -> TaskResult:
+    with owned_folder(asset):
+        return run_task(
             asset,
             "toy",
             order=20,
@@ -56,6 +56,7 @@ def run_toy(asset: Path, seed: int = 1, *, textures: int = 3) -> StageResult:
 
 
 if __name__ == "__main__":
+    arm_from_environment()
     options = [argument for argument in sys.argv[2:] if argument.startswith("--")]
     numbers = [int(argument) for argument in sys.argv[2:] if not argument.startswith("--")]
     result = run_toy(

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from usdbrdf.tasks import fit_objects
+from usdbrdf.material import fit_objects
+from usdbrdf.material.fit_objects import ObjectFit
 
 
 class _Run:
@@ -16,10 +17,15 @@ class _Run:
         self.saved: dict[str, dict[str, np.ndarray]] = {}
 
     def checkpoint_if(self, name: str) -> dict[str, np.ndarray] | None:
-        return {"threads": np.array([-1])} if name == "object-1" else None
+        return ObjectFit(cost=-1.0).arrays() if name == "object-1" else None
 
     def save(self, name: str, found: dict[str, np.ndarray]) -> None:
         self.saved[name] = found
+
+
+def _fit_that_tells_the_threads(*_: object) -> ObjectFit:
+    (threads,) = set(_threads_of_blas().tolist())
+    return ObjectFit(cost=float(threads))
 
 
 def _threads_of_blas() -> np.ndarray:
@@ -29,11 +35,11 @@ def _threads_of_blas() -> np.ndarray:
 def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.MonkeyPatch):
     before = _threads_of_blas()
     assert len(before)
-    monkeypatch.setattr(fit_objects, "fit_object", lambda *_: {"threads": _threads_of_blas()})
+    monkeypatch.setattr(fit_objects, "fit_object", _fit_that_tells_the_threads)
     lit, run = SimpleNamespace(scene=SimpleNamespace(objects=range(4))), _Run()
     found = fit_objects.fitted_objects(run, lit, None, None, None, fit_objects.FitOptions())  # type: ignore[arg-type]
-    assert found[1]["threads"] == -1  # taken from an interrupted run
+    assert found[1].cost == -1  # taken from an interrupted run
     assert sorted(run.saved) == ["object-0", "object-2", "object-3"]
     for i in (0, 2, 3):
-        assert (found[i]["threads"] == 1).all()
+        assert found[i].cost == 1
     np.testing.assert_array_equal(_threads_of_blas(), before)

@@ -1,4 +1,4 @@
-"""When a stage runs again and when it does not."""
+"""When a task runs again and when it does not."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.job import stamp as stamp_module
-from usdbrdf.job import task as stage
-from usdbrdf.job.task import run_stage
+from usdbrdf.job import task as task_module
+from usdbrdf.job.task import run_task
 
 STAMP = ".usdbrdf/stamps/20-toy.json"
 
@@ -79,7 +79,7 @@ def test_changed_parameter_reruns_and_says_so(asset, toy):
 
 def test_changed_input_and_version_rerun(tmp_path, monkeypatch):
     def run(sha256):
-        return run_stage(
+        return run_task(
             tmp_path,
             "one",
             order=1,
@@ -91,6 +91,10 @@ def test_changed_input_and_version_rerun(tmp_path, monkeypatch):
     assert run("aa").reran
     assert not run("aa").reran
     assert run("bb").reason == "inputs changed: scan"
+    with monkeypatch.context() as another:
+        another.setattr(stamp_module, "tasks_identity", lambda: "another")
+        assert run("bb").reason == "code changed"
+    assert run("bb").reason == "code changed"
     monkeypatch.setattr(stamp_module, "code_version", lambda: "9")
     assert run("bb").reason.startswith("version 9 instead of ")
 
@@ -126,15 +130,15 @@ def test_outputs_of_refused_work_are_not_published(tmp_path):
         raise InputRefused("no")
 
     with pytest.raises(InputRefused):
-        run_stage(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+        run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
     assert not (tmp_path / "layers").exists()
     assert not (tmp_path / ".usdbrdf/stamps/1-one.json").exists()
 
 
 @pytest.mark.parametrize("relative", ["../a", "/a", ".usdbrdf/a", "", "a/../../b"])
 def test_output_outside_the_asset_is_our_bug(tmp_path, relative):
-    with pytest.raises(UsdBrdfError, match=r"not a path inside the asset. \[stage.output\]"):
-        run_stage(
+    with pytest.raises(UsdBrdfError, match=r"not a path inside the asset. \[task.output\]"):
+        run_task(
             tmp_path,
             "one",
             order=1,
@@ -146,7 +150,7 @@ def test_output_outside_the_asset_is_our_bug(tmp_path, relative):
 
 def test_output_that_was_not_written_is_our_bug(tmp_path):
     with pytest.raises(UsdBrdfError, match=r"did not write layers/a\.usda"):
-        run_stage(
+        run_task(
             tmp_path,
             "one",
             order=1,
@@ -161,8 +165,8 @@ def test_what_the_machine_lacks_is_an_environment_failure(tmp_path, error):
     def work(run):
         raise error
 
-    with pytest.raises(EnvironmentFailure, match=r"^stage one: .+ \[environment\.(memory|io)\]$"):
-        run_stage(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    with pytest.raises(EnvironmentFailure, match=r"^one: .+ \[environment\.(memory|io)\]$"):
+        run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
 
 
 def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
@@ -181,7 +185,7 @@ def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
         assert run.latest("é/@0.x") is None
         return {}
 
-    run_stage(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
     assert list(loaded) == list(arrays)
     for key, array in arrays.items():
         assert loaded[key].dtype == array.dtype
@@ -190,7 +194,7 @@ def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
 
 def test_a_running_state_is_not_saved_all_the_time(tmp_path, monkeypatch):
     clock, saved = [0.0], []
-    monkeypatch.setattr(stage.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(task_module.time, "monotonic", lambda: clock[0])
 
     def state():
         saved.append(clock[0])
@@ -203,7 +207,7 @@ def test_a_running_state_is_not_saved_all_the_time(tmp_path, monkeypatch):
             run.save_latest_in_time("sum", frame, state)
         return {}
 
-    run_stage(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
+    run_task(tmp_path, "one", order=1, parameters={}, inputs={}, work=work)
     assert saved[0] == 1
     assert np.diff(saved).min() >= 20
     assert 3 <= len(saved) <= 6
@@ -214,6 +218,7 @@ def test_stamp_has_no_time_and_no_absolute_path(asset):
     assert str(asset.parent) not in text
     assert set(json.loads(text)) == {
         "check",
+        "code",
         "earlier",
         "inputs",
         "once",

@@ -1,30 +1,20 @@
-"""Inside step 3: irradiance at every texel, traced tile by tile so that a kill costs one tile."""
+"""Irradiance at every texel, traced tile by tile so that a kill costs one tile."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
-from usdbrdf.model.arrays import Float
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.texels import Texels
-from usdbrdf.tasks.atlas import Atlas
+from usdbrdf.options import Sampling
 from usdbrdf.transport.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.irradiance import (
-    Irradiance,
-    Sampling,
-    irradiance_at,
-    tiles_of_texels,
-    whole_tiles,
-)
-from usdbrdf.transport.lights import lights_from_radiance
-from usdbrdf.transport.rays import RayScene
-from usdbrdf.transport.surface_texture import surface_texture
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
+from usdbrdf.transport.textured_scene import TexturedScene
 
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
 # bounds the memory of the ray buffers.
@@ -32,18 +22,15 @@ _TILE = 1 << 15
 
 
 def trace_irradiance(
-    run: StageRun,
-    atlas: Atlas,
-    rays: RayScene,
+    run: TaskRun,
+    surface: TexturedScene,
     lit: Float,
     environment: Environment,
     sampling: Sampling,
 ) -> Irradiance:
     """S at all texels with the radiance ``lit`` (T, 3) as the light, from where a kill left it."""
-    scene, texels = atlas.scene, atlas.texels
-    radiance = surface_texture(texels, scene.face_object, lit)
-    lights = lights_from_radiance(scene, texels, lit)
-    size = float(np.linalg.norm(np.ptp(scene.points, axis=0)))
+    texels = surface.texels
+    radiance, lights = surface.texture(lit), surface.lights(lit)
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
@@ -51,15 +38,15 @@ def trace_irradiance(
     tiles = tiles_of_patches(patch)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
-    def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
+    def tile(part: slice) -> dict[str, Array]:
         index = order[part]
         found = irradiance_at(
-            rays, radiance, lights, environment, texels.position[index], texels.normal[index],
-            patch[part], sampling, size, dark[index],
+            surface.rays, radiance, lights, environment, texels.position[index],
+            texels.normal[index], patch[part], sampling, surface.diagonal_m, dark[index],
         )  # fmt: skip
         return dict(vars(found))
 
-    parts: dict[str, list[npt.NDArray[Any]]] = {}
+    parts: dict[str, list[Array]] = {}
     for number, part in enumerate(progress(tiles, total=len(tiles), label="shade", unit="tiles")):
         done = run.checkpoint(f"tile-{number}", partial(tile, part))
         for name, values in done.items():
@@ -68,7 +55,7 @@ def trace_irradiance(
     return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
 
 
-def tiles_of_patches(patch: npt.NDArray[np.int32]) -> list[slice]:
+def tiles_of_patches(patch: Array) -> list[slice]:
     """Ranges of about _TILE texels that do not cut a patch."""
     return whole_tiles(patch, _TILE)
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.job.task import StageRun
-from usdbrdf.tasks.atlas import Atlas
-from usdbrdf.tasks.clipped import ClippedLight, estimate_clipped_light
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.options import Sampling
+from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import Sampling, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
+from usdbrdf.transport.textured_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 
 ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]
@@ -58,11 +60,10 @@ def truth(world: World) -> np.ndarray:
 
 
 def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
-    atlas = Atlas(stage=None, scene=world.scene, texels=world.texels)
-    run = StageRun(folder, "shade", folder / "work")
-    return estimate_clipped_light(
-        run, atlas, world.rays, lit, ~clipped, clipped, black_environment(), 0
-    )
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    run = TaskRun(folder, "shade", folder / "work")
+    coverage = CoverageMap.of(~clipped, clipped)
+    return estimate_clipped_light(run, surface, lit, coverage, black_environment(), 0)
 
 
 def test_the_lamps_are_as_bright_as_their_light_says(

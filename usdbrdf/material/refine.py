@@ -8,24 +8,27 @@ place of the median, and what the pixels blurred is restored where it stands abo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Protocol
+
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import progress, say
-from usdbrdf.job.task import StageRun
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
-from usdbrdf.tasks.albedo_map import albedo_map
-from usdbrdf.tasks.atlas import Atlas, TexelMap
-from usdbrdf.tasks.in_passes import in_passes
-from usdbrdf.tasks.refined_irradiance import Lobes, refined_irradiance
-from usdbrdf.tasks.texture import CLIPPED, FILLED
+from usdbrdf.shading.albedo import albedo_map
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
-from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, smallest_groups
+from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
+from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.warps import shifts_of
@@ -42,61 +45,86 @@ _MOST_SAMPLES = 24
 # sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
 
-# A sample's error, in parts of the texel's lit radiance: what poses, lobes and reading do to it;
-# and in parts of the noise floor, which lies some four deviations of the sensor's noise above zero.
-_RELATIVE_ERROR, _OF_NOISE_FLOOR = 0.03, 0.25
+_RELATIVE_ERROR = calibration.number("refine.relative_error")
+_OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 
-# Errors in proportion to what is seen: those of black surfaces are not below this share of the
-# scene's median.
-_DARKEST = 1e-3
+_DARKEST = calibration.number("refine.darkest")
 
 
-def refined_maps(
-    run: StageRun,
-    atlas: Atlas,
+class LightBefore(Protocol):
+    """What texturing and shading know of T texels; each is read when it is needed.
+
+    lit         (T, 3) W/(m^2 sr): L_d with the specular light in it
+    samples     (T,): how many frames measured each texel
+    emission    (T, 3) W/(m^2 sr): what shines by itself, zero elsewhere; emissive (T,): it does
+    irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced_irradiance: before the lightmap
+                filter, where there was one
+    """
+
+    @property
+    def lit(self) -> Float: ...
+    @property
+    def samples(self) -> Float: ...
+    @property
+    def coverage(self) -> CoverageMap: ...
+    @property
+    def emission(self) -> Float: ...
+    @property
+    def emissive(self) -> Bool: ...
+    @property
+    def irradiance(self) -> Float: ...
+    @property
+    def traced_irradiance(self) -> Float: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
+    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two."""
+
+    diffuse: Float
+    irradiance: Float
+    base_color: Float
+
+
+def refined_light(
+    run: TaskRun,
     lit: LitScene,
+    texels: Texels,
     frames: Frames,
+    before: LightBefore,
     lobes: Lobes,
     lightmap_filter: str,
     memory: float | None,
     seed: int,
-) -> dict[str, TexelMap]:
-    """The maps "diffuse", L_d without specular light; "refined_irradiance", S of that and of the
-    lobes; and "base_color", pi L_d / S of these two.
+) -> Refined:
+    """What the frames show of T texels without the specular light of the ``lobes``: L_d, S and base
+    colour; in as many passes over the frames as ``memory`` (GiB) asks for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
-    texels = atlas.texels
-    measured_lit = atlas.map("lit")
-    level = _level(measured_lit)
-    observed = _without_lobes(run, atlas, lit, frames, lobes, level, memory, seed)
-    measured = np.isfinite(observed.mean[:, 0])
-    emission = atlas.map_where_present("emission", 3)
-    emissive: Bool = np.any(emission > 0, axis=1)
-    known = measured & ~emissive
-    diffuse = np.where(emissive[:, None], emission, _restored(texels, observed, known, level))
-    del observed  # several times as large as a map
+    found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
+    emissive, observed = before.emissive, before.coverage.observed
+    known = np.isfinite(found.mean[:, 0]) & ~emissive
+    restored_light = _restored(texels, found, known, _level(before.lit))
+    diffuse = np.where(emissive[:, None], before.emission, restored_light)
     # What clips in every frame is at least as bright as that.
-    coverage = atlas.map("coverage")
-    clipped = coverage == CLIPPED
-    diffuse = np.where(clipped, np.maximum(diffuse, measured_lit), diffuse)
-    seen = coverage[:, 0] != FILLED
+    clipped = before.coverage.clipped[:, None]
+    diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
+    filled = ~(observed | emissive)[:, None]
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
         """Base colour, and L_d with what it reflects where nobody looked."""
-        base_color, _ = albedo_map(texels, radiance, irradiance, seen, emissive)
-        filled = ~(seen | emissive)[:, None]
+        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive)
         return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
 
-    _, diffuse = reflected(diffuse, atlas.map("irradiance"))
-    irradiance = refined_irradiance(run, atlas, lit, diffuse, lobes, lightmap_filter, seed)
+    _, diffuse = reflected(diffuse, before.irradiance)
+    change = np.where(emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
+    traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
+    irradiance = refined_irradiance(run, lit, texels, traced, change, lobes, lightmap_filter, seed)
     base_color, diffuse = reflected(diffuse, irradiance)
-    return {
-        "diffuse": TexelMap(diffuse.astype(np.float32), 1.0, "W/(m^2 sr)", exact=True),
-        "refined_irradiance": TexelMap(irradiance, 1 / np.pi, "W/m^2"),
-        "base_color": TexelMap(base_color, 1.0, "1"),
-    }
+    return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
 
 
 def _restored(texels: Texels, found: RobustMean, known: Bool, level: Float) -> Float:
@@ -113,32 +141,31 @@ def _level(lit: Float) -> Float:
     return level
 
 
-def _without_lobes(
-    run: StageRun,
-    atlas: Atlas,
+def _means_without_lobes(
+    run: TaskRun,
     lit: LitScene,
+    texels: Texels,
     frames: Frames,
+    before: LightBefore,
     lobes: Lobes,
-    level: Float,
     memory: float | None,
     seed: int,
 ) -> RobustMean:
-    """All frames without their specular light, in units of ``level`` (T,), in as many passes as
-    memory asks for."""
-    textures = _bytes_of(lit) // len(atlas.texels)
+    """Of T texels the mean over all frames without their specular light, relative to ``_level`` of
+    their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
+    textures = _bytes_of(lit) // len(texels)
     need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
     try:
-        groups = groups_of_texels(atlas.texels, atlas.scene, frames, memory, need)
+        groups = groups_of_texels(texels, lit.scene, frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
         say(f"warning: {short}")
-        groups = smallest_groups(atlas.texels)
-    samples = atlas.map("samples")[:, 0]
+        groups = smallest_groups(texels)
 
     def means(part: slice) -> dict[str, Float]:
-        observed = _observe(run, atlas, lit, frames, lobes, level, samples, seed, part)
+        observed = _observed(run, lit, texels, frames, before, lobes, seed, part)
         return dict(vars(robust_mean(observed)))
 
-    return RobustMean(**in_passes(run, "means", groups, len(atlas.texels), means))
+    return RobustMean(**in_passes(run, "means", groups, len(texels), means))
 
 
 def _bytes_of(lit: LitScene) -> int:
@@ -146,20 +173,18 @@ def _bytes_of(lit: LitScene) -> int:
     return lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
 
 
-def _observe(
-    run: StageRun,
-    atlas: Atlas,
+def _observed(
+    run: TaskRun,
     lit: LitScene,
+    texels: Texels,
     frames: Frames,
+    before: LightBefore,
     lobes: Lobes,
-    level: Float,
-    samples: Float,
     seed: int,
     part: slice,
 ) -> MeanState:
-    """Some texels in all frames, going on from the last saved state of an interrupted run; samples
-    (T,): how many frames see each."""
-    texels, owner = atlas.texels, atlas.texels.object_index()
+    """Some texels in all frames, going on from the last saved state of an interrupted run."""
+    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
     name = f"refined-{part.start}-{part.stop}"
     saved = run.latest(name)
     start, observed = 0, MeanState.empty(part.stop - part.start)
@@ -167,10 +192,10 @@ def _observe(
         start, observed = saved[0] + 1, MeanState(**saved[1])
     # The mean starts from its first samples, which must not all show one highlight.
     order = spread_order(len(frames))[start:]
-    shown = samples_from_frames(texels, atlas.scene, lit.rays, frames, order, part)
-    bar = progress(shown, total=len(order), label="fit: refine", unit="frames")
+    sampled = samples_from_frames(texels, lit.scene, lit.rays, frames, order, part)
+    bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
-        taken = _taken(some.texel, samples[some.texel], some.frame, seed)
+        taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
         texel, radiance = some.texel[taken], some.radiance[taken]
         camera = frames.camera(some.frame)
         specular = np.empty_like(radiance)
@@ -198,7 +223,7 @@ def _deviation(unit: Float, covered: Float, noise_floor: float) -> Float:
     return np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
 
 
-def _taken(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
+def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
     """Which of the texels (M,), which so many frames show as ``samples`` (M,) says, are taken from
     this frame: what becomes of a texel depends on nothing but its number."""
     taken: Bool = samples <= _MOST_SAMPLES

@@ -1,0 +1,470 @@
+"""The rules of the house: who may import whom, who opens files, where numbers stand.
+
+Each test gives the places that break its rule, and compares them with ``NOT_YET``: a place that is
+new there fails, and so does an entry that is not needed any more. Read ``docs/architecture.md``
+first.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from datetime import date
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+from usdbrdf.calibration import entries
+
+PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
+
+# --- The arrows. A room may import what it names here, and all rooms that those may. -------------
+
+GROUND = {"calibration", "errors", "identity", "kernel", "kernel_cache", "options"}
+RUNNING = {"files", "job", "untrusted"}
+SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
+READERS = {"delivery", "evaluation", "relighting", "validation"}
+
+ARROWS: dict[str, set[str]] = {
+    "errors": set(),
+    "identity": set(),
+    "calibration": set(),
+    "options": {"model"},
+    "kernel_cache": {"identity"},
+    "kernel": {"kernel_cache"},
+    "model": {"errors"},
+    "files": {"model"},
+    "job": {"files", "identity"},
+    "untrusted": {"job"},
+    "transport": {"model", "untrusted", "kernel", "calibration", "options"},
+    "geometry": {"transport"},
+    "texturing": {"geometry"},
+    "capture": {"geometry"},
+    "shading": {"transport"},
+    "material": {"transport"},
+    # A document of views is read by the adapter of the capture that they belong to.
+    "asset": {"transport", "capture"},
+    "tasks": SUBJECTS,
+    "pipeline": {"tasks"},
+    "delivery": {"asset"},
+    "evaluation": {"asset"},
+    "relighting": {"asset"},
+    "validation": {"asset"},
+    "cli": {"commands", "command_parser"},
+    "commands": {"command_parser"},
+    "command_parser": {"pipeline", *READERS},
+    "fit_options": {"tasks"},
+    "__main__": {"cli"},
+    # The public face, which nothing inside may import.
+    "": {"pipeline", *READERS},
+}
+
+# --- The one place of each dependency. ------------------------------------------------------------
+
+IMPORTERS: dict[str, set[str]] = {
+    "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
+    "drjit": {"relighting/"},
+    "embreex": {"transport/embree.py"},
+    "filelock": {"job/lock.py"},
+    "flip_evaluator": {"evaluation/metrics.py"},
+    "llvmlite": {"kernel_cache.py", "transport/"},
+    "matplotlib": {"evaluation/"},
+    "mitsuba": {"relighting/"},
+    "msgspec": {"files/documents.py"},
+    "numba": {"kernel.py", "kernel_cache.py", "geometry/", "material/", "texturing/", "transport/"},
+    "omni": {"validation/omniverse.py"},
+    "OpenImageIO": {"files/images.py"},
+    "pickle": {"kernel_cache.py"},
+    "PIL": {"delivery/"},
+    "psutil": {"job/memory.py"},
+    "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
+    "pymeshlab": {"geometry/mesh_filters.py"},
+    "PyOpenColorIO": {"files/colour.py"},
+    "pyoidn": {"transport/denoise.py"},
+    "subprocess": {"job/child.py"},
+    "threadpoolctl": {"tasks/"},
+    "tqdm": {"job/progress.py"},
+    "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
+    "xatlas": {"geometry/unwrap.py"},
+}
+
+# --- Who opens files: rooms and single modules, with the reason. ----------------------------------
+
+OPENERS: dict[str, str] = {
+    "files/": "bytes are its subject",
+    "job/": "stamps, locks, checkpoints, children",
+    "untrusted/": "parses what others wrote",
+    "asset/": "USD layers are written by USD",
+    "delivery/": "packages are files",
+    "calibration.py": "its own data",
+    "cli.py": "stdout that nobody reads is replaced",
+    "identity.py": "hashes the sources",
+    "kernel_cache.py": "compiled code",
+    "capture/checks.py": "compares photographs by their hashes",
+    "evaluation/truth.py": "truth comes as .npz",
+    "relighting/command_options.py": "a matrix comes as a text file",
+    "validation/cure_layer.py": "the layer of cures is an artist's file",
+}
+_OPEN = {
+    "open", "read_text", "write_text", "read_bytes", "write_bytes", "load", "loadtxt", "save",
+    "savez", "savetxt", "fromfile", "tofile", "memmap", "Export",
+}  # fmt: skip
+
+# --- Numbers in the rooms of the method that are no calibration, with the reason. -----------------
+
+CALIBRATED_ROOMS = ("capture", "material", "shading", "tasks", "texturing")
+ENGINEERING: dict[str, str] = {
+    "GRID": "discretisation of the search",
+    "MEASURED": "codes of coverage, which other programs read",
+    "MIXTURE": "rays: noise against time",
+    "NOTHING": "codes of what a texel shows in a frame",
+    "NOTHING_KNOWN": "mathematics: deviation of the even distribution",
+    "OF_TEXTURING": "bytes",
+    "RINGS": "mathematics: nodes of a quadrature",
+    "SIDE": "texels of a square",
+    "_AT_A_TIME": "memory",
+    "_BATCH": "memory",
+    "_BRIGHTER_THAN": "importance sampling: noise, not value",
+    "_CANDIDATES": "discretisation of the search",
+    "_COUNTED_PIXELS": "time",
+    "_DIGITS": "what is printed",
+    "_DIFFUSE_RAYS": "rays: noise against time",
+    "_FEWEST": "memory",
+    "_FIRST_GUESS": "start and end of a search",
+    "_FLIP": "convention of a format",
+    "_FOLLOWED": "memory",
+    "_FRAMES_OF_NOISE": "time",
+    "_GAP": "keeps lights off surfaces",
+    "_GOLDEN": "mathematics",
+    "_HALF_UNTIL": "limit of half floats",
+    "_KEPT": "memory",
+    "_HALF_STOP": "mathematics",
+    "_LAGS": "pixels at which correlations are taken",
+    "_LONGEST_NAME": "limit of a format",
+    "LARGEST_OF_POSE": "limit of what is refused",
+    "_FOCAL_LENGTHS": "limit of what is refused",
+    "_OFF_CENTRE": "limit of what is refused",
+    "_LEVEL_1": "discretisation of the search",
+    "_LEVEL_2": "discretisation of the search",
+    "_MAX_CELLS": "memory",
+    "_MAX_DEVIATION": "numerics: what is a rotation",
+    "_MAX_DROPPED_SHARE": "limit of what is refused",
+    "_MAX_GROUPS": "time",
+    "_MAX_OBJECTS": "limit of a format",
+    "_MAX_PARTS": "sides of a box",
+    "_MAX_RAYS": "memory",
+    "_MAX_TAPS": "time",
+    "_MAX_WIDTH": "size of a picture",
+    "_MIN_BASELINE": "limit of what is refused",
+    "_MIN_HIT_SHARE": "limit of what is refused",
+    "_MIN_USEFUL_SHARE": "limit of what is refused",
+    "MIN_FRAMES": "limit of what is refused",
+    "_MOSTLY": "from here on a warning is printed",
+    "_MOST_EFFECTS": "memory",
+    "_MOST_MEGABYTES": "memory",
+    "_MOST_SAMPLES": "time",
+    "_MOST_SOURCES": "memory",
+    "_MOST_TEXELS": "memory",
+    "_NEIGHBOURS": "discretisation of the filling in",
+    "_OF_REFINING": "bytes",
+    "_OF_TEXEL": "mathematics: variance of a texel",
+    "_OLD_NERFSTUDIO": "convention of a format",
+    "_PERCENTILE": "exposure of a picture that is looked at",
+    "_PER_TRIANGLE": "bytes",
+    "_PROBED_FRAMES": "time",
+    "_PROBED_SIDE": "time",
+    "_PROCESS": "bytes",
+    "_PROXY_RAYS": "rays: noise against time",
+    "_PSI_GRID": "discretisation of the posterior",
+    "_RAYS": "rays: noise against time",
+    "_RAYS_PER_FRAME": "time",
+    "_READERS": "threads and frames ahead",
+    "_REPEATS": "rays: noise against time",
+    "_RING": "mathematics: nodes of a quadrature",
+    "_ROUNDING": "numerics: of float32 and printed digits",
+    "_ROUNDS": "steps of a search",
+    "_SAMPLING": "rays: noise against time",
+    "_SEED": "a seed",
+    "_SHARE": "memory",
+    "_SIDE": "texels of a tile",
+    "_SMALLEST_GROUP": "memory",
+    "_SPECULAR_RAYS": "rays: noise against time",
+    "_STEPS": "steps of a search",
+    "_SUB_PIXEL": "mathematics: nodes of a quadrature",
+    "_TEXELS": "time: how many are asked",
+    "_TILE": "texels that are worked on together",
+    "_TIMES_FOR_CURVED": "rays: noise against time",
+    "_UPDATES": "steps of a search",
+    "_VIEWS": "memory",
+    "_WINDOW": "pixels that are worked on together",
+    "_WRITERS": "threads",
+    "_ZERO": "numerics: zero has no logarithm",
+    "_Z_UP_FROM_Y_UP": "convention of a format",
+}
+
+MOST_FILES, MOST_LINES, MOST_LINES_OF_TASK = 20, 500, 120
+HISTORY = re.compile(r"\b(no longer|used to (?!be\b)\w+|previously|was once|formerly)\b", re.I)
+
+NOT_YET: dict[str, set[str]] = {
+    "arrows": {
+        "asset -> geometry", "asset -> shading", "cli -> fit_options",
+        "command_parser -> fit_options",
+        "material -> texturing",
+        "options -> capture", "options -> shading", "options -> tasks", "options -> transport",
+        "relighting -> geometry", "untrusted -> geometry",
+    },
+    "circles": {"asset.layers <- asset.readers"},
+    "face": {"cli.py"},
+    "history": {"job/publishing.py: no longer"},
+    "importers": {
+        "model/mesh.py: pxr",
+        "relighting/inserted_models.py: trimesh", "tasks/atlas.py: pxr", "tasks/step.py: pxr",
+        "tasks/texture.py: pxr",
+    },
+    "tasks": {
+        "tasks/atlas.py", "tasks/clipped.py", "tasks/fit.py", "tasks/fit_objects.py",
+        "tasks/ingest.py", "tasks/refine.py", "tasks/shade.py", "tasks/texture.py",
+    },
+}  # fmt: skip
+
+
+@cache
+def modules() -> dict[str, tuple[Path, ast.Module]]:
+    """Dotted name below the package ("" for its face) -> file and syntax tree."""
+    found = {}
+    for file in sorted(PACKAGE.rglob("*.py")):
+        parts = file.relative_to(PACKAGE).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = file, ast.parse(file.read_text("utf-8"))
+    return found
+
+
+def place(name: str) -> str:
+    return modules()[name][0].relative_to(PACKAGE).as_posix()
+
+
+def within(file: str, places: set[str] | dict[str, str]) -> bool:
+    return any(file == p or (p.endswith("/") and file.startswith(p)) for p in places)
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Absolute names of all that a module imports, in functions too, ``package.module.name``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"relative import, line {node.lineno}"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module"
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
+            yield str(node.args[0].value)
+
+
+@cache
+def inner_imports() -> dict[str, set[str]]:
+    """Module -> the package's modules that it imports, "" being the package's face."""
+    found: dict[str, set[str]] = {}
+    for name, (_, tree) in modules().items():
+        found[name] = set()
+        for full in imported(tree):
+            if full.split(".")[0] != "usdbrdf":
+                continue
+            inner = full.partition(".")[2]
+            while inner not in modules():
+                inner = inner.rpartition(".")[0]
+            found[name].add(inner)
+    return found
+
+
+def room(name: str) -> str:
+    return name.split(".")[0]
+
+
+def check(rule: str, found: set[str]) -> None:
+    expected = NOT_YET.get(rule, set())
+    assert found - expected == set(), "breaks the rule"
+    assert expected - found == set(), "is in order now: take it out of NOT_YET"
+
+
+def test_every_room_has_its_place():
+    assert {room(name) for name in modules()} <= ARROWS.keys()
+    assert GROUND | RUNNING | SUBJECTS | READERS | {"model"} <= ARROWS.keys()
+    assert tuple(TopologicalSorter(ARROWS).static_order())
+
+
+def test_imports_go_downwards_only():
+    @cache
+    def below(one: str) -> frozenset[str]:
+        return frozenset(ARROWS[one].union(*(below(other) for other in ARROWS[one])))
+
+    # The ground floor carries everything, files, job and untrusted all but the ground and model.
+    def may(one: str, other: str) -> bool:
+        return (
+            other in below(one)
+            or (other in GROUND and one not in GROUND)
+            or (other in RUNNING and one not in GROUND | RUNNING | {"model"})
+        )
+
+    check(
+        "arrows",
+        {
+            f"{room(name)} -> {room(other)}"
+            for name, others in inner_imports().items()
+            for other in others
+            if other and room(other) != room(name) and not may(room(name), room(other))
+        },
+    )
+
+
+def test_nothing_imports_the_public_face():
+    """It is not part of a kernel's identity, and importing it would import everything."""
+    inside = {name: others for name, others in inner_imports().items() if name}
+    check("face", {place(name) for name, others in inside.items() if "" in others})
+
+
+def test_no_circles():
+    folders: dict[str, set[str]] = {}
+    for name, others in inner_imports().items():
+        own, theirs = name.rpartition(".")[0], {other.rpartition(".")[0] for other in others}
+        # A folder and one inside it are one room.
+        apart = {x for x in theirs if not (f"{x}.".startswith(own) or f"{own}.".startswith(x))}
+        folders.setdefault(own, set()).update(apart)
+    found = set()
+    for graph in (inner_imports(), folders):
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            found.add(" <- ".join(sorted(set(error.args[1]))))
+    check("circles", found)
+
+
+def test_each_dependency_has_its_place():
+    check(
+        "importers",
+        {
+            f"{place(name)}: {full.split('.')[0]}"
+            for name, (_, tree) in modules().items()
+            for full in imported(tree)
+            if full.split(".")[0] in IMPORTERS
+            and not within(place(name), IMPORTERS[full.split(".")[0]])
+        },
+    )
+
+
+def test_few_open_files():
+    opening = set()
+    for name, (_, tree) in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                function = node.func
+                called = function.attr if isinstance(function, ast.Attribute) else ""
+                if isinstance(function, ast.Name):
+                    called = function.id if function.id == "open" else ""
+                if called in _OPEN and not _is_own_checkpoint(function):
+                    opening.add(place(name))
+    strangers = {file for file in opening if not within(file, OPENERS)}
+    assert strangers == set()
+    unneeded = {p for p in OPENERS if not any(within(file, {p}) for file in opening)}
+    assert {p for p in unneeded if (PACKAGE / p).exists()} == set()
+
+
+def _is_own_checkpoint(function: ast.expr) -> bool:
+    """``run.save(...)`` and the like store with the job's help."""
+    return (
+        isinstance(function, ast.Attribute)
+        and function.attr in ("save", "load")
+        and not (isinstance(function.value, ast.Name) and function.value.id == "np")
+    )
+
+
+def test_folders_and_files_are_of_a_size_one_can_read():
+    files = Counter(file.parent for file, _ in modules().values() if file.name != "__init__.py")
+    assert {folder.name: n for folder, n in files.items() if n > MOST_FILES} == {}
+    lines = {
+        name: len(file.read_text("utf-8").splitlines()) for name, (file, _) in modules().items()
+    }
+    assert {name: n for name, n in lines.items() if n > MOST_LINES} == {}
+    tasks = {place(name) for name, n in lines.items() if n > MOST_LINES_OF_TASK}
+    check("tasks", {file for file in tasks if file.startswith("tasks/")})
+
+
+def _numbers(node: ast.expr) -> bool:
+    return any(
+        isinstance(part, ast.Constant) and type(part.value) in (int, float)
+        for part in ast.walk(node)
+    )
+
+
+def _is_calibrated(node: ast.expr) -> bool:
+    return any(isinstance(n, ast.Name) and n.id == "calibration" for n in ast.walk(node))
+
+
+def test_numbers_of_the_method_are_data_or_engineering():
+    found = set()
+    for name, (_, tree) in modules().items():
+        for node in tree.body if room(name) in CALIBRATED_ROOMS else ():
+            if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
+                continue
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            first = target.elts[0] if isinstance(target, ast.Tuple) else target
+            if _numbers(node.value) and not _is_calibrated(node.value):
+                found.add(f"{place(name)}: {ast.unparse(first)}")
+    unknown = {entry for entry in found if entry.split(": ")[1] not in ENGINEERING}
+    assert unknown == set()
+
+
+def test_calibration_is_whole_and_used():
+    used = [
+        node.args[0].value
+        for _, tree in modules().values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and isinstance(node.func.value, ast.Name)
+        and node.func.value.id == "calibration"
+    ]
+    assert sorted(used) == sorted(entries())
+    for name, entry in entries().items():
+        assert set(entry) == {"value", "unit", "meaning", "on", "by", "date"}, name
+        assert entry["unit"], name
+        assert entry["meaning"].endswith("."), name
+        assert entry["on"], name
+        assert date.fromisoformat(entry["date"]), name
+        if entry["by"]:
+            assert (PACKAGE.parent / entry["by"]).is_file(), name
+
+
+def test_comments_tell_of_the_code_and_not_of_its_past():
+    found = set()
+    for name, (file, _) in modules().items():
+        for token in tokenize.generate_tokens(io.StringIO(file.read_text("utf-8")).readline):
+            if token.type == tokenize.COMMENT and HISTORY.search(token.string):
+                found.add(f"{place(name)}: {HISTORY.search(token.string)[0].lower()}")
+    check("history", found)
+
+
+def test_only_the_command_line_prints():
+    printing = {
+        place(name)
+        for name, (_, tree) in modules().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+    }
+    assert printing <= {"cli.py", "commands.py"}
+
+
+@pytest.mark.parametrize("word", ["fastmath=True", "# type: ignore\n", "import *"])
+def test_what_is_never_written(word):
+    assert [name for name, (file, _) in modules().items() if word in file.read_text("utf-8")] == []

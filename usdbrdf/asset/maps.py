@@ -1,0 +1,217 @@
+"""The maps of an asset: opened once, each read when it is first asked for; and their writer."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pxr import Ar, Usd
+
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.properties import Aov
+from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.objects import aov_path
+from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.images import image_size, read_exr, write_exr
+from usdbrdf.geometry.texels import texels_from_atlas
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.texels import Texels
+from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.lit_scene import LitScene, lit_scene
+from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.textured_scene import TexturedScene
+
+# Half floats end at 65504. A map that must lose nothing is stored as floats from here on.
+_HALF_UNTIL = 60_000
+# Pictures decoded or written at a time.
+_AT_A_TIME = min(4, os.cpu_count() or 1)
+
+
+class AssetMaps:
+    """The scene of a composed stage, its photographs, and what tasks measured of its texels.
+
+    Each is read when it is first asked for, and every map is decoded at most once; the arrays are
+    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear Rec.709.
+    """
+
+    def __init__(self, stage: Usd.Stage) -> None:
+        self.stage = stage
+        self._read: dict[str, Float] = {}
+
+    def layers_elsewhere(self, folder: Path) -> list[Path]:
+        """Files of layers that are not in the asset's ``folder``: captured USD geometry."""
+        # What lies in a package has the package's path, followed by its own in brackets.
+        files = {
+            Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0])
+            for layer in self.stage.GetUsedLayers()
+            if not layer.anonymous
+        }
+        ours = (folder / "layers").resolve()
+        return sorted(file for file in files if file.resolve().parent != ours)
+
+    @cached_property
+    def frames(self) -> Frames:
+        """The photographs, poses in metres."""
+        return frames_from_stage(self.stage)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The labelled meshes as one triangle soup, in metres."""
+        return scene_from_stage(self.stage)
+
+    @cached_property
+    def texels(self) -> Texels:
+        """Where the texels lie; InputRefused before the texturing task has run."""
+        if self.scene.corner_uv is None:
+            raise InputRefused(
+                "the stage has no texture coordinates of ours. Run `usdbrdf texture` first. "
+                "[asset.incomplete]"
+            )
+        sizes = [image_size(self._file(obj, "coverage"))[:2] for obj in self.scene.objects]
+        return texels_from_atlas(self.scene, np.array(sizes, np.int32))
+
+    @cached_property
+    def surface(self) -> TexturedScene:
+        """Scene and texels as light transport takes them."""
+        rays = RayScene(self.scene.points, self.scene.triangles)
+        return TexturedScene(self.scene, self.texels, rays)
+
+    @cached_property
+    def coverage(self) -> CoverageMap:
+        """What the frames know of each texel."""
+        return CoverageMap.from_stored(self._decoded("coverage"))
+
+    @property
+    def lit(self) -> Float:
+        """(T, 3) W/(m^2 sr): L_d as the texturing task has it; where lamps clip, a lower bound."""
+        return self.map("lit")
+
+    @property
+    def samples(self) -> Float:
+        """(T,): how many frames measured each texel."""
+        return self.map("samples")[:, 0]
+
+    @property
+    def irradiance(self) -> Float:
+        """(T, 3) W/m^2: S as it is used."""
+        return self.map("irradiance")
+
+    @property
+    def traced_irradiance(self) -> Float:
+        """(T, 3) W/m^2: S before the lightmap filter, of assets whose shading used one."""
+        return self.map("irradiance_raw")
+
+    @cached_property
+    def emission(self) -> Float:
+        """(T, 3) W/(m^2 sr): the radiance with which lamps shine, zero on all else."""
+        return self.map_where_present("emission", 3)
+
+    @cached_property
+    def emissive(self) -> Bool:
+        """(T,): the texel shines by itself."""
+        return np.asarray((self.emission > 0).any(axis=1), np.bool_)
+
+    @property
+    def light(self) -> Float:
+        """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and of lamps what shading found (of
+        those that clipped in every frame L_d is only a lower bound)."""
+        return np.where(self.emissive[:, None], self.emission, self.lit)
+
+    def lit_scene(self, environment: Environment) -> LitScene:
+        """All that light transport needs, with ``light`` as the light."""
+        return lit_scene(self.surface, self.light, self.emissive, environment)
+
+    def has(self, aov: str) -> bool:
+        """Whether any object has the map."""
+        return any(aov_path(self.stage, obj.prim_path, aov) for obj in self.scene.objects)
+
+    def map(self, aov: str) -> Float:
+        """(T, C): a map that every object has; InputRefused where one has not."""
+        if aov not in self._read:
+            self._read[aov] = self._decoded(aov)
+        return self._read[aov]
+
+    def map_where_present(self, aov: str, channels: int) -> Float:
+        """(T, channels): zeros on objects that do not have the map."""
+        if aov in self._read:
+            return self._read[aov]
+        values = np.zeros((len(self.texels), channels), np.float32)
+        for i, obj in enumerate(self.scene.objects):
+            if aov_path(self.stage, obj.prim_path, aov) is not None:
+                picture = read_exr(self._file(obj, aov))
+                values[self.texels.of_object(i)] = self.texels.from_image(i, picture)
+        return values
+
+    def _decoded(self, aov: str) -> Float:
+        files = [self._file(obj, aov) for obj in self.scene.objects]
+        with ThreadPoolExecutor(_AT_A_TIME) as pool:
+            pictures = enumerate(pool.map(read_exr, files))
+            return np.concatenate([self.texels.from_image(i, image) for i, image in pictures])
+
+    def _file(self, obj: SceneObject, aov: str) -> Path:
+        path = aov_path(self.stage, obj.prim_path, aov)
+        if path is None or not path.is_file():
+            raise InputRefused(
+                f"<{obj.prim_path}>: its map {aov!r} is missing ({path}). Run the step that makes "
+                "it again. [asset.incomplete]"
+            )
+        return path
+
+
+class TexelMap(NamedTuple):
+    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``; exact: stored as floats
+    rather than clamped."""
+
+    values: Float
+    scale: float
+    unit: str
+    exact: bool = False
+
+
+@dataclass
+class MapWriter:
+    """Writes the maps of a task, and counts the values that were too large for them."""
+
+    run: TaskRun
+    asset: Asset
+    scene: Scene
+    texels: Texels
+    clamped: int = 0
+
+    def write(self, index: int, maps: dict[str, TexelMap]) -> tuple[Aov, ...]:
+        """One object's pictures."""
+        identifier = self.scene.objects[index].identifier
+        files = [self.asset.texture(identifier, name) for name in maps]
+        places = [self.run.output(file) for file in files]
+
+        def written(place: Path, chosen: TexelMap) -> int:
+            picture = self.texels.image(index, chosen.values)
+            half = not (chosen.exact and float(np.abs(picture).max()) > _HALF_UNTIL)
+            return write_exr(place, picture, half=half)
+
+        # Compressing takes a core each, and flushing to the disk time.
+        with ThreadPoolExecutor(_AT_A_TIME) as pool:
+            self.clamped += sum(pool.map(written, places, maps.values()))
+        return tuple(
+            Aov(name=name, file=file, scale=chosen.scale, unit=chosen.unit)
+            for file, (name, chosen) in zip(files, maps.items(), strict=True)
+        )
+
+    def warn(self) -> None:
+        """Say once what was lost, if anything."""
+        if self.clamped:
+            say(
+                f"warning: {self.clamped:,} values of the maps exceed 65504 and were clamped. The "
+                "unit of the radiance may be wrong. [image.clamped]"
+            )

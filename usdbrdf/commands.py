@@ -1,0 +1,330 @@
+"""The commands of ``usdbrdf``: each class says what its command takes, ``run`` what it does.
+
+What takes time to load is loaded where it is needed: no page of help waits for NumPy or USD.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from usdbrdf import options
+from usdbrdf.command_parser import Command
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.interrupts import loading
+from usdbrdf.job.progress import hand_over, printable, say, set_quiet, show
+from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from usdbrdf.asset.layout import Asset
+    from usdbrdf.job.task import TaskResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run(TalkOptions, Command):
+    wait_s: float = option("--wait S", 0.0, (0, 10**9))
+    "wait up to this many seconds for a busy asset folder"
+
+    def report(self, results: Mapping[str, TaskResult], folder: Path) -> int:
+        """What the tasks found, with the root layer, whose name only a finished ingest knows."""
+        from usdbrdf.asset.layout import Asset
+
+        root = Asset.at(folder).root_layer
+        if self.json:
+            tasks = {
+                name: {"reran": result.reran, "reason": result.reason, **result.summary}
+                for name, result in results.items()
+            }
+            _hand_over({"asset": str(root), "steps": tasks})
+        if "ingest" in results and results["ingest"].summary.get("radiometric") is False:
+            say("warning: the images are not radiometric; albedo and fit have no absolute meaning.")
+        say(f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RunOnCapture(_Run):
+    capture: Path = option("SCAN", REQUIRED)
+    "capture folder or its main file"
+    output: Path = option("-o --output ASSET", REQUIRED)
+    "asset folder, made if it is not there"
+    adapter: str | None = option(
+        "--adapter NAME", None, unset="recognised by its content", shared="ingest"
+    )
+    "capture format"
+    plugins: bool = option("--no-plugins", True, shared="ingest")
+    "use our own adapters only"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(EditOptions, _RunOnCapture):
+    """Do all four steps: capture in, USD asset out."""
+
+    options: options.ConvertOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.pipeline import convert
+        results = convert(
+            self.capture,
+            self.output,
+            self.options,
+            adapter=self.adapter,
+            plugins=self.plugins,
+            hand_edits=self.hand_edits,
+            wait_s=self.wait_s,
+        )
+        return self.report(results, self.output)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ingest(_RunOnCapture):
+    """Read a capture into the layer scan.usdc."""
+
+    ingest: options.IngestOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.pipeline import ingest, working_on
+        with working_on(self.output, wait_s=self.wait_s) as asset:
+            done = ingest(self.capture, asset, self.ingest, self.adapter, plugins=self.plugins)
+        return self.report({"ingest": done}, self.output)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RunOnAsset(_Run):
+    asset: Path = option("ASSET", REQUIRED)
+    "asset folder made by ingest"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf import pipeline
+        name = type(self).__name__.lower()
+        with pipeline.working_on(self.asset, wait_s=self.wait_s) as asset:
+            done = getattr(pipeline, name)(asset, getattr(self, name))
+        return self.report({name: done}, self.asset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture(_RunOnAsset):
+    """Project the frames: lit diffuse radiance L_d per texel."""
+
+    texture: options.TextureOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shade(_RunOnAsset):
+    """Trace irradiance S, divide for albedo, find the emitters."""
+
+    shade: options.ShadeOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(_RunOnAsset):
+    """Fit roughness and specular of each object."""
+
+    fit: options.FitOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class _WithAsset(TalkOptions, Command):
+    asset: Path = option("ASSET", REQUIRED)
+    "asset folder; it is not changed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(_WithAsset):
+    """Render views and compare them with photographs."""
+
+    output: Path = option("-o --output FOLDER", Path("evaluation"))
+    "folder for figures and pictures, made if it is not there"
+    views: Path = option("--views FILE", REQUIRED, file=True)
+    "nerfstudio document (transforms.json) of views of the capture, held out or its own"
+    options: options.EvaluateOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.evaluation.evaluate_views import DOCUMENT, evaluate
+            from usdbrdf.evaluation.report import summary_line, truth_line
+        found = evaluate(self.asset, self.views, self.output, self.options)
+        truth = {"truth": found["truth"]} if "truth" in found else {}
+        if self.json:
+            _hand_over({"output": str(self.output), **found["summary"], **truth})
+        say(summary_line(found["summary"]))
+        if truth:
+            say(truth_line(found["truth"]))
+        say(f"{self.output / DOCUMENT}: written")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(TalkOptions, Command):
+    """Compare two assets of one scene, lit differently."""
+
+    first: Path = option("ASSET", REQUIRED)
+    "asset folder; it is not changed"
+    second: Path = option("OTHER", REQUIRED)
+    "another of the same scene; it is not changed"
+    output: Path = option("-o --output FOLDER", Path("comparison"))
+    "folder for figures and pictures, made if it is not there"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.evaluation import compare_assets as made
+        found = made.compare(self.first, self.second, self.output)
+        if self.json:
+            _hand_over({"output": str(self.output), **made.figures(found)})
+        say(made.comparison_line(found))
+        say(f"{self.output / made.DOCUMENT}: written")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relight(_WithAsset):
+    """Path trace the published asset in its own or in other light."""
+
+    output: Path = option("-o --output IMAGE", REQUIRED)
+    ".exr: linear float radiance; .png, .jpg: exposed, sRGB; with --views a folder"
+    options: options.RelightOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.relighting.relight import relight
+        summary = relight(self.asset, self.output, self.options)
+        if self.json:
+            _hand_over(summary)
+        say(f"{self.output}: written")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Package(_WithAsset):
+    """Write the asset as one file: .usdz or .glb."""
+
+    output: Path = option("-o --output FILE", REQUIRED)
+    ".usdz, or .glb (metres, y up) for what reads no USD; replaced if it is there"
+    options: options.PackageOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.delivery.package import package
+        summary = package(_asset_at(self.asset).folder, self.output, self.options)
+        if self.json:
+            _hand_over(summary)
+        say(f"{self.output}: written, {summary['bytes']:,} bytes")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validate(Command):
+    """Check an asset by our rules and those of USD."""
+
+    asset: Path = option("ASSET", REQUIRED)
+    "asset folder"
+    fix: Path | None = option("--fix LAYER", None)
+    """write what can be cured beyond doubt into a new layer, such as ASSET/fixes.usda, for you to
+    add in front of edits.usda"""
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.validation.cure_layer import write_cures
+            from usdbrdf.validation.validate import has_errors, validate
+        asset = _asset_at(self.asset)
+        root = asset.root_layer
+        findings = validate(root)
+        for finding in findings:
+            show(printable(str(finding)))
+        if not findings:
+            say(f"{root}: no errors")
+        if self.fix is not None:
+            cured = write_cures(asset, self.fix)
+            done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
+            say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
+        return 7 if has_errors(findings) else 0
+
+
+def _asset_at(place: Path) -> Asset:
+    """The asset of a folder, or of the root layer in it."""
+    from usdbrdf.asset.layout import Asset
+
+    asset = Asset.at(place.parent if place.is_file() else place)
+    root = asset.root_layer
+    if not root.is_file() or (place.is_file() and not place.samefile(root)):
+        raise InputRefused(
+            f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or the "
+            "NAME.usda in it. [asset.missing]"
+        )
+    return asset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules(Command):
+    """List what validate looks for."""
+
+    json: bool = option("--json", False)
+    "with descriptions, as JSON"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.validation.validate import listed_rules
+        rules = listed_rules()
+        if self.json:
+            _hand_over([asdict(rule) for rule in rules])
+            return 0
+        for rule in rules:
+            severity = f" ({rule.severity})" if rule.severity else ""
+            first = re.split(r"(?<!\be\.g)(?<!\bi\.e)\.\s", rule.description, maxsplit=1)[0]
+            show(printable(f"{rule.name}{severity}: {first.rstrip('.')}."))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adapters(Command):
+    """List the capture formats that can be read."""
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.adapters import list_adapters
+        set_quiet(True)  # a broken adapter's warning is its line in the list
+        found = list_adapters()
+        width = max(len(adapter.name) for adapter in found)
+        for adapter in found:
+            about = f"broken: {adapter.problem}" if adapter.problem else adapter.description
+            show(printable(f"{adapter.name:{width}}  {' '.join(about.split())} ({adapter.origin})"))
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginPath(Command):
+    """Print what to put into PXR_PLUGINPATH_NAME."""
+
+    schemas: bool = option("--schemas", False)
+    """without the validators, for applications whose Python has no usdbrdf: USD reports an error
+    there when all validators are asked for"""
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.asset.schema import plugin_path, validators_path
+        folders = [plugin_path()] if self.schemas else [plugin_path(), validators_path()]
+        show(os.pathsep.join(str(folder) for folder in folders))
+        return 0
+
+
+def _hand_over(summary: Any) -> None:
+    hand_over(json.dumps(summary, indent=2))
+
+
+_TASKS: tuple[type[Command], ...] = (Convert, Ingest, Texture, Shade, Fit)
+
+_OTHERS = (Evaluate, Compare, Relight, Package, Validate, Rules, Adapters, PluginPath)
+
+COMMANDS = {
+    re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
+    for command in (*_TASKS, *_OTHERS)
+}

@@ -1,0 +1,226 @@
+"""One pass over the frames for all objects, then a lobe for each of them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from usdbrdf.files.frames import read_frame
+from usdbrdf.job.progress import progress
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material.fit_target import Residual, fit_target_frame
+from usdbrdf.material.fit_views import MIXTURE, fit_views
+from usdbrdf.material.observations import Follower, Observations
+from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
+from usdbrdf.material.verdict import (
+    NEUTRAL,
+    Verdict,
+    class_prior,
+    verdict_on_frame,
+    verdict_on_views,
+)
+from usdbrdf.model.arrays import Array, Bool, Float, Int
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.scene import SceneObject
+from usdbrdf.model.texels import Texels
+from usdbrdf.options import FitOptions
+from usdbrdf.transport.lit_scene import LitScene, View
+from usdbrdf.transport.lobe_radiance import Mixture
+
+# Objects that are fitted together: while rays of one are traced on all cores, another is at its
+# algebra, which takes one.
+_AT_A_TIME = 2
+
+# A1 and A2 are counted on about this many pixels per frame.
+_COUNTED_PIXELS = 80_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What one pass over the frames gathers: per object the target frame, which shows its highlight
+    best (-1: none), and, as the method needs, the observations of followed texels, and by how many
+    pixels the pictures were smoothed (NaN: they do not tell)."""
+
+    target: Int
+    observations: Observations
+    smoothing: float
+
+
+class ObjectFit(NamedTuple):
+    """What the frames say of one object's lobe; NaN where it could not be fitted.
+
+    phi, psi, phi_error, psi_error  the paper's parameters and their standard deviations
+    unresolved    share of the highlight that the pixels do not resolve
+    cost          at the minimum; evidence: 1 - cost / cost without a lobe
+    num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
+    """
+
+    phi: float = math.nan
+    psi: float = math.nan
+    phi_error: float = math.nan
+    psi_error: float = math.nan
+    unresolved: float = math.nan
+    cost: float = math.nan
+    evidence: float = math.nan
+    num_samples: int = 0
+    target: int = -1
+
+    def arrays(self) -> dict[str, Array]:
+        """As checkpoints hold it."""
+        return {
+            "numbers": np.array(self[:7]),
+            "used": np.array(self.num_samples),
+            "target": np.array(self.target),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> ObjectFit:
+        """The inverse of ``arrays``."""
+        counts = int(arrays["used"]), int(arrays["target"])
+        return cls._make([*map(float, arrays["numbers"]), *counts])
+
+    def rounded(self) -> ObjectFit:
+        """Without the digits that depend on how many threads the linear algebra had."""
+        return ObjectFit._make([*(round(number, 4) for number in self[:7]), *self[7:]])
+
+
+def survey_frames(
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    usable: Bool,
+    frames: Frames,
+    options: FitOptions,
+) -> Survey:
+    """Gather all that the fits need of the frames, which are read once.
+
+    usable (T,): measured by frames, and no lamp
+    """
+
+    def gather() -> dict[str, Array]:
+        by_views = options.method == "views"
+        follower = Follower(
+            lit, texels, usable & texels.interior & by_views, len(frames), options.seed
+        )
+        counts = []
+        numbers = range(len(frames))
+        for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
+            pixels = read_frame(frames, i)
+            if by_views:
+                view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
+                follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
+            else:
+                counts.append(_count(lit, frames, i, pixels.valid))
+        target = follower.target_frames(texels) if by_views else choose_target_frames(counts)[0]
+        chosen = follower.chosen(texels, options.seed)
+        smoothing = np.array(follower.smoothing)
+        return {"target": target, "smoothing": smoothing, **chosen.arrays()}
+
+    found = run.checkpoint("survey", gather)
+    target, smoothing = found.pop("target"), float(found.pop("smoothing"))
+    return Survey(target=target, smoothing=smoothing, observations=Observations(**found))
+
+
+def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
+    return View(radiance=radiance, valid=valid, camera=frames.camera(i))
+
+
+def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
+    stride = max(1, round(math.sqrt(valid.size / _COUNTED_PIXELS)))
+    return count_frame(
+        lit.rays, lit.scene, lit.emission, valid, frames.camera(i), lit.diagonal_m, stride
+    )
+
+
+def fitted_objects(
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    survey: Survey,
+    options: FitOptions,
+) -> list[ObjectFit]:
+    """``fit_object`` of every object, going on where an interrupted run was."""
+    numbers = range(len(lit.scene.objects))
+    stored = {i: run.checkpoint_if(f"object-{i}") for i in numbers}
+    done = {i: ObjectFit.from_arrays(found) for i, found in stored.items() if found is not None}
+    with (
+        # With all cores for each object's small matrices BLAS's threads only wait for each other.
+        threadpool_limits(limits=1, user_api="blas"),
+        ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
+    ):
+        jobs = {
+            pool.submit(fit_object, lit, texels, frames, survey, i, options): i
+            for i in numbers
+            if i not in done
+        }
+        try:
+            for job in progress(as_completed(jobs), total=len(jobs), label="fit", unit="objects"):
+                i, found = jobs[job], job.result()
+                run.save(f"object-{i}", found.arrays())
+                done[i] = found
+        finally:
+            for job in jobs:
+                job.cancel()
+    return [done[i].rounded() for i in numbers]
+
+
+def fit_object(
+    lit: LitScene,
+    texels: Texels,
+    frames: Frames,
+    survey: Survey,
+    index: int,
+    options: FitOptions,
+    mixture: Mixture = MIXTURE,
+) -> ObjectFit:
+    """The lobe of one object by the chosen method; mixture: see fit_views."""
+    target = int(survey.target[index])
+    if options.method == "views":
+        own = survey.observations.of_texels(texels.of_object(index))
+        lobe, used = fit_views(
+            lit, texels, own, survey.smoothing, frames.camera, index, options.seed, mixture
+        )
+        if lobe is None:
+            return ObjectFit(num_samples=used, target=target)
+        return ObjectFit(
+            lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
+            lobe.evidence, used, target,
+        )  # fmt: skip
+    if target < 0 or _is_lamp(lit, index):
+        return ObjectFit(target=target)
+    pixels = read_frame(frames, target)
+    view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
+    residual: Residual = "paper" if options.method == "paper" else "scaled"
+    found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
+    if found is None:
+        return ObjectFit(num_samples=used, target=target)
+    # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
+    error = (found.phi_high - found.phi_low) / math.sqrt(12)
+    return ObjectFit(
+        found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence, used, target
+    )
+
+
+def _is_lamp(lit: LitScene, index: int) -> bool:
+    """Does every point of the object shine?"""
+    faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
+    third = np.full(len(faces), 1 / 3, np.float32)
+    return bool((lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5).all())
+
+
+def judged(found: ObjectFit, obj: SceneObject, method: str, observed: bool) -> Verdict:
+    """What to publish of a fit; ``observed``: some frame shows the object."""
+    phi, psi = (found.phi, found.phi_error), (found.psi, found.psi_error)
+    prior = class_prior(obj.class_name, obj.label) if observed else NEUTRAL
+    if method == "views":
+        return verdict_on_views(phi, psi, found.unresolved, found.evidence, prior, observed)
+    keep = method == "paper"
+    return verdict_on_frame(phi, found.psi, found.evidence, prior, observed, keep)

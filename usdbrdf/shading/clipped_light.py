@@ -1,0 +1,265 @@
+"""Lamps that clip in every frame get the radiance that explains their light.
+
+Clipped texels that hang together are one group, which looks like a lamp or like a bright wall; what
+each of the groups sends to a few thousand measured texels is traced, and their radiances follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from usdbrdf import calibration
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import Texels
+from usdbrdf.options import Sampling
+from usdbrdf.shading.clipped_emitters import (
+    LAMP_PRIOR,
+    EstimatedRadiance,
+    estimate_clipped_emitters,
+    nothing_known,
+)
+from usdbrdf.shading.lamp_evidence import Evidence
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.irradiance import irradiance_at
+from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.tile_draws import independent_tiles
+
+_MIN_TEXELS = calibration.count("lamps.min_texels")
+
+# More lamps are not told apart; the faintest keep their bounds.
+_MAX_GROUPS = 24
+
+_REACH = calibration.number("lamps.reach")
+
+_NEARLY = calibration.number("lamps.nearly_as_bright")
+
+_AROUND = calibration.number("lamps.around")
+
+# Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
+# and how many segments, those that the lamps should light most.
+_TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
+
+_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
+
+_WALL_PRIOR = calibration.pair("lamps.wall_prior")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClippedGroups:
+    """K groups of texels with one radiance each.
+
+    group  (T,) int32, -1 for a texel of none
+    object (K,) int32, whose texels they are
+    bound  (K,) float32, the largest radiance at which one of its texels clipped
+    lamp   (K,) bool: no measured texel around is nearly as bright
+    """
+
+    group: Int
+    object: Int
+    bound: Float
+    lamp: Bool
+
+    def __len__(self) -> int:
+        return len(self.object)
+
+
+def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> ClippedGroups:
+    """An object more than half of whose observed area clipped is one group, with what nobody saw
+    of it; on others each connected part is one.
+
+    radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped.
+    """
+    found: list[tuple[float, int, float, bool, Long]] = []
+    measured, clipped = coverage.measured, coverage.clipped
+    bright = radiance.max(axis=1)
+    for i in range(len(texels.resolution)):
+        own = np.arange(*texels.of_object(i).indices(len(texels)))
+        candidates = own[clipped[own]]
+        if len(candidates) < _MIN_TEXELS:
+            continue
+        around = own[measured[own]]
+        whole = texels.area[candidates].sum() > texels.area[around].sum()
+        parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
+        for part in parts:
+            bound = float(bright[part][clipped[part]].max())
+            lamp = whole or _stands_out(texels, bright, part, around, bound)
+            found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
+    found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]
+    group = np.full(len(texels), -1, np.int32)
+    for k, item in enumerate(found):
+        group[item[-1]] = k
+    return ClippedGroups(
+        group=group,
+        object=np.array([item[1] for item in found], np.int32),
+        bound=np.array([item[2] for item in found], np.float32),
+        lamp=np.array([item[3] for item in found], np.bool_),
+    )
+
+
+def _connected(texels: Texels, candidates: Long) -> list[Long]:
+    """Parts of at least _MIN_TEXELS that touch in space, across the charts of the atlas."""
+    reach = _REACH * float(np.sqrt(np.median(texels.area[candidates])))
+    pairs = cKDTree(texels.position[candidates]).query_pairs(reach, output_type="ndarray")
+    graph = coo_array(
+        (np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(candidates),) * 2
+    )
+    count, label = connected_components(graph, directed=False)
+    parts = [candidates[label == k] for k in range(count)]
+    return [part for part in parts if len(part) >= _MIN_TEXELS]
+
+
+def _stands_out(
+    texels: Texels,
+    bright: Float,
+    part: Long,
+    measured: Long,
+    bound: float,
+) -> bool:
+    distance, _ = cKDTree(texels.position[part]).query(texels.position[measured])
+    around = measured[distance < _AROUND]
+    return not len(around) or float(np.median(bright[around])) < _NEARLY * bound
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClippedLight:
+    """L_d with the estimates in it, and what they are.
+
+    lit       (T, 3) float32: the working copy; the texturing step's map stays a lower bound
+    groups    the K groups of clipped texels; estimate: their multipliers and errors
+    """
+
+    lit: Float
+    groups: ClippedGroups
+    estimate: EstimatedRadiance
+
+    def may_shine(self, clipped: Bool) -> Bool:
+        """(T,): the clipped texels but those that are clearly part of a bright wall."""
+        wall = np.concatenate([~self.groups.lamp, [False]])
+        return np.asarray(clipped & ~wall[self.groups.group], np.bool_)
+
+    def error_of_object(self, index: int) -> float:
+        """Relative standard error of the object's estimate; NaN if it has none."""
+        own = (self.groups.object == index) & self.groups.lamp
+        if not own.any() or not self.estimate.determined[own].all():
+            return float("nan")
+        return float(self.estimate.standard_error[own].max())
+
+    def least_of_lamps(self) -> float:
+        """Radiance of the dimmest lamp that stayed a lower bound; 0 if none did."""
+        unknown = self.groups.bound[self.groups.lamp & ~self.estimate.determined]
+        return float(unknown.min()) if len(unknown) else 0.0
+
+
+def estimate_clipped_light(
+    run: TaskRun,
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    environment: Environment,
+    seed: int,
+) -> ClippedLight:
+    """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates."""
+    groups = clipped_groups(surface.texels, lit, coverage)
+    if not groups.lamp.any():
+        return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
+    say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
+
+    def compute() -> dict[str, Array]:
+        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
+        if not len(chosen):
+            return dict(vars(nothing_known(len(groups))))
+        evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
+        return dict(vars(estimate_clipped_emitters(evidence)))
+
+    estimate = EstimatedRadiance(**run.checkpoint("clipped", compute))
+    return ClippedLight(
+        lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
+    )
+
+
+def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
+    changed = lit.copy()
+    for k in np.flatnonzero(estimate.determined):
+        changed[groups.group == k] = groups.bound[k] * estimate.multiplier[k]
+    return changed
+
+
+def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
+    """Measured texels spread over all objects, denser near the lamps, and their segments."""
+    usable = np.flatnonzero(measured & texels.interior & (groups.group < 0))
+    owner = texels.object_index()[usable]
+    normal = texels.normal[usable]
+    axis = np.abs(normal).argmax(axis=1)
+    facing = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
+    segment = (6 * owner + facing).astype(np.int32)
+    nearness = np.full(len(usable), 1e-6)
+    for k in np.flatnonzero(groups.lamp):
+        own = groups.group == k
+        centre = np.average(texels.position[own], axis=0, weights=texels.area[own] + 1e-12)
+        square = ((texels.position[usable] - centre) ** 2).sum(axis=1)
+        nearness += texels.area[own].sum() / (square + texels.area[own].sum())
+    weight = texels.area[usable] * np.sqrt(nearness)
+    random = np.random.default_rng(seed)
+    # Weighted sampling without replacement: the largest of u^(1/w), by logarithms.
+    rank = np.argsort(np.log(random.random(len(usable))) / np.maximum(weight, 1e-30))[::-1]
+    lit_by_lamps = np.bincount(segment, weight)
+    numbers = np.argsort(-lit_by_lamps, kind="stable")[:_SEGMENTS]
+    numbers = numbers[lit_by_lamps[numbers] > 0]
+    each = int(np.clip(_TEXELS // max(len(numbers), 1), _LEAST_OF_SEGMENT, _PER_SEGMENT))
+    rank = rank[np.isin(segment[rank], numbers)]
+    rank = rank[np.argsort(segment[rank], kind="stable")]
+    place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
+    kept = np.sort(rank[place < each])
+    return usable[kept], segment[kept]
+
+
+def _evidence(
+    surface: TexturedScene,
+    lit: Float,
+    groups: ClippedGroups,
+    chosen: Long,
+    segment: Int,
+    environment: Environment,
+    seed: int,
+) -> Evidence:
+    dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
+    outside = black_environment()
+    lamps = []
+    for k in range(len(groups)):
+        alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
+        light = np.repeat(alone, 3, axis=1).astype(np.float32)
+        lamps.append(_traced(surface, light, outside, chosen, seed + k + 1))
+    return Evidence(
+        radiance=lit[chosen],
+        irradiance=_traced(surface, dark, environment, chosen, seed),
+        lamp_irradiance=np.stack(lamps),
+        position=surface.texels.position[chosen],
+        segment=segment,
+        object=surface.texels.object_index()[chosen].astype(np.int32),
+        prior=np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in groups.lamp]),
+    )
+
+
+def _traced(
+    surface: TexturedScene, light: Float, environment: Environment, chosen: Long, seed: int
+) -> Float:
+    """S (N, 3) at the chosen texels with the radiance ``light`` (T, 3)."""
+    return irradiance_at(
+        surface.rays,
+        surface.texture(light),
+        surface.lights(light),
+        environment,
+        surface.texels.position[chosen],
+        surface.texels.normal[chosen],
+        independent_tiles(len(chosen)),
+        replace(_SAMPLING, seed=seed),
+        surface.diagonal_m,
+    ).mean

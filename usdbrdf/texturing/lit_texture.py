@@ -1,0 +1,117 @@
+"""Frames become the lit diffuse texture L_d, its companions, and what is known of each texel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.progress import progress
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array, Float
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import Texels
+from usdbrdf.texturing.inpaint import inpaint_alike
+from usdbrdf.texturing.observe import Observation, radiance_from_frames
+from usdbrdf.texturing.passes import Measured, groups_of_texels, in_passes, measured_arrays
+from usdbrdf.transport.textured_scene import TexturedScene
+
+# A larger share of unmeasured texels is worth a warning.
+_MOSTLY = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LitTexture:
+    """Of T texels; radiance in W/(m^2 sr), linear Rec.709.
+
+    lit, mean  (T, 3) float32: the quantile that was asked for and the mean of what frames measured,
+               filled in elsewhere; where all frames clip, at least what saturates them
+    spread     (T, 3) float32: see ``psquare.spread``; 0 where not measured
+    samples    (T,) float32: frames that measured the texel
+    coverage   what is known of each texel
+    """
+
+    lit: Float
+    mean: Float
+    spread: Float
+    samples: Float
+    coverage: CoverageMap
+
+    def doubts(self) -> Iterator[str]:
+        """Sentences about what a person should look at."""
+        unmeasured = 1 - float(self.coverage.measured.mean())
+        if unmeasured > _MOSTLY:
+            yield (
+                f"{100 * unmeasured:.1f} % of the texels were measured by no frame and are filled "
+                "in. Check the winding of the faces, the poses and the exposures. "
+                "[texturing.unseen]"
+            )
+
+
+def lit_texture_from_frames(
+    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
+) -> LitTexture:
+    """Project all frames, in as many passes over them as ``memory`` (GiB) asks for.
+
+    run  keeps what is done for a run that goes on
+
+    Raises InputRefused where no frame shows any surface.
+    """
+    groups = groups_of_texels(surface.texels, surface.scene, frames, memory)
+
+    def measured(part: slice) -> dict[str, Array]:
+        return measured_arrays(_observed(run, surface, frames, quantile, part), quantile)
+
+    return _filled_in(
+        surface.texels, Measured(**in_passes(run, "texels", groups, len(surface.texels), measured))
+    )
+
+
+def _observed(
+    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, part: slice
+) -> Observation:
+    """Some texels in all frames, going on from the last saved state of an interrupted run."""
+    name = f"frames-{part.start}-{part.stop}"
+    saved = run.latest(name)
+    start, observed = 0, Observation.empty(part.stop - part.start)
+    if saved is not None:
+        start, observed = saved[0] + 1, Observation.from_arrays(saved[1])
+    frames_done = radiance_from_frames(
+        surface.texels, surface.scene, surface.rays, frames, observed, quantile, start, part=part
+    )
+    left = len(frames) - start
+    for done in progress(frames_done, total=left, label="texture", unit="frames"):
+        run.save_latest_in_time(name, done, observed.arrays)
+    return observed
+
+
+def _filled_in(texels: Texels, found: Measured) -> LitTexture:
+    """L_d and the mean everywhere: measured, or inpainted from what was measured on the same
+    object. An object that only ever clipped is known by those bounds alone."""
+    measured = found.count > 0
+    clipped = ~measured & (found.clipped > 0)
+    if not (measured | clipped).any():
+        raise InputRefused(
+            "no frame sees any surface from its front: the faces are wound away from the cameras, "
+            "or the poses are wrong. Turn the mesh's faces or correct the poses. "
+            "[texturing.unseen]"
+        )
+    owner = texels.object_index()
+    has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0
+    bounded = clipped & ~has_measured[owner]
+    least = found.lower_bound[:, None]
+    lit, mean = inpaint_alike(
+        texels,
+        [np.where(bounded[:, None], least, values) for values in (found.median, found.mean)],
+        measured | bounded,
+    )
+    return LitTexture(
+        lit=np.where(clipped[:, None], np.maximum(lit, least), lit),
+        mean=mean,
+        spread=np.nan_to_num(found.spread),
+        samples=found.count.astype(np.float32),
+        coverage=CoverageMap.of(measured, clipped),
+    )
