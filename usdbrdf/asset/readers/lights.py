@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
@@ -60,11 +59,12 @@ def lights_from_stage(
     return tuple(lights)
 
 
-def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
-    """A latitude-longitude picture about the stage's up axis, as ``shade --environment`` has it:
-    in a world with z up it is the y-up one turned by 90 degrees about x."""
+def sky_of_picture(picture: Float, up_axis: str) -> SkyLight:
+    """A latitude-longitude picture (H, W, 3) about the stage's up axis, as ``shade --environment``
+    has it: in a world with z up it is the y-up one turned by 90 degrees about x. What is not
+    finite or negative is black."""
     turned = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    image = np.maximum(read_texture(file, "raw"), 0)
+    image = np.maximum(np.nan_to_num(picture, nan=0.0, posinf=0.0, neginf=0.0), 0)
     return SkyLight(image=image, world_from_here=turned if up_axis == "Z" else np.eye(3))
 
 
