@@ -66,6 +66,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         inserts,
         keep_emitters=options.keep_emitters,
         eye_height=eye_height(stage) if any(i.falls_from_eye_height for i in inserts) else 0.0,
+        allow_outside=options.allow_outside,
     )
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):
