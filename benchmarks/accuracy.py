@@ -55,7 +55,7 @@ def main() -> int:
     parser.add_argument("truth", type=Path)
     parser.add_argument("mesh", type=Path)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--share", type=int, default=24, help="every n-th patch for L_d and S")
+    parser.add_argument("--share", type=int, default=24, help="every n-th tile for L_d and S")
     options = parser.parse_args()
 
     stage = open_measured(Asset.at(options.asset))
@@ -85,11 +85,11 @@ def main() -> int:
     return 0
 
 
-def some_patches(atlas: AssetMaps, share: int) -> tuple[np.ndarray, np.ndarray]:
-    """Texels of every ``share``-th patch, and their patch numbers."""
-    order, patch = tiles_of_texels(atlas.texels)
-    keep = patch % share == 0
-    return order[keep], patch[keep]
+def some_tiles(atlas: AssetMaps, share: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texels of every ``share``-th tile, and their tile numbers."""
+    order, tile = tiles_of_texels(atlas.texels)
+    keep = tile % share == 0
+    return order[keep], tile[keep]
 
 
 def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
@@ -97,7 +97,7 @@ def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str,
     frames = frames_from_stage(atlas.stage)
     scene, texels = atlas.scene, atlas.texels
     rays = RayScene(scene.points, scene.triangles)
-    chosen, _ = some_patches(atlas, share)
+    chosen, _ = some_tiles(atlas, share)
     chosen = chosen[scored[chosen]]
     place = np.full(len(texels), -1)
     place[chosen] = np.arange(len(chosen))
@@ -123,7 +123,7 @@ def irradiance_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[s
     """S against a converged S from the same L_d."""
     scene, texels = atlas.scene, atlas.texels
     lit = atlas.map("lit")
-    order, patch = some_patches(atlas, share)
+    order, tile = some_tiles(atlas, share)
     reference = irradiance_at(
         RayScene(scene.points, scene.triangles),
         surface_texture(texels, scene.face_object, lit),
@@ -131,7 +131,7 @@ def irradiance_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[s
         black_environment(),
         texels.position[order],
         texels.normal[order],
-        patch,
+        tile,
         Sampling(standard_error=0.0, max_rays=REFERENCE_RAYS, seed=977),
         float(np.linalg.norm(np.ptp(scene.points, axis=0))),
     ).mean.mean(axis=1)

@@ -10,7 +10,7 @@ triangle and not emissive, both weighted by area, printed are
                      of all texels, those within 4.5 cm of another object (`contacts`), the rest,
                      and the change of the mean S of each object
     against_4096_rays
-                     on every n-th patch, of S raw and filtered against our own S with 4096 rays per
+                     on every n-th tile, of S raw and filtered against our own S with 4096 rays per
                      texel: mean and median relative error, relative RMSE; `darkest` are the tenth
                      of the contacts with the least light, the deepest shadows
 """
@@ -41,7 +41,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("asset", type=Path)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--share", type=int, default=24, help="every n-th patch for the reference")
+    parser.add_argument("--share", type=int, default=24, help="every n-th tile for the reference")
     options = parser.parse_args()
 
     atlas = AssetMaps(open_measured(Asset.at(options.asset)))
@@ -96,14 +96,14 @@ def errors(
     atlas: AssetMaps, raw: Array, filtered: Array, scored: Array, contact: Array, share: int
 ) -> dict[str, Any]:
     """Relative errors of S raw and filtered against a converged S of the same light."""
-    order, patch = tiles_of_texels(atlas.texels)
-    keep = patch % share == 0
-    order, patch = order[keep], patch[keep]
+    order, tile = tiles_of_texels(atlas.texels)
+    keep = tile % share == 0
+    order, tile = order[keep], tile[keep]
     position, normal = atlas.texels.position[order], atlas.texels.normal[order]
     lit = atlas.lit_scene(black_environment())
     reference = irradiance_at(
-        lit.rays, lit.radiance, lit.lights, lit.environment, position, normal, patch, REFERENCE,
-        lit.size,
+        lit.rays, lit.radiance, lit.lights, lit.environment, position, normal, tile, REFERENCE,
+        lit.diagonal_m,
     ).mean.mean(axis=1)  # fmt: skip
     near = contact[order]
     good = scored[order] & (reference > 0)

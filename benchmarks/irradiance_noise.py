@@ -37,12 +37,12 @@ class Sizes(NamedTuple):
 
 
 def some_texels(lit: Lit, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """About ``count`` scored texels, evenly spread in the order of their patches, and the numbers
+    """About ``count`` scored texels, evenly spread in the order of their tiles, and the numbers
     of these: a few of each patch."""
-    order, patch = tiles_of_texels(lit.atlas.texels)
+    order, tile = tiles_of_texels(lit.atlas.texels)
     usable = np.flatnonzero(scored(lit)[order])
     chosen = usable[np.linspace(0, len(usable) - 1, min(count, len(usable))).astype(int)]
-    return order[chosen], patch[chosen]
+    return order[chosen], tile[chosen]
 
 
 def scored(lit: Lit) -> np.ndarray:
@@ -53,7 +53,7 @@ def scored(lit: Lit) -> np.ndarray:
 
 
 def shaded(
-    lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling, rays: Any = None
+    lit: Lit, order: np.ndarray, tile: np.ndarray, sampling: Sampling, rays: Any = None
 ) -> Irradiance:
     texels, scene = lit.atlas.texels, lit.scene
     with first_round_of(
@@ -63,7 +63,7 @@ def shaded(
     ):
         return irradiance_at(
             rays or scene.rays, scene.radiance, scene.lights, scene.environment,
-            texels.position[order], texels.normal[order], patch, sampling, scene.size,
+            texels.position[order], texels.normal[order], tile, sampling, scene.diagonal_m,
         )  # fmt: skip
 
 
@@ -80,10 +80,10 @@ def first_round_of(rays: int) -> Iterator[None]:
 
 def noise(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     """Relative RMSE and seconds per texel of each way; rays and time for equal noise."""
-    order, patch = some_texels(lit, sizes.texels)
-    every, every_patch = tiles_of_texels(lit.atlas.texels)
+    order, tile = some_texels(lit, sizes.texels)
+    every, every_tile = tiles_of_texels(lit.atlas.texels)
     converged = Sampling(standard_error=0, max_rays=sizes.reference_rays, seed=977)
-    reference = shaded(lit, order, patch, converged).mean.mean(axis=1)
+    reference = shaded(lit, order, tile, converged).mean.mean(axis=1)
     good = reference > 0
 
     def rmse(mean: np.ndarray) -> float:
@@ -91,19 +91,19 @@ def noise(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         return float(np.sqrt((relative**2).mean()))
 
     papers = Sampling(estimator="cosine", max_rays=PAPERS_RAYS, seed=5)
-    found, time = timed(lambda: shaded(lit, order, patch, papers).mean)
+    found, time = timed(lambda: shaded(lit, order, tile, papers).mean)
     papers_rmse, papers_time = rmse(found), time / len(order)
 
     def of_rays(rays: int) -> Sampling:
         return Sampling(standard_error=0, max_rays=rays, seed=3)
 
     ours = [
-        {"rays": rays, "rmse": rmse(shaded(lit, order, patch, of_rays(rays)).mean)}
+        {"rays": rays, "rmse": rmse(shaded(lit, order, tile, of_rays(rays)).mean)}
         for rays in COUNTS
     ]
     filtered = []
     for rays in FILTERED_COUNTS if chosen_filter("auto") == OIDN else ():
-        found, tracing = timed(lambda n=rays: shaded(lit, every, every_patch, of_rays(n)).mean)
+        found, tracing = timed(lambda n=rays: shaded(lit, every, every_tile, of_rays(n)).mean)
         mean = np.empty_like(found)
         mean[every] = found
         smooth, filtering = timed(lambda m=mean: denoised_irradiance(lit.atlas.texels, m))
@@ -119,7 +119,7 @@ def noise(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         )
     equal = rays_for(papers_rmse, ours)
     traced = of_rays(2 * round(equal / 2))
-    _, time = timed(lambda: shaded(lit, every, every_patch, traced).mean)
+    _, time = timed(lambda: shaded(lit, every, every_tile, traced).mean)
     return {
         "texels": int(good.sum()),
         "reference_rays": sizes.reference_rays,
@@ -142,11 +142,11 @@ def rays_for(target: float, ours: list[dict[str, Any]]) -> float:
 def bias(lit: Lit, sizes: Sizes) -> dict[str, Any]:
     """Mean over texels of S / reference - 1, its standard error over seeds, and their ratio z, for
     the raw estimate and with the stopping rule of the default."""
-    order, patch = some_texels(lit, sizes.texels // 4)
+    order, tile = some_texels(lit, sizes.texels // 4)
 
     def estimates(sampling: Sampling, seeds: range) -> np.ndarray:
         return np.stack(
-            [shaded(lit, order, patch, replace(sampling, seed=s)).mean.mean(axis=1) for s in seeds]
+            [shaded(lit, order, tile, replace(sampling, seed=s)).mean.mean(axis=1) for s in seeds]
         )
 
     references = estimates(

@@ -6,7 +6,7 @@ ASSET was shaded. Measured are
 
     throughput  rays per second of the whole estimator (make rays, trace them, add up) over those of
                 embreex when it is called with the very same rays in the same order and nothing else
-    order       first hits in our order, one sample's rays after the other's over patches of 8 x 8
+    order       first hits in our order, one sample's rays after the other's over tiles of 8 x 8
                 texels and as the estimator traces them, a group's parallel rays in a packet;
                 against the same rays in random order, one by one; and beside that our order one by
                 one, and random order in packets
@@ -104,17 +104,17 @@ def measure(asset: Path, quick: bool) -> dict[str, Any]:
 
 
 def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
-    order, patch = spread(*tiles_of_texels(lit.atlas.texels), sizes.traced)
+    order, tile = spread(*tiles_of_texels(lit.atlas.texels), sizes.traced)
     sampling = Sampling(standard_error=0, max_rays=64, seed=1)
-    calls, scene = rays_of(lit, order, patch, sampling), embreex_scene(lit.scene.rays)
+    calls, scene = rays_of(lit, order, tile, sampling), embreex_scene(lit.scene.rays)
     ours, embree = side_by_side(
-        [lambda: shaded(lit, order, patch, sampling), lambda: embreex(scene, calls)], sizes.turns
+        [lambda: shaded(lit, order, tile, sampling), lambda: embreex(scene, calls)], sizes.turns
     )
     first_hits = [call for call in calls if call.distances is None]
     single = [call._replace(group=None) for call in first_hits]
     mixed = in_random_order(first_hits)
     packed = [call._replace(group=np.arange(len(call.origins)) // 8) for call in mixed]
-    patches, one_by_one, random, random_packets = side_by_side(
+    tiles, one_by_one, random, random_packets = side_by_side(
         [partial(traced, lit, rays) for rays in (first_hits, single, mixed, packed)], sizes.turns
     )
     rays = sum(len(call.origins) for call in calls)
@@ -124,21 +124,21 @@ def throughput(lit: Lit, sizes: Sizes) -> dict[str, Any]:
         "rays_per_cpu_second": {name: 1 / one.cpu for name, one in per_ray.items()},
         "rays_per_wall_second": {name: 1 / one.wall for name, one in per_ray.items()},
         "of_embreex": ratio(embree, ours)._asdict(),
-        "patches_over_random_order": ratio(random, patches)._asdict(),
+        "patches_over_random_order": ratio(random, tiles)._asdict(),
         "one_by_one_over_random_order": ratio(random, one_by_one)._asdict(),
         "random_packets_over_random_order": ratio(random, random_packets)._asdict(),
     }
 
 
-def spread(order: np.ndarray, patch: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """About ``count`` texels of the whole scene: RUNS runs of whole patches, evenly spaced."""
-    parts = whole_tiles(patch, count // RUNS)
+def spread(order: np.ndarray, tile: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """About ``count`` texels of the whole scene: RUNS runs of whole tiles, evenly spaced."""
+    parts = whole_tiles(tile, count // RUNS)
     evenly = np.linspace(0, len(parts), RUNS, endpoint=False).astype(int)
-    kept = np.concatenate([np.arange(len(patch))[parts[k]] for k in np.unique(evenly)])
-    return order[kept], patch[kept]
+    kept = np.concatenate([np.arange(len(tile))[parts[k]] for k in np.unique(evenly)])
+    return order[kept], tile[kept]
 
 
-def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) -> list[Call]:
+def rays_of(lit: Lit, order: np.ndarray, tile: np.ndarray, sampling: Sampling) -> list[Call]:
     """All rays that the estimator traces, in its order: a call for each of its loops' calls."""
     calls: list[Call] = []
 
@@ -169,7 +169,7 @@ def rays_of(lit: Lit, order: np.ndarray, patch: np.ndarray, sampling: Sampling) 
 
     instead = {"add_cosine_samples": by_cosine, "add_light_samples": by_lights}
     with mock.patch.multiple(irradiance, **instead):
-        shaded(lit, order, patch, sampling)
+        shaded(lit, order, tile, sampling)
     return [call for call in calls if len(call.origins)]
 
 
@@ -225,8 +225,8 @@ def figures(results: dict[str, Any]) -> list[dict[str, Any]]:
     rows = [
         figure("rays per CPU second, of embreex's own", 100 * of_embreex["cpu"], "%", least=85),
         figure("the same by the clock", 100 * of_embreex["wall"], "%"),
-        figure("first hits in patches and packets over random order", order["cpu"], "x", least=1.8),
-        figure("in patches, one by one", traced["one_by_one_over_random_order"]["cpu"], "x"),
+        figure("first hits in tiles and packets over random order", order["cpu"], "x", least=1.8),
+        figure("in tiles, one by one", traced["one_by_one_over_random_order"]["cpu"], "x"),
         figure(
             "in random order, in packets", traced["random_packets_over_random_order"]["cpu"], "x"
         ),

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.model import mesh as mesh_module
+from usdbrdf.model import mesh
 from usdbrdf.model.mesh import doubled_areas, face_normals, welded_ids
 
 
@@ -121,5 +121,5 @@ def test_areas_are_those_of_any_number_at_a_time(monkeypatch: pytest.MonkeyPatch
     )
     half = (a + b + c) / 2
     square = half * (half - a) * (half - b) * (half - c)
-    monkeypatch.setattr(mesh_module, "_AT_A_TIME", 7)
+    monkeypatch.setattr(mesh, "_AT_A_TIME", 7)
     np.testing.assert_allclose((doubled_areas(points, triangles) / 2) ** 2, square, atol=1e-9)

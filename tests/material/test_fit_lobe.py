@@ -18,8 +18,8 @@ TEXELS, FRAMES = 50, 10
 SAMPLES = TEXELS * FRAMES
 LIGHT = np.array([1.0, 0.9, 0.8])
 SEEDS = range(20)
-# Relative standard deviations of what frames share: exposure, patches, white balance.
-FRAME, PATCH, COLOUR, OWN = 0.02, 0.04, 0.01, 0.015
+# Relative standard deviations of what frames share: exposure, cells of space, white balance.
+FRAME, CELL, COLOUR, OWN = 0.02, 0.04, 0.01, 0.015
 Basis = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 
@@ -63,7 +63,7 @@ def _views(seed: int) -> tuple[ViewSamples, np.ndarray]:
     cell = frame * 4 + (position[texel, :2] > 0.5) @ [1, 2]
     error = FRAME * rng.standard_normal((FRAMES, 1))[frame]
     error = error + COLOUR * rng.standard_normal((FRAMES, 3))[frame]
-    error = error + PATCH * rng.standard_normal((FRAMES * 4, 1))[cell]
+    error = error + CELL * rng.standard_normal((FRAMES * 4, 1))[cell]
     error = error + OWN * rng.standard_normal((SAMPLES, 3))
     samples = ViewSamples(
         texel=texel,
@@ -71,7 +71,7 @@ def _views(seed: int) -> tuple[ViewSamples, np.ndarray]:
         position=position[texel].astype(np.float32),
         radiance=(diffuse * (1 + error)).astype(np.float32),
         noise=np.full((SAMPLES, 3), 1e-3, np.float32),
-        patch=0.2,
+        cell=0.2,
     )
     return samples, mirrored
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -10,8 +12,6 @@ from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
 from usdbrdf.material import observations
 from usdbrdf.material.observations import SIDE, Follower
-from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, View
 
 SIZE = 16
@@ -30,12 +30,7 @@ def _lit(world: World, lamp: int | None = None, size: float | None = None) -> Li
     lit = np.full((len(world.texels), 3), 0.5, np.float32)
     if lamp is not None:
         lit[world.texels.of_object(lamp)] = 50
-    texture = world.texture(lit)
-    return LitScene(
-        scene=world.scene, rays=world.rays, radiance=texture,
-        lights=lights_from_radiance(world.scene, world.texels, lit), emission=texture,
-        environment=black_environment(), diagonal_m=size or world.size,
-    )  # fmt: skip
+    return replace(world.lit(lit, emission=lit), diagonal_m=size or world.size)
 
 
 def _view(i: int) -> View:

@@ -112,7 +112,7 @@ def _add_specular(capture: MadeCapture, atlas: AssetMaps, frames: Frames) -> Non
         image = read_exr(path)
         height, width = image.shape[:2]
         camera = frames.camera(i).at_size(width, height)
-        points = visible_points(lit.rays, lit.scene, camera, camera.pixels())
+        points = visible_points(lit, camera, camera.pixels())
         image += _specular(lit, lobes, points, 64, 100 + i).reshape(image.shape)
         write_exr(path, image)
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
-from usdbrdf.material.target_frames import (
+from usdbrdf.material.fit_target import (
     FrameCounts,
     choose_target_frames,
     count_frame,
@@ -15,7 +15,7 @@ from usdbrdf.material.target_frames import (
     object_pixels,
 )
 from usdbrdf.material.verdict import class_prior
-from usdbrdf.transport.lit_scene import visible_points
+from usdbrdf.transport.lit_scene import LitScene, visible_points
 
 WIDTH, HEIGHT = 80, 60
 LENS = np.array([60.0, 60.0, 40.0, 30.0])
@@ -37,6 +37,12 @@ def pose() -> np.ndarray:
     return look_at(EYE, np.array([0.0, 0.2, 0]))
 
 
+def _lit(world: World) -> LitScene:
+    """The lamp is the emitter."""
+    emits = world.per_object([(0, 0, 0), (1, 1, 1)])
+    return world.lit(emits, emission=emits)
+
+
 def _mirrored(position: np.ndarray) -> np.ndarray:
     """Does the mirror image of the lamp, at z = -2, cover the floor point seen from the eye?
 
@@ -48,7 +54,7 @@ def _mirrored(position: np.ndarray) -> np.ndarray:
 
 def test_what_a_camera_sees(world: World, pose: np.ndarray):
     camera = camera_at(pose, LENS, WIDTH, HEIGHT)
-    points = visible_points(world.rays, world.scene, camera, camera.pixels())
+    points = visible_points(_lit(world), camera, camera.pixels())
     floor = points.face >= 0
     floor &= points.face < 2
     assert floor.sum() > 2000
@@ -63,7 +69,7 @@ def test_normals_are_turned_to_the_camera(world: World):
     # From below the floor: its normal points away and is turned round.
     below = look_at(np.array([0, -1.0, -1.0]), np.zeros(3))
     camera = camera_at(below, LENS, WIDTH, HEIGHT)
-    points = visible_points(world.rays, world.scene, camera, np.array([[40.0, 30.0]]))
+    points = visible_points(_lit(world), camera, np.array([[40.0, 30.0]]))
     assert points.face[0] in (0, 1)
     np.testing.assert_allclose(points.normal[0], [0, 0, -1], atol=1e-6)
     assert (points.normal * points.to_camera).sum() > 0
@@ -71,9 +77,8 @@ def test_normals_are_turned_to_the_camera(world: World):
 
 def test_the_mirror_image_of_the_lamp_is_where_geometry_says(world: World, pose: np.ndarray):
     camera = camera_at(pose, LENS, WIDTH, HEIGHT)
-    points = visible_points(world.rays, world.scene, camera, camera.pixels())
-    emission = world.texture(world.per_object([(0, 0, 0), (1, 1, 1)]))
-    found = mirror_hits_emitter(world.rays, points, emission, world.size)
+    points = visible_points(_lit(world), camera, camera.pixels())
+    found = mirror_hits_emitter(_lit(world), points)
     floor = (points.face >= 0) & (points.face < 2)
     expected = _mirrored(points.position)
     assert 50 < (expected & floor).sum() < 1000
@@ -83,15 +88,14 @@ def test_the_mirror_image_of_the_lamp_is_where_geometry_says(world: World, pose:
 
 
 def test_a_frame_counts_highlights_and_valid_pixels(world: World, pose: np.ndarray):
-    emission = world.texture(world.per_object([(0, 0, 0), (1, 1, 1)]))
     valid = np.ones((HEIGHT, WIDTH), bool)
     camera = camera_at(pose, LENS, WIDTH, HEIGHT)
     pixels = camera.pixels()
-    points = visible_points(world.rays, world.scene, camera, pixels)
+    points = visible_points(_lit(world), camera, pixels)
     floor = (points.face >= 0) & (points.face < 2)
 
     def count(valid: np.ndarray, stride: int = 1) -> FrameCounts:
-        return count_frame(world.rays, world.scene, emission, valid, camera, world.size, stride)
+        return count_frame(_lit(world), valid, camera, stride)
 
     whole = count(valid)
     assert whole.valid[0] == floor.sum()

@@ -10,7 +10,7 @@ import pytest
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.05
-PATCH = 0.1
+CELL = 0.1
 
 
 def _samples(
@@ -27,7 +27,7 @@ def _samples(
         position=position[texel],
         radiance=diffuse[texel].astype(np.float32),
         noise=np.full((len(texel), 3), 1e-3, np.float32),
-        patch=PATCH,
+        cell=CELL,
     )
 
 
@@ -42,7 +42,7 @@ def _with_errors(
         values = deviation[kind] * rng.standard_normal((which.max() + 1, channels))
         return np.broadcast_to(values[which], (count, 3))
 
-    small, large = _patches(samples, PATCH), _patches(samples, 2.5 * PATCH)
+    small, large = _cells(samples, CELL), _cells(samples, 2.5 * CELL)
     error = drawn("frame", samples.frame, 1) + drawn("frame of channel", samples.frame, 3)
     error = error + drawn("small", small, 1) + drawn("large", large, 1)
     error = error + drawn("large of channel", large, 3) + drawn("own", np.arange(count), 1)
@@ -50,7 +50,7 @@ def _with_errors(
     return replace(samples, radiance=(samples.radiance * (1 + error)).astype(np.float32))
 
 
-def _patches(samples: ViewSamples, size: float) -> np.ndarray:
+def _cells(samples: ViewSamples, size: float) -> np.ndarray:
     """One number for the samples of a frame in a cube of that size."""
     cell = np.floor((samples.position - samples.position.min(axis=0)) / size).astype(int)
     rows = np.column_stack([samples.frame, cell])
@@ -59,8 +59,8 @@ def _patches(samples: ViewSamples, size: float) -> np.ndarray:
 
 def _shared_columns(samples: ViewSamples, level: np.ndarray) -> list[np.ndarray]:
     """Z of each kind of shared error, (3 P, n): level where a sample has it, groups of one left
-    out. Frame, small patches, large ones, then per channel of frame and of large patches."""
-    small, large = _patches(samples, PATCH), _patches(samples, 2.5 * PATCH)
+    out. Frame, small cells, large ones, then per channel of frame and of large cells."""
+    small, large = _cells(samples, CELL), _cells(samples, 2.5 * CELL)
     every = [(samples.frame, None), (small, None), (large, None)]
     every += [(group, c) for group in (samples.frame, large) for c in range(3)]
     result = []
@@ -81,7 +81,7 @@ def _shared_columns(samples: ViewSamples, level: np.ndarray) -> list[np.ndarray]
 
 def _covariance(samples: ViewSamples, model: ViewModel) -> np.ndarray:
     """(3 P, 3 P) with nothing eliminated, from the model's present variances."""
-    level, specular, trust = model._level, model._specular, model._trust
+    level, specular, trust = model._level, model._specular, model._robust_weight
     variance = (INDEPENDENT * (level + specular)) ** 2 + (OF_SPECULAR * specular) ** 2
     variance = (variance + samples.noise.astype(float) ** 2) * model._scale / trust[:, None]
     covariance = np.diag(variance.ravel())
@@ -120,8 +120,8 @@ def test_costs_are_those_of_generalised_least_squares(updates: int):
     # Not every texel is in every frame.
     kept = np.sort(rng.choice(45, 38, replace=False))
     samples = ViewSamples(
-        **{name: value[kept] for name, value in vars(samples).items() if name != "patch"},
-        patch=PATCH,
+        **{name: value[kept] for name, value in vars(samples).items() if name != "cell"},
+        cell=CELL,
     )
     samples = replace(samples, texel=np.unique(samples.texel, return_inverse=True)[1])
     model = ViewModel(samples)
@@ -129,7 +129,7 @@ def test_costs_are_those_of_generalised_least_squares(updates: int):
     for _ in range(updates):
         model.update(lobe)
     if updates:
-        assert model._trust.min() < 0.8 < 1 < model._trust.max()
+        assert model._robust_weight.min() < 0.8 < 1 < model._robust_weight.max()
     else:
         np.testing.assert_array_equal(model._deviation, FIRST_GUESS)
     covariance = _covariance(samples, model)
@@ -157,7 +157,7 @@ def test_what_a_texel_shows_in_all_frames_costs_nothing():
 
 
 def test_the_samples_tell_how_large_their_errors_are():
-    # 25 frames, 100 texels in four large patches and 25 small ones.
+    # 25 frames, 100 texels in four large cells and 25 small ones.
     true = {"frame": 0.06, "frame of channel": 0.03, "small": 0.03, "large": 0.05,
             "large of channel": 0.015, "own": 0.01}  # fmt: skip
     rng = np.random.default_rng(1)
@@ -171,7 +171,7 @@ def test_the_samples_tell_how_large_their_errors_are():
     assert large == pytest.approx(true["large"], rel=0.25)
     assert np.mean(of_channels[:3]) == pytest.approx(true["frame of channel"], rel=0.35)
     assert np.mean(of_channels[3:]) == pytest.approx(true["large of channel"], rel=0.25)
-    # A little low: of four samples in a small patch the patch's error takes a share.
+    # A little low: of four samples in a small cell the cell's error takes a share.
     assert model._own_deviation == pytest.approx(true["own"], rel=0.35)
     assert model._scale == pytest.approx(1, rel=0.25)
     # With the right covariance each degree of freedom costs about one.
@@ -200,7 +200,7 @@ def test_a_group_of_a_single_sample_has_no_error_of_its_own():
 
 
 def test_more_frames_than_shared_errors_are_wanted_come_to_an_end():
-    # Nine for each frame, however large the patches: more than the most that there may be.
+    # Nine for each frame, however large the cells: more than the most that there may be.
     few = _samples(np.random.default_rng(6), 3, 300)
     model = ViewModel(few)
     assert model.degrees_of_freedom > 0

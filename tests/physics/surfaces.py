@@ -20,6 +20,7 @@ from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at
 from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 from usdbrdf.transport.tile_draws import independent_tiles
@@ -60,6 +61,25 @@ class World:
 
     def texture(self, values: Float) -> SurfaceTexture:
         return surface_texture(self.texels, self.scene.face_object, values)
+
+    def lit(
+        self,
+        radiance: Float,
+        *,
+        bright: Float | None = None,
+        emission: Float | None = None,
+        environment: Environment | None = None,
+    ) -> LitScene:
+        """With L_d (T, 3); ``bright`` (T, 3) is what lights are picked by, else L_d."""
+        return LitScene(
+            scene=self.scene,
+            rays=self.rays,
+            radiance=self.texture(radiance),
+            lights=self.lights(radiance if bright is None else bright),
+            emission=self.texture(0 * radiance if emission is None else emission),
+            environment=environment or black_environment(),
+            diagonal_m=self.size,
+        )
 
     def lights(self, radiance: Float) -> Lights:
         return lights_from_radiance(self.scene, self.texels, radiance)
@@ -191,7 +211,7 @@ def estimates(
 ) -> tuple[Double, Irradiance]:
     """S at points (N, 3), each ``repeat`` times with random numbers of its own: (repeat, N, 3).
 
-    Every repetition is a patch of its own, and independent of the others.
+    Every repetition is a tile of its own, and independent of the others.
     """
     count = len(points)
     found = irradiance_at(

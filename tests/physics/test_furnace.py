@@ -41,10 +41,10 @@ def _shade(
     world: World, lights: np.ndarray, estimator: str, rays: int, lit: np.ndarray | None = None
 ) -> Irradiance:
     lit = _lit(world) if lit is None else lit
-    order, patch = tiles_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     found = irradiance_at(
         world.rays, world.texture(lit), world.lights(lights), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch,
+        world.texels.position[order], world.texels.normal[order], tile,
         Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=1), world.size,
     )  # fmt: skip
     back = np.argsort(order)
@@ -79,11 +79,11 @@ def test_no_ray_leaves_a_closed_room_with_real_charts():
     uv, resolution = unwrap(scene, 0.07)
     scene = replace(scene, corner_uv=uv)
     world = World(scene=scene, texels=texels_from_atlas(scene, resolution))
-    order, patch = tiles_of_texels(world.texels)
+    order, tile = tiles_of_texels(world.texels)
     ones = np.ones((len(order), 3), np.float32)
     found = irradiance_at(
         world.rays, world.texture(ones), world.lights(ones), black_environment(),
-        world.texels.position[order], world.texels.normal[order], patch,
+        world.texels.position[order], world.texels.normal[order], tile,
         Sampling(standard_error=0.0, max_rays=64), world.size,
     )  # fmt: skip
     leaks = found.escaped > 0

@@ -34,11 +34,11 @@ def furnished() -> tuple[World, np.ndarray, Lights]:
     return world, lit, lights
 
 
-def _shade(furnished, index: np.ndarray, patch: np.ndarray, **sampling) -> Irradiance:
+def _shade(furnished, index: np.ndarray, tile: np.ndarray, **sampling) -> Irradiance:
     world, lit, lights = furnished
     return irradiance_at(
         world.rays, world.texture(lit), lights, black_environment(),
-        world.texels.position[index], world.texels.normal[index], patch,
+        world.texels.position[index], world.texels.normal[index], tile,
         Sampling(**sampling), world.size,
     )  # fmt: skip
 
@@ -63,10 +63,10 @@ def test_both_estimators_agree_on_a_furnished_room(furnished):
 
 
 def test_seeds_matter_and_repetition_does_not(furnished):
-    index, patch = np.arange(40), np.arange(40, dtype=np.int32) // 8
+    index, tile = np.arange(40), np.arange(40, dtype=np.int32) // 8
     for estimator in ("mis", "cosine"):
         runs = [
-            _shade(furnished, index, patch, estimator=estimator, max_rays=128, seed=seed).mean
+            _shade(furnished, index, tile, estimator=estimator, max_rays=128, seed=seed).mean
             for seed in (0, 0, 1)
         ]
         np.testing.assert_array_equal(runs[0], runs[1])
@@ -75,24 +75,24 @@ def test_seeds_matter_and_repetition_does_not(furnished):
 
 def test_a_tile_of_whole_tiles_gives_the_bits_of_the_whole(furnished):
     world, _, _ = furnished
-    order, patch = tiles_of_texels(world.texels)
-    cut = int(np.searchsorted(patch, patch[len(patch) // 2]))
+    order, tile = tiles_of_texels(world.texels)
+    cut = int(np.searchsorted(tile, tile[len(tile) // 2]))
     sampling = {"estimator": "mis", "standard_error": 0.1, "max_rays": 256}
-    whole = _shade(furnished, order, patch, **sampling)
-    second = _shade(furnished, order[cut:], patch[cut:], **sampling)
+    whole = _shade(furnished, order, tile, **sampling)
+    second = _shade(furnished, order[cut:], tile[cut:], **sampling)
     np.testing.assert_array_equal(whole.mean[cut:], second.mean)
     np.testing.assert_array_equal(whole.rays[cut:], second.rays)
 
 
 def test_patches_are_blocks_of_one_object(furnished):
     texels = furnished[0].texels
-    order, patch = tiles_of_texels(texels)
+    order, tile = tiles_of_texels(texels)
     assert sorted(order) == list(range(len(texels)))
-    assert (np.diff(patch) >= 0).all()
-    assert (np.diff(patch) <= 1).all()
+    assert (np.diff(tile) >= 0).all()
+    assert (np.diff(tile) <= 1).all()
     owner = texels.object_index()[order]
-    for number in np.unique(patch):
-        own = patch == number
+    for number in np.unique(tile):
+        own = tile == number
         assert len(np.unique(owner[own])) == 1
         # 8 x 8 texels of the atlas.
         assert own.sum() <= 64
@@ -127,9 +127,9 @@ def test_the_standard_error_of_independent_rays_is_unbiased(furnished):
 
 
 def test_rays_double_until_the_error_that_was_asked_for(furnished):
-    order, patch = tiles_of_texels(furnished[0].texels)
-    reached = _shade(furnished, order, patch, standard_error=0.05, max_rays=4096)
-    exact = _shade(furnished, order, patch, standard_error=0.0, max_rays=4096, seed=77)
+    order, tile = tiles_of_texels(furnished[0].texels)
+    reached = _shade(furnished, order, tile, standard_error=0.05, max_rays=4096)
+    exact = _shade(furnished, order, tile, standard_error=0.0, max_rays=4096, seed=77)
     assert exact.mean.min() > 1e-3
     relative = reached.mean / exact.mean - 1
     assert np.sqrt((relative**2).mean()) < 0.05
@@ -138,8 +138,8 @@ def test_rays_double_until_the_error_that_was_asked_for(furnished):
     assert 64 <= reached.rays.min() < reached.rays.max() <= 4096
     assert reached.rays.mean() < 1000
     # One decision per patch.
-    first = np.searchsorted(patch, np.arange(patch[-1] + 1))
-    np.testing.assert_array_equal(reached.rays, reached.rays[first][patch])
+    first = np.searchsorted(tile, np.arange(tile[-1] + 1))
+    np.testing.assert_array_equal(reached.rays, reached.rays[first][tile])
 
 
 @pytest.mark.parametrize("with_lights", [True, False])
@@ -182,15 +182,15 @@ def test_stopping_early_hardly_biases_the_irradiance(furnished):
     # 32 seeds against the whole number of rays; their mean over the points resolves 2.5e-4 of S.
     world, _, _ = furnished
     index = np.arange(0, 8 * (len(world.texels) // 8), len(world.texels) // 256)
-    patch = (np.arange(len(index)) // 8).astype(np.int32)
+    tile = (np.arange(len(index)) // 8).astype(np.int32)
     exact = np.mean(
         [
-            _shade(furnished, index, patch, standard_error=0.0, max_rays=4096, seed=s).mean
+            _shade(furnished, index, tile, standard_error=0.0, max_rays=4096, seed=s).mean
             for s in range(1000, 1004)
         ],
         axis=0,
     )
-    runs = [_shade(furnished, index, patch, seed=s) for s in range(32)]
+    runs = [_shade(furnished, index, tile, seed=s) for s in range(32)]
     assert np.mean([run.rays.mean() for run in runs]) < 1024
     off = np.array([(run.mean.sum() / exact.sum()) - 1 for run in runs])
     resolved = off.std(ddof=1) / np.sqrt(len(off))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.transport.brdf import grazing, half_vector, lobe
-from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import SurfacePoints
 from usdbrdf.transport.lobe_radiance import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
@@ -53,10 +54,9 @@ def _assert_albedo(
     group: int = 4,
 ) -> None:
     """base and base + slope equal L times the directional albedo at psi = 0 and 1."""
-    samples = trace_lobe_samples(
-        world.rays, _points(position, _towards(degrees)), world.texture(lit), lights,
-        environment or black_environment(), Mixture(), world.size, 0, group=group,
-    )  # fmt: skip
+    scene = replace(world.lit(lit, environment=environment), lights=lights)
+    points = _points(position, _towards(degrees))
+    samples = trace_lobe_samples(scene, points, Mixture(), 0, group=group)
     wanted = [
         [
             directional_albedo(np.radians(degrees), phi, psi, steps=300, visible=visible) * radiance
@@ -154,10 +154,8 @@ def _of_copies(
     """base + slope of 64 copies of a point in a room with a bright ceiling, (64 / group, 3)."""
     world = world_of(room((-2, -2, 0), (2, 2, 2.5)))
     lit = world.per_object([(1, 1, 1)] * 5 + [(9, 9, 9)])
-    samples = trace_lobe_samples(
-        world.rays, _points(np.zeros(3), _towards(30), repeat=64), world.texture(lit),
-        world.lights(lit), black_environment(), mixture, world.size, seed, stream, group=group,
-    )  # fmt: skip
+    points = _points(np.zeros(3), _towards(30), repeat=64)
+    samples = trace_lobe_samples(world.lit(lit), points, mixture, seed, stream, group=group)
     base, slope = _of_groups(samples, [0.3], 64 // group)
     return (base + slope)[..., 0]
 

@@ -9,9 +9,9 @@ import pytest
 
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
-from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.transport import lobe_radiance as predict
-from usdbrdf.transport.environment import Environment, black_environment
+from tests.physics.surfaces import quad, room, world_of
+from usdbrdf.transport import lobe_radiance as module
+from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 
@@ -38,30 +38,19 @@ def _points(degrees: Sequence[float], position: Sequence[float] = (0, 0, 0)) -> 
     )  # fmt: skip
 
 
-def _lit(
-    world: World, radiance: np.ndarray, bright: np.ndarray, environment: Environment
-) -> LitScene:
-    """bright: what the lights are picked by."""
-    return LitScene(
-        scene=world.scene, rays=world.rays, radiance=world.texture(radiance),
-        lights=world.lights(bright), emission=world.texture(0 * radiance),
-        environment=environment, diagonal_m=world.size,
-    )  # fmt: skip
-
-
 def _open_sky() -> LitScene:
     """Radiance RGB from everywhere above; the only quad lies below, black."""
     world = world_of([quad((-1, -1, -2), (2, 0, 0), (0, 2, 0))])
     sky = Environment(image=np.tile(RGB.astype(np.float32), (4, 8, 1)), z_up=True)
     black = world.per_object([(0, 0, 0)])
-    return _lit(world, black, black, sky)
+    return world.lit(black, environment=sky)
 
 
 def _furnace() -> LitScene:
     """The inside of a room, RGB everywhere; of the rays for lights, all go to one wall."""
     world = world_of(room((-2, -2, 0), (2, 2, 2.5)))
     bright = world.per_object([(1, 1, 1)] * 5 + [(100, 100, 100)])
-    lit = _lit(world, world.per_object([tuple(RGB)] * 6), bright, black_environment())
+    lit = world.lit(world.per_object([tuple(RGB)] * 6), bright=bright)
     assert len(lit.lights.face) == 2
     return lit
 
@@ -91,8 +80,7 @@ def test_one_mirror_shows_the_wall_that_it_faces():
     # phi 0 seen at 45 degrees in the plane y = 0: the mirror direction meets the wall at x low.
     world = world_of(room((-2, -2, 0), (2, 2, 4)))
     walls = np.arange(1, 7)[:, None] * RGB
-    lit = _lit(world, world.per_object(walls.tolist()), world.per_object([(1, 1, 1)] * 6),
-               black_environment())  # fmt: skip
+    lit = world.lit(world.per_object(walls.tolist()), bright=world.per_object([(1, 1, 1)] * 6))
     degrees = np.full(256, 45.0)
     one = np.ones(256, np.float32)
     found = lobe_radiance(lit, _points(degrees), 0 * one, one, 64, 0).mean(axis=0)
@@ -104,7 +92,7 @@ def test_pieces_make_no_difference(monkeypatch: pytest.MonkeyPatch):
     lit = _furnace()
     whole = _predicted(lit, 16, 5)
     for at_once in (1, 16 * 7, 16 * 74):
-        monkeypatch.setattr(predict, "_RAYS_AT_ONCE", at_once)
+        monkeypatch.setattr(module, "_RAYS_AT_ONCE", at_once)
         np.testing.assert_array_equal(_predicted(lit, 16, 5), whole)
 
 

@@ -18,7 +18,6 @@ from usdbrdf.material.fit_target import fit_target_frame
 from usdbrdf.material.fit_views import fit_views
 from usdbrdf.material.observations import Follower
 from usdbrdf.model.camera import Camera, pixel_centres
-from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, View
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.35
@@ -135,15 +134,7 @@ def _render(studio: Studio, phi: float, psi: float, samples: int = 96) -> np.nda
 
 def _lit_scene(world: World, radiance: np.ndarray) -> LitScene:
     emission = world.per_object([(0, 0, 0)] * 6 + [(1, 1, 1)] * 6 + [(0, 0, 0)])
-    return LitScene(
-        scene=world.scene,
-        rays=world.rays,
-        radiance=world.texture(radiance),
-        lights=world.lights(radiance),
-        emission=world.texture(emission),
-        environment=black_environment(),
-        diagonal_m=world.size,
-    )
+    return world.lit(radiance, emission=emission)
 
 
 def _whole(studio: Studio) -> np.ndarray:

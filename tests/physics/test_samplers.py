@@ -19,7 +19,7 @@ from usdbrdf.transport.warps import (
     cosine_direction,
     hashed_uniform,
     shifts_of,
-    sobol_points,
+    sobol_bits,
     tangent_frame,
     triangle_point,
 )
@@ -237,12 +237,12 @@ def test_shifts_of_different_seeds_and_numbers_differ():
     assert_distributed([chi_square_p(counts, np.full(100, 200.0))])
 
 
-def test_sobol_points_stratify_every_pair_of_dimensions():
+def test_sobol_points_stratify_both_dimensions_and_their_pair():
     # A (t, m, s)-net: 2^10 points put one point into each of 1024 intervals in every dimension,
     # and at most a few into each cell of a 32 x 32 grid.
-    points = sobol_points(10, 5)
-    assert points.shape == (1024, 5)
-    for d in range(5):
+    points = sobol_bits(10) * 2.0**-32
+    assert points.shape == (1024, 2)
+    for d in range(2):
         assert (np.bincount((points[:, d] * 1024).astype(int)) == 1).all()
     cells = np.histogram2d(points[:, 0], points[:, 1], bins=32, range=[[0, 1], [0, 1]])[0]
     assert (cells == 1).all()

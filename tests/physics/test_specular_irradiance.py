@@ -7,7 +7,6 @@ import pytest
 
 from tests.physics.brdf import directional_albedo
 from tests.physics.surfaces import World, room, world_of
-from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import specular_irradiance
 
@@ -26,11 +25,7 @@ def world() -> World:
 def _lit(world: World, emits: int | None = None) -> LitScene:
     radiance = world.per_object([tuple(RGB)] * 6)
     mask = world.per_object([(float(i == emits),) * 3 for i in range(6)])
-    return LitScene(
-        scene=world.scene, rays=world.rays, radiance=world.texture(radiance),
-        lights=world.lights(radiance), emission=world.texture(mask),
-        environment=black_environment(), diagonal_m=world.size,
-    )  # fmt: skip
+    return world.lit(radiance, emission=mask)
 
 
 def _found(lit: LitScene, phi: float, psi: float, seed: int = 0) -> np.ndarray:

@@ -26,12 +26,12 @@ SATURATION = 3.0
 def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) -> np.ndarray:
     """L_d (T, 3) after some bounces, with noise of each texel's own, as pictures have it."""
     order, _ = tiles_of_texels(world.texels)
-    patch = independent_tiles(len(order))
+    tile = independent_tiles(len(order))
     lit = emitted
     for bounce in range(bounces):
         found = irradiance_at(
             world.rays, world.texture(lit), world.lights(lit), black_environment(),
-            world.texels.position[order], world.texels.normal[order], patch,
+            world.texels.position[order], world.texels.normal[order], tile,
             Sampling(standard_error=0.01, max_rays=512, seed=bounce), world.size,
         )  # fmt: skip
         irradiance = np.empty_like(lit)

@@ -65,13 +65,13 @@ def floor() -> Floor:
 def _irradiance(world: World, lit: np.ndarray, sampling: Sampling) -> np.ndarray:
     """S (T, 3) on the floor, 0 elsewhere."""
     texels = world.texels
-    order, patch = tiles_of_texels(texels)
+    order, tile = tiles_of_texels(texels)
     on_floor = texels.object_index()[order] == 0
-    order, patch = order[on_floor], patch[on_floor]
+    order, tile = order[on_floor], tile[on_floor]
     found = np.zeros_like(lit)
     found[order] = irradiance_at(
         world.rays, world.texture(lit), world.lights(lit), black_environment(),
-        texels.position[order], texels.normal[order], patch, sampling, world.size,
+        texels.position[order], texels.normal[order], tile, sampling, world.size,
     ).mean  # fmt: skip
     return found
 

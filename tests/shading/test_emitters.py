@@ -66,10 +66,10 @@ def test_single_noisy_texels_are_no_lamps(world: World, lit: np.ndarray):
     lit[local] = 50
     assert not _find(world, lit).emissive[wall].any()
     # 5 x 5 that hang together: a spot in the ceiling.
-    patch = wall.reshape(16, 16)[4:9, 4:9].ravel()
-    lit[patch] = 50
+    tile = wall.reshape(16, 16)[4:9, 4:9].ravel()
+    lit[tile] = 50
     found = _find(world, lit)
-    np.testing.assert_array_equal(np.flatnonzero(found.emissive[wall]), np.sort(patch - wall[0]))
+    np.testing.assert_array_equal(np.flatnonzero(found.emissive[wall]), np.sort(tile - wall[0]))
     assert not found.is_lamp[0]
     np.testing.assert_allclose(found.radiance[0], 50, rtol=1e-5)
 

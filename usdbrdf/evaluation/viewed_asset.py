@@ -104,7 +104,7 @@ def predict_view(seen: ViewedAsset, camera: Camera, quality: Quality) -> Predict
     bands = []
     for top in range(0, height, rows):
         pixels = _sub_pixels(width, top, min(top + rows, height), quality.per_side)
-        points = visible_points(seen.lit.rays, seen.lit.scene, camera, pixels)
+        points = visible_points(seen.lit, camera, pixels)
         values = _radiance_at(seen, points, max(1, quality.rays // per_pixel), quality.seed + top)
         bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
     picture = np.concatenate(bands).astype(np.float32)
@@ -129,7 +129,7 @@ def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int)
     """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
     hit = points.face >= 0
     place = points.face, points.u, points.v
-    lamp = hit & (seen.lit.emission.at(*place)[:, 0] > 0.5)
+    lamp = hit & seen.lit.emits(points)
     values = np.zeros((len(hit), 8), np.float32)
     values[:, :3] = seen.measured.at(*place)
     values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))

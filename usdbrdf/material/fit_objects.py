@@ -15,10 +15,15 @@ from threadpoolctl import threadpool_limits
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material.fit_target import Residual, fit_target_frame
+from usdbrdf.material.fit_target import (
+    FrameCounts,
+    Residual,
+    choose_target_frames,
+    count_frame,
+    fit_target_frame,
+)
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
-from usdbrdf.material.target_frames import FrameCounts, choose_target_frames, count_frame
 from usdbrdf.material.verdict import (
     NEUTRAL,
     Verdict,
@@ -134,9 +139,7 @@ def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
 
 def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
     stride = max(1, round(math.sqrt(valid.size / _COUNTED_PIXELS)))
-    return count_frame(
-        lit.rays, lit.scene, lit.emission, valid, frames.camera(i), lit.diagonal_m, stride
-    )
+    return count_frame(lit, valid, frames.camera(i), stride)
 
 
 def fitted_objects(

@@ -1,18 +1,18 @@
-"""One object's roughness and specular from its target frame alone (the paper's way): roughness by a
-two-level grid, specular by closed-form least squares (section 3.4.2)."""
+"""One object's roughness and specular from one frame alone, the paper's way: its target frame
+(section 3.4.1), roughness by a two-level grid, specular by closed-form least squares (3.4.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
+from scipy import ndimage
 
 from usdbrdf import calibration
-from usdbrdf.material.target_frames import mirror_hits_emitter, object_pixels
-from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
@@ -21,14 +21,94 @@ from usdbrdf.transport.lit_scene import (
     visible_points,
 )
 from usdbrdf.transport.lobe_radiance import lobe_basis
+from usdbrdf.transport.rays import lift_from_surface
 
 Basis = Callable[[float], tuple[Float, Float]]
-
 Projection = Callable[[Double], Double]
 
+# Roughnesses of each level.
 GRID = 11
 
 _FLAT = calibration.number("fit_of_frame.flat_cost")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCounts:
+    """Per object: pixels whose mirror ray hits an emitter and that are valid (A1 and A2), and valid
+    pixels (A2); (num_objects,) int64 each."""
+
+    mirrored: Long
+    valid: Long
+
+
+def mirror_hits_emitter(lit: LitScene, points: SurfacePoints) -> Bool:
+    """A1 (R,): would a perfect mirror at the point show an emitter to the camera?"""
+    along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
+    reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
+    origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
+    hits = lit.rays.closest(origin, reflected)
+    return lit.emits(hits) & (hits.face >= 0) & (points.face >= 0)
+
+
+def count_frame(lit: LitScene, valid: Bool, camera: Camera, stride: int) -> FrameCounts:
+    """A1 and A2 counted per object over every ``stride``-th pixel of a frame, valid (H, W)."""
+    points = visible_points(lit, camera, camera.pixels(stride))
+    owner = lit.owner(points.face)
+    good = valid[::stride, ::stride].ravel() & (owner >= 0)
+    mirrored = good & mirror_hits_emitter(lit, points)
+    number = len(lit.scene.objects)
+    return FrameCounts(
+        mirrored=np.bincount(owner[mirrored], minlength=number),
+        valid=np.bincount(owner[good], minlength=number),
+    )
+
+
+def choose_target_frames(counts: Iterable[FrameCounts]) -> tuple[Int, Int]:
+    """Per object: the frame with most pixels in A1 and A2, and how many those are.
+
+    An object that mirrors an emitter in no frame takes the frame with most valid pixels (count 0);
+    an object without any valid pixel gets frame -1.
+    """
+    frames = list(counts)
+    mirrored = np.stack([frame.mirrored for frame in frames])
+    valid = np.stack([frame.valid for frame in frames])
+    target = np.where(mirrored.max(axis=0) > 0, mirrored.argmax(axis=0), valid.argmax(axis=0))
+    target = np.where(valid.max(axis=0) > 0, target, -1)
+    return target.astype(np.int32), mirrored.max(axis=0).astype(np.int32)
+
+
+def object_pixels(
+    owner: Int,
+    valid: Bool,
+    highlight: Bool,
+    index: int,
+    limit: int,
+    pick: Callable[[int], Long],
+) -> tuple[Long, Float]:
+    """Flat indices of the pixels of object ``index`` to fit, at most ``limit``, and how many pixels
+    each stands for, (P,) float32.
+
+    owner (H, W): object per pixel; valid (H, W); highlight (H, W): A1. Pixels next to another
+    object are left out (they mix both). Where there are more than ``limit``, ``pick(n)`` orders
+    them at random and half of them are taken within 30 pixels of a mirrored emitter, where the
+    lobe shows.
+    """
+    own = owner == index
+    inner = ndimage.binary_erosion(own, np.ones((3, 3)))
+    candidates = np.flatnonzero(inner & valid)
+    if len(candidates) <= limit:
+        return candidates, np.ones(len(candidates), np.float32)
+    candidates = candidates[pick(len(candidates))]
+    near = np.zeros(len(candidates), np.bool_)
+    if (highlight & own).any():
+        near = ndimage.distance_transform_edt(~(highlight & own)).ravel()[candidates] <= 30
+    close, far = candidates[near], candidates[~near]
+    take = min(len(close), max(limit // 2, limit - len(far)))
+    parts = (close[:take], close), (far[: limit - take], far)
+    chosen = np.concatenate([taken for taken, _ in parts])
+    stands_for = np.concatenate([np.full(len(t), len(of) / max(len(t), 1)) for t, of in parts])
+    order = np.argsort(chosen)
+    return chosen[order], stands_for[order].astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,13 +248,13 @@ def fit_target_frame(
 
 def _points_of_object(
     lit: LitScene, view: View, index: int, max_pixels: int, seed: int
-) -> tuple[npt.NDArray[np.int64], Float, SurfacePoints]:
+) -> tuple[Long, Float, SurfacePoints]:
     """The pixels to fit (flat indices), how many pixels each stands for, and the four surface
     points of each, in order."""
     pixels = view.camera.pixels()
-    seen = visible_points(lit.rays, lit.scene, view.camera, pixels)
+    seen = visible_points(lit, view.camera, pixels)
     owner = lit.owner(seen.face).reshape(view.valid.shape)
-    mirrored = mirror_hits_emitter(lit.rays, seen, lit.emission, lit.diagonal_m)
+    mirrored = mirror_hits_emitter(lit, seen)
     highlight = mirrored.reshape(view.valid.shape) & view.valid
     random = np.random.default_rng([seed, index])
     chosen, stands_for = object_pixels(

@@ -27,7 +27,7 @@ from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
 _FOOTPRINT = calibration.number("fit.footprint")
 
-_WIDER = calibration.numbers("fit.wider_footprints")
+_OTHER_WIDTHS_PX = calibration.numbers("fit.wider_footprints")
 
 _KEPT = calibration.number("fit.kept_in_footprint")
 
@@ -43,10 +43,9 @@ _ABOVE_NOISE = calibration.number("fit.above_noise")
 
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
-
 _TIMES_FOR_CURVED = 2
 
-_PATCH_PIXELS = calibration.number("fit.shared_error_size")
+_CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 
 def fit_views(
@@ -94,7 +93,7 @@ def _candidates(
 ) -> list[Candidate]:
     """What the lobe would look like with each of the footprints; see ``_likely``."""
     candidates = []
-    for points, width in zip(footprints, (_FOOTPRINT, *_WIDER), strict=False):
+    for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
         # Views of a texel share their random numbers: what they have in common then cancels in
         # their differences, which are all that is fitted.
         first, second, third = [
@@ -127,9 +126,9 @@ def _footprints(
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
-    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_WIDER)}
-    for count in range(len(_WIDER), 0, -1):
-        widths = (_FOOTPRINT, *_WIDER[:count])
+    within = {width: whole(observed, width)[0] for width in (_FOOTPRINT, *_OTHER_WIDTHS_PX)}
+    for count in range(len(_OTHER_WIDTHS_PX), 0, -1):
+        widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX[:count])
         inner = reduce(np.intersect1d, [within[width] for width in widths])
         inner = inner[_several_views(observed.texel[inner])]
         if len(inner) >= max(_KEPT * len(kept), MIN_OBSERVATIONS):
@@ -175,7 +174,7 @@ def _samples(
         position=position,
         radiance=observed.radiance,
         noise=np.hypot(observed.noise[:, None], contrast),
-        patch=_PATCH_PIXELS * _pixel_size(position, observed.frame, camera_of),
+        cell=_CELL_PIXELS * _pixel_size(position, observed.frame, camera_of),
     )
 
 

@@ -57,10 +57,10 @@ def on_flat_squares(texels: Texels, reach: int) -> Bool:
     return flat
 
 
-# The noise is looked at in tiles of so many pixels that show one object alone, so many per frame.
-_TILE, _TILES = 24, 60
+# The noise is looked at in windows of so many pixels that show one object alone, so many per frame.
+_WINDOW, _WINDOWS = 24, 60
 
-_FEWEST_TILES = calibration.count("observations.noise.min_tiles")
+_FEWEST_WINDOWS = calibration.count("observations.noise.min_tiles")
 
 _LAGS = 3
 
@@ -70,23 +70,23 @@ _WIDEST_BLUR = calibration.number("observations.noise.widest_blur")
 
 
 def noise_correlation(lit: LitScene, view: View) -> Double:
-    """(N, 3): of N tiles of a frame, the correlation of its relative deviation from L_d between
+    """(N, 3): of N windows of a frame, the correlation of its relative deviation from L_d between
     pixels 1, 2 and 3 apart."""
     height, width = view.valid.shape
     corners = [
         (row, column)
-        for row in range(0, height - _TILE + 1, _TILE)
-        for column in range(0, width - _TILE + 1, _TILE)
-        if view.valid[row : row + _TILE, column : column + _TILE].all()
+        for row in range(0, height - _WINDOW + 1, _WINDOW)
+        for column in range(0, width - _WINDOW + 1, _WINDOW)
+        if view.valid[row : row + _WINDOW, column : column + _WINDOW].all()
     ]
-    chosen = np.linspace(0, len(corners) - 1, min(_TILES, len(corners))).round().astype(int)
+    chosen = np.linspace(0, len(corners) - 1, min(_WINDOWS, len(corners))).round().astype(int)
     if not len(chosen):
         return np.zeros((0, _LAGS))
-    within = np.moveaxis(np.indices((_TILE, _TILE)), 0, -1)
+    within = np.moveaxis(np.indices((_WINDOW, _WINDOW)), 0, -1)
     place = np.array(corners)[chosen][:, None, None] + within
     pixels = place[..., ::-1].reshape(-1, 2) + 0.5
-    seen = visible_points(lit.rays, lit.scene, view.camera, pixels)
-    diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _TILE, _TILE, 3)
+    seen = visible_points(lit, view.camera, pixels)
+    diffuse = lit.radiance.at(seen.face, seen.u, seen.v).reshape(len(chosen), _WINDOW, _WINDOW, 3)
     owner = lit.owner(seen.face).reshape(len(chosen), -1)
     alone = (owner[:, 0] >= 0) & (owner == owner[:, :1]).all(axis=1)
     alone &= (diffuse > 0).all(axis=(1, 2, 3))
@@ -94,9 +94,9 @@ def noise_correlation(lit: LitScene, view: View) -> Double:
     return correlations((shown / diffuse[alone]).mean(axis=-1, dtype=np.float64))
 
 
-def correlations(tiles: Double) -> Double:
-    """(N, 3) correlation between pixels 1, 2 and 3 apart in tiles (N, H, W)."""
-    rest = tiles - tiles.mean(axis=(1, 2), keepdims=True)
+def correlations(windows: Double) -> Double:
+    """(N, 3) correlation between pixels 1, 2 and 3 apart in windows (N, H, W)."""
+    rest = windows - windows.mean(axis=(1, 2), keepdims=True)
     power = np.maximum((rest**2).mean(axis=(1, 2)), 1e-30)
     each = [
         (rest[:, lag:] * rest[:, :-lag]).mean(axis=(1, 2))
@@ -107,16 +107,16 @@ def correlations(tiles: Double) -> Double:
     return found
 
 
-def smoothing_of(tiles: Sequence[Double]) -> float:
+def smoothing_of(windows: Sequence[Double]) -> float:
     """Standard deviation in pixels of what smoothed the pictures, 0 if nothing did, NaN if they do
     not tell.
 
     White noise that a normal distribution of standard deviation s has smoothed correlates as
     exp(-d^2 / (4 s^2)) over a distance d. White noise that came on top, later, lessens all alike:
-    so the ratio of two correlations tells s. tiles: ``noise_correlation`` of frames.
+    so the ratio of two correlations tells s. windows: ``noise_correlation`` of frames.
     """
-    every = np.concatenate([np.zeros((0, _LAGS)), *tiles])
-    if len(every) < _FEWEST_TILES:
+    every = np.concatenate([np.zeros((0, _LAGS)), *windows])
+    if len(every) < _FEWEST_WINDOWS:
         return math.nan
     first, _, last = np.median(every, axis=0)
     if first < _WHITE:
@@ -129,9 +129,7 @@ def smoothing_of(tiles: Sequence[Double]) -> float:
 
 # Followed per object, kept per object, and views kept per texel.
 _FOLLOWED = 3000
-
 _KEPT = 200
-
 _VIEWS = 12
 
 _MIN_VIEWS = calibration.count("observations.min_views")
@@ -139,7 +137,6 @@ _MIN_VIEWS = calibration.count("observations.min_views")
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
 # whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
 _MAX_CELLS = 12_000_000
-
 _FEWEST = 40
 
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
@@ -198,7 +195,7 @@ class Follower:
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
         self._added = 0
         self._frames_per_noise = max(1, -(-frames // _FRAMES_OF_NOISE))
-        self._noise_in_tiles: list[Double] = []
+        self._noise_in_windows: list[Double] = []
         cells = (rows, len(self._index))
         self._seen = np.zeros(cells, np.bool_)
         self._radiance = np.zeros((*cells, 3), np.float32)
@@ -209,7 +206,7 @@ class Follower:
         """Sample the followed texels in the next frame."""
         row = self._row.get(self._added)
         if len(self._index) and self._added % self._frames_per_noise == 0:
-            self._noise_in_tiles.append(noise_correlation(self._lit, view))
+            self._noise_in_windows.append(noise_correlation(self._lit, view))
         self._added += 1
         if row is None or not len(self._index):
             return
@@ -246,7 +243,7 @@ class Follower:
     @property
     def smoothing(self) -> float:
         """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
-        return smoothing_of(self._noise_in_tiles)
+        return smoothing_of(self._noise_in_windows)
 
     def target_frames(self, texels: Texels) -> Int:
         """Per object, the frame in which its followed texels mirror most light beyond what each of

@@ -186,7 +186,7 @@ _OF_SPECULAR = calibration.number("errors.of_specular")
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
 
-# With more shared errors than this, patches are made larger, up to the object.
+# With more shared errors than this, cells are made larger, up to the object.
 _MOST_EFFECTS = 2500
 
 _TAIL = calibration.number("errors.student_freedom")
@@ -198,14 +198,14 @@ _LEAST_LEVEL = calibration.number("errors.least_diffuse")
 class ViewSamples:
     """P samples: texel (P,) counted from 0 without gaps, frame (P,), position (P, 3) in metres,
     radiance (P, 3); noise (P, 3), standard deviation of independent errors, the least there is;
-    patch: size of the smaller patches."""
+    cell: side of the smaller cells of space whose samples share errors."""
 
     texel: Long
     frame: Long
     position: Float
     radiance: Float
     noise: Float
-    patch: float
+    cell: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,7 +246,7 @@ class ViewModel:
         self._deviation = np.full(self._effects.kinds, _FIRST_GUESS)
         self._own_deviation = _FIRST_GUESS
         self._scale = 1.0
-        self._trust = np.ones(len(samples.texel))
+        self._robust_weight = np.ones(len(samples.texel))
         self._factorise()
 
     @property
@@ -285,12 +285,12 @@ class ViewModel:
         values, weighted = left.values[..., 0], left.weighted[..., 0]
         own_variance = 1 / self._own_precision
         own = (self._towards_level * values).sum(axis=1) * own_variance
-        self._own_deviation = float(np.sqrt((self._trust * (own**2 + own_variance)).mean()))
+        self._own_deviation = float(np.sqrt((self._robust_weight * (own**2 + own_variance)).mean()))
         alone = values - own[:, None] * self._level
         explained = (self._level**2 * own_variance[:, None] / self._variance).mean()
         self._scale *= float((alone**2 / self._variance).mean() * self._freedom + explained)
-        distance = (values * weighted).sum(axis=1) * self._freedom / self._trust
-        self._trust = (_TAIL + 3) / (_TAIL + distance)
+        distance = (values * weighted).sum(axis=1) * self._freedom / self._robust_weight
+        self._robust_weight = (_TAIL + 3) / (_TAIL + distance)
         self._specular = np.maximum(non_diffuse, 0).astype(np.float64)
         diffuse = self._texel_means(self._weight @ rest[..., None])[self._texel, :, 0]
         self._level = np.maximum(diffuse, _LEAST_LEVEL * self._mean)
@@ -306,9 +306,9 @@ class ViewModel:
         """Everything that follows from the variances."""
         seen = self._level + self._specular
         variance = (_INDEPENDENT * seen) ** 2 + (_OF_SPECULAR * self._specular) ** 2
-        self._variance = (variance + self._noise**2) * self._scale / self._trust[:, None]
+        self._variance = (variance + self._noise**2) * self._scale / self._robust_weight[:, None]
         self._towards_level = self._level / self._variance
-        self._own_precision = self._trust / self._own_deviation**2 + (
+        self._own_precision = self._robust_weight / self._own_deviation**2 + (
             self._towards_level * self._level
         ).sum(axis=1)
         # Each sample's inverse 3 x 3 covariance, of its own errors.
@@ -331,18 +331,18 @@ def _gather(texel: Long) -> sparse.csr_matrix:
 def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
     """The shared errors: which of them each sample has (-1: none), and the one channel that it is
     for (None: all three alike)."""
-    frame, patch = _shared(samples.frame), samples.patch
+    frame, side = _shared(samples.frame), samples.cell
     extent = float(np.ptp(samples.position, axis=0).max())
     while True:
-        cells = [_cells(samples.position, size) for size in (patch, 2.5 * patch)]
+        cells = [_cells(samples.position, size) for size in (side, 2.5 * side)]
         small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
         every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
         every += [(which, channel) for which in (frame, large) for channel in range(3)]
-        # Their number bounds memory and time. Each of many frames has some, whatever the patches.
+        # Their number bounds memory and time. Each of many frames has some, whatever the cells.
         number = sum(int(which.max(initial=-1)) + 1 for which, _ in every)
-        if number <= _MOST_EFFECTS or patch > extent:
+        if number <= _MOST_EFFECTS or side > extent:
             return every
-        patch *= 1.5
+        side *= 1.5
 
 
 def _cells(position: Float, size: float) -> Long:

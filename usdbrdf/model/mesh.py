@@ -110,7 +110,7 @@ def face_normals(points: Float, triangles: Int) -> Double:
     return face_normals_and_angles(points, triangles)[0]
 
 
-def doubled_areas(points: Float, triangles: Int) -> Double:
+def doubled_areas(points: Float | Double, triangles: Int) -> Double:
     """(F,) float64, twice the triangles' areas, in the points' unit squared; some triangles at a
     time, which takes little memory."""
     doubled = np.empty(len(triangles))
@@ -120,7 +120,7 @@ def doubled_areas(points: Float, triangles: Int) -> Double:
     return doubled
 
 
-def across_triangles(points: Float, triangles: Int) -> Double:
+def across_triangles(points: Float | Double, triangles: Int) -> Double:
     """(F, 3) float64 along the triangles' normals, as long as twice their areas."""
     first, second, third = (points[triangles[:, k]].astype(np.float64) for k in range(3))
     across: Double = np.cross(second - first, third - first)

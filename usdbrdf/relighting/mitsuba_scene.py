@@ -10,6 +10,7 @@ import numpy as np
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight, SkyLight
 from usdbrdf.model.material import Surface
+from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.relighting import lobe_plugin
 from usdbrdf.transport.renderer_match import matching_factor
 
@@ -167,9 +168,7 @@ def _flat(values: Any) -> Float:
 
 def _power(surface: Surface) -> float:
     """Luminance that leaves the surface, up to pi; a map counts with the mean of its texels."""
-    corner = surface.points[surface.triangles]
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    area = float(np.linalg.norm(across, axis=1).sum()) / 2
+    area = float(doubled_areas(surface.points, surface.triangles).sum()) / 2
     return max(area * _mean_luminance(surface.material.emission), 1e-12)
 
 
@@ -193,15 +192,19 @@ def _shape_light(mi: Any, light: ShapeLight) -> dict[str, Any]:
         to_world = np.diag([*(np.cbrt(edges.prod()),) * 3, 1.0])
         to_world[:3, 3] = light.world_from_here[:3, 3]
     weight = max(area * edges[0] * edges[1] * _mean_luminance(light.emission), 1e-12)
+    radiance = radiance_texture(mi, light.emission)
+    return _area_light(light.kind, mi.ScalarTransform4f(to_world), radiance, float(weight))
+
+
+def _area_light(
+    kind: str, to_world: Any, radiance: dict[str, Any], weight: float
+) -> dict[str, Any]:
+    """A black shape that shines."""
     return {
-        "type": light.kind,
-        "to_world": mi.ScalarTransform4f(to_world),
+        "type": kind,
+        "to_world": to_world,
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-        "emitter": {
-            "type": "area",
-            "radiance": radiance_texture(mi, light.emission),
-            "sampling_weight": float(weight),
-        },
+        "emitter": {"type": "area", "radiance": radiance, "sampling_weight": weight},
     }
 
 
@@ -235,13 +238,6 @@ def _distant_light(mi: Any, light: DistantLight, centre: Double, radius: float) 
         origin=origin.tolist(), target=centre.tolist(), up=up.tolist()
     )
     scale = distance * math.tan(light.half_angle)
-    return {
-        "type": "disk",
-        "to_world": frame @ mi.ScalarTransform4f().scale([scale, scale, 1.0]),
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-        "emitter": {
-            "type": "area",
-            "radiance": {"type": "rgb", "value": (irradiance / size).tolist()},
-            "sampling_weight": weight,
-        },
-    }
+    to_world = frame @ mi.ScalarTransform4f().scale([scale, scale, 1.0])
+    radiance = {"type": "rgb", "value": (irradiance / size).tolist()}
+    return _area_light("disk", to_world, radiance, weight)

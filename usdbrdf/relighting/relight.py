@@ -63,6 +63,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         options.inserts,
         keep_emitters=options.keep_emitters,
         eye_height=eye_height(stage) if falls else 0.0,
+        allow_outside=options.allow_outside,
     )
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):

@@ -18,7 +18,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.untrusted.usd_paths import layers_of_usd
+from usdbrdf.untrusted.usd_files import layers_of_usd
 
 
 def ingest(

@@ -1,0 +1,18 @@
+"""Light transport: rays through the scene, light that arrives at points, light that lobes send on.
+
+Its face, which is all that the rest of the package calls:
+
+    rays             RayScene.closest: first surfaces along rays; lift_from_surface
+    lit_scene        LitScene, the scene with its light; visible_points under a camera's pixels
+    surface_texture  radiance on the surface, bilinear; environment: radiance from outside
+    lights           lights_from_radiance: surface that rays are sent to on purpose
+    irradiance       irradiance_at points, in tiles of texels
+    lobe_radiance    lobe_radiance of known lobes, lobe_basis for roughnesses that are tried, and
+                     specular_irradiance that they bring to other surfaces
+    renderer_match   what to write for renderers with another lobe
+    brdf             the lobe's equations
+    warps            shifts_of: uniform numbers of numbered things
+
+Behind it are Embree (embree), random numbers (tile_draws) and the estimators' loops
+(cosine_sampling, light_sampling), which hold occlusion as well.
+"""

@@ -26,7 +26,6 @@ from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double
 
 F0_OF_PSI = 0.08
-
 MIN_ALPHA = 0.001
 
 F = TypeVar("F", bound=Callable[..., Any])

@@ -9,9 +9,9 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, to_working_space
-from usdbrdf.files.images import read_radiance
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Float
+from usdbrdf.untrusted.pictures import picture_from_file
 
 # What these files hold is radiance even where all of it happens to be 0 or 1.
 _HDR_SUFFIXES = (".exr", ".hdr")
@@ -50,7 +50,7 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
     """A latitude-longitude HDR picture in the working space, or black for None."""
     if picture is None:
         return black_environment()
-    image = read_radiance(picture)
+    image = picture_from_file(picture)
     _refuse_what_is_not_light(picture, image)
     image = to_working_space(image, WORKING_SPACE)
     return Environment(image=image, z_up=up_axis == "Z")

@@ -46,6 +46,7 @@ from usdbrdf.transport.tile_draws import (
     scrambles_of_points,
     tile_draws,
 )
+from usdbrdf.transport.tile_draws import independent_tiles as independent_tiles
 
 # Samples of the first round, and blocks that sums are kept in.
 _FIRST_ROUND, _BLOCKS = 64, 4
@@ -84,6 +85,40 @@ def tiles_of_texels(texels: Texels) -> tuple[Long, Int]:
     return order, tile.astype(np.int32)
 
 
+def whole_tiles(tile: Int, points: int) -> list[slice]:
+    """Ranges of about so many ``points`` that cut no tile."""
+    starts = np.flatnonzero(np.diff(tile, prepend=-1))
+    wanted = np.searchsorted(starts, np.arange(0, int(starts[-1]) + 1, points))
+    firsts = [int(first) for first in np.unique(starts[wanted])]
+    return [slice(first, last) for first, last in pairwise([*firsts, len(tile)])]
+
+
+class _Points(NamedTuple):
+    """Points of whole tiles: origins of their rays and normals (P, 3), tiles, random numbers'
+    identities and strata, least S to hold errors against, and the row of their tile in what is
+    kept for each, (P,)."""
+
+    origin: Float
+    normal: Float
+    tile: Int
+    identity: Long
+    stratum: Int
+    floor: Double
+    row: Int
+
+    def of(self, which: Any) -> _Points:
+        return _Points._make(values[which] for values in self)
+
+
+class _Light(NamedTuple):
+    """All that brings light, and the one or two ``techniques`` that look for it."""
+
+    met: Met
+    groups: LightGroups
+    draws: TileDraws
+    techniques: int
+
+
 def irradiance_at(
     rays: RayScene,
     radiance: SurfaceTexture,
@@ -114,23 +149,20 @@ def irradiance_at(
     floor = np.zeros(len(tile)) if dark is None else dark.astype(np.float64)
     techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     rounds = _rounds(sampling, techniques)
-    light = IncomingLight(
-        rays=rays,
-        radiance=radiance,
-        groups=lights.groups,  # made here, once, not by each thread
-        environment=environment,
-        draws=independent_draws(sampling.seed)
-        if sampling.estimator == "cosine"
-        else tile_draws(sampling.seed, rounds[0][1], rounds[-1][1]),
-        techniques=techniques,
-    )
+    if sampling.estimator == "cosine":
+        draws = independent_draws(sampling.seed)
+    else:
+        draws = tile_draws(sampling.seed, rounds[0][1], rounds[-1][1])
+    # The groups are made here, once, not by each thread.
+    light = _Light(Met(rays.address, radiance, environment), lights.groups, draws, techniques)
 
     def traced(part: slice) -> Irradiance:
         origin = lift_from_surface(position[part], normal[part], diagonal_m)
-        points = Points(
-            origin, normal[part], tile[part], identity[part], stratum[part], floor[part],
-            _numbers(tile[part]),
-        )  # fmt: skip
+        # Which of the tiles here, counted from 0.
+        row = np.cumsum(np.diff(tile[part], prepend=tile[part][0]) != 0, dtype=np.int32)
+        points = _Points(
+            origin, normal[part], tile[part], identity[part], stratum[part], floor[part], row
+        )
         return _irradiance_of(points, light, rounds, sampling.standard_error)
 
     threads = os.cpu_count() or 1
@@ -142,7 +174,7 @@ def irradiance_at(
 
 
 def _irradiance_of(
-    points: Points, light: IncomingLight, rounds: list[tuple[int, int]], standard_error: float
+    points: _Points, light: _Light, rounds: list[tuple[int, int]], standard_error: float
 ) -> Irradiance:
     """Rounds of samples, each as many as all before, until every tile has enough."""
     count = len(points.origin)
@@ -150,13 +182,13 @@ def _irradiance_of(
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
     sums, escaped = np.zeros((2, _BLOCKS, count, 4)), np.zeros(count)
     active: Any = slice(None)
-    picks = light.picks(points)
+    picks = _picks(light, points)
     for first, last in rounds:
         if first:
             sums[:, 0] += sums[:, 1]
             sums[:, 1] = sums[:, 2] + sums[:, 3]
             sums[:, 2:] = 0
-        light.add(points, picks, (first, last), sums, escaped)
+        _add_samples(light, points, picks, (first, last), sums, escaped)
         found, scatter = mean_and_error(sums, last)
         mean[active], error[active], share[active] = found, scatter, escaped / last
         done[active] = light.techniques * last
@@ -194,75 +226,33 @@ def _noisy(tile: Int, mean: Double, error: Double, target: float, dark: Double) 
     return (np.sqrt(square) > target * np.maximum(level, floor))[index]
 
 
-def _numbers(tile: Int) -> Int:
-    """Which of the tiles here, counted from 0, (P,)."""
-    return np.cumsum(np.diff(tile, prepend=tile[0]) != 0, dtype=np.int32)
+def _picks(light: _Light, points: _Points) -> TilePicks:
+    """How the points' tiles pick lights."""
+    if light.techniques == 1:
+        return TilePicks(np.zeros((0, 0)), np.zeros((0, 0), np.int16), np.zeros((0, 0), np.float32))
+    first_point = np.searchsorted(points.row, np.arange(points.row[-1] + 2))
+    picks: TilePicks = weighed_groups(light.groups, points.origin, points.normal, first_point)
+    return picks
 
 
-class Points(NamedTuple):
-    """Points of whole tiles: origins of their rays and normals (P, 3), tiles, random numbers'
-    identities and strata, least S to hold errors against, and the row of their tile in what is
-    kept for each, (P,)."""
-
-    origin: Float
-    normal: Float
-    tile: Int
-    identity: Long
-    stratum: Int
-    floor: Double
-    row: Int
-
-    def of(self, which: Any) -> Points:
-        return Points(*(values[which] for values in self))
-
-
-def whole_tiles(tile: Int, points: int) -> list[slice]:
-    """Ranges of about so many ``points`` that cut no tile."""
-    starts = np.flatnonzero(np.diff(tile, prepend=-1))
-    wanted = np.searchsorted(starts, np.arange(0, int(starts[-1]) + 1, points))
-    firsts = [int(first) for first in np.unique(starts[wanted])]
-    return [slice(first, last) for first, last in pairwise([*firsts, len(tile)])]
-
-
-@dataclass(frozen=True, kw_only=True)
-class IncomingLight:
-    """All that brings light, and the one or two ``techniques`` that look for it."""
-
-    rays: RayScene
-    radiance: SurfaceTexture
-    groups: LightGroups
-    environment: Environment
-    draws: TileDraws
-    techniques: int
-
-    def picks(self, points: Points) -> TilePicks:
-        """How the points' tiles pick lights."""
-        if self.techniques == 1:
-            return TilePicks(
-                np.zeros((0, 0)), np.zeros((0, 0), np.int16), np.zeros((0, 0), np.float32)
-            )
-        first_point = np.searchsorted(points.row, np.arange(points.row[-1] + 2))
-        return weighed_groups(self.groups, points.origin, points.normal, first_point)
-
-    def add(
-        self,
-        points: Points,
-        picks: TilePicks,
-        samples: tuple[int, int],
-        sums: Double,
-        escaped: Double,
-    ) -> None:
-        """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
-        technique, and escaped (P,)."""
-        seed = self.draws.seed
-        scrambles = scrambles_of_points(points.identity, points.stratum, seed, self.draws.shared)
-        draws = PointDraws(self.draws.sobol, scrambles, seed, points.identity)
-        receivers = Receivers(points.origin, points.normal, draws, self.groups, points.row, picks)
-        met = Met(self.rays.address, self.radiance, self.environment)
-        start, block = samples[0], _block_of(np.arange(*samples), *samples)
-        add_cosine_samples(met, receivers, start, block, sums[0], escaped)
-        if self.techniques == 2:
-            add_light_samples(met, receivers, start, block, sums[1])
+def _add_samples(
+    light: _Light,
+    points: _Points,
+    picks: TilePicks,
+    samples: tuple[int, int],
+    sums: Double,
+    escaped: Double,
+) -> None:
+    """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
+    technique, and escaped (P,)."""
+    sobol, seed, shared = light.draws.sobol, light.draws.seed, light.draws.shared
+    scrambles = scrambles_of_points(points.identity, points.stratum, seed, shared)
+    draws = PointDraws(sobol, scrambles, seed, points.identity)
+    receivers = Receivers(points.origin, points.normal, draws, light.groups, points.row, picks)
+    start, block = samples[0], _block_of(np.arange(*samples), *samples)
+    add_cosine_samples(light.met, receivers, start, block, sums[0], escaped)
+    if light.techniques == 2:
+        add_light_samples(light.met, receivers, start, block, sums[1])
 
 
 def _block_of(sample: Long, first: int, last: int) -> Long:

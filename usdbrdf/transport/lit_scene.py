@@ -13,7 +13,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.textured_scene import TexturedScene
 
@@ -46,32 +46,6 @@ class SurfacePoints:
         )
 
 
-def visible_points(rays: RayScene, scene: Scene, camera: Camera, pixels: Double) -> SurfacePoints:
-    """The surface under pixel coordinates (R, 2)."""
-    return points_of_rays(rays, scene, *camera.rays(pixels))
-
-
-def points_of_rays(
-    rays: RayScene, scene: Scene, origins: Float, directions: Float
-) -> SurfacePoints:
-    """The surface that rays (R, 3) meet first, seen from where they come."""
-    hits = rays.closest(origins, directions)
-    face = np.maximum(hits.face, 0)
-    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
-    normal = np.einsum("rc,rcd->rd", weights, scene.corner_normals[face])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    towards = np.einsum("rd,rd->r", normal, directions) > 0
-    position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
-    return SurfacePoints(
-        face=hits.face,
-        u=hits.u,
-        v=hits.v,
-        position=position.astype(np.float32),
-        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
-        to_camera=-directions,
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class LitScene:
     """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
@@ -88,6 +62,34 @@ class LitScene:
     def owner(self, face: Int) -> Int:
         """The object of each face (R,), -1 where the face is -1."""
         return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
+
+    def emits(self, place: SurfacePoints | Hits) -> Bool:
+        """(R,): is there an emitter?"""
+        return np.asarray(self.emission.at(place.face, place.u, place.v)[:, 0] > 0.5, np.bool_)
+
+
+def visible_points(lit: LitScene, camera: Camera, pixels: Double) -> SurfacePoints:
+    """The surface under pixel coordinates (R, 2)."""
+    return points_of_rays(lit, *camera.rays(pixels))
+
+
+def points_of_rays(lit: LitScene, origins: Float, directions: Float) -> SurfacePoints:
+    """The surface that rays (R, 3) meet first, seen from where they come."""
+    hits = lit.rays.closest(origins, directions)
+    face = np.maximum(hits.face, 0)
+    weights = np.stack([1 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+    normal = np.einsum("rc,rcd->rd", weights, lit.scene.corner_normals[face])
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    towards = np.einsum("rd,rd->r", normal, directions) > 0
+    position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
+    return SurfacePoints(
+        face=hits.face,
+        u=hits.u,
+        v=hits.v,
+        position=position.astype(np.float32),
+        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
+        to_camera=-directions,
+    )
 
 
 def lit_scene(
@@ -125,6 +127,6 @@ def sub_pixel_points(
     Returns which pixels have all K on object ``index``, (P,) bool, and their points in order.
     """
     inside = (pixels[:, None] + offsets).reshape(-1, 2)
-    points = visible_points(lit.rays, lit.scene, camera, inside)
+    points = visible_points(lit, camera, inside)
     whole = (lit.owner(points.face) == index).reshape(-1, len(offsets)).all(axis=1)
     return whole, points.take(np.flatnonzero(np.repeat(whole, len(offsets))))

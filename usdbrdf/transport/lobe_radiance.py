@@ -32,10 +32,9 @@ from usdbrdf.transport.brdf import (
 )
 from usdbrdf.transport.embree import Hits
 from usdbrdf.transport.environment import Environment, environment_at
-from usdbrdf.transport.lights import DENSITY, LightGroups, Lights, facing, picked, way_to
+from usdbrdf.transport.lights import DENSITY, LightGroups, facing, picked, way_to
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, points_of_rays
-from usdbrdf.transport.rays import RayScene, lift_from_surface
-from usdbrdf.transport.surface_texture import SurfaceTexture
+from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.warps import (
     cosine_direction,
     cosine_rays,
@@ -293,13 +292,9 @@ def _add_point(
 
 
 def trace_lobe_samples(
-    rays: RayScene,
+    lit: LitScene,
     points: SurfacePoints,
-    radiance: SurfaceTexture,
-    lights: Lights,
-    environment: Environment,
     mixture: Mixture,
-    diagonal_m: float,
     seed: int,
     stream: Long | None = None,
     alphas: Double | None = None,
@@ -312,13 +307,14 @@ def trace_lobe_samples(
     stream (G,)    groups of the same number share their random numbers; default: none do
     alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
     """
-    if not len(lights.face):
+    groups = lit.lights.groups
+    if not len(groups.face):
         mixture = Mixture(mixture.per_lobe, 0, mixture.cosine + mixture.lights)
     count = len(points.face)
     if alphas is None:
         alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
     total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
-    origin = lift_from_surface(points.position, points.normal, diagonal_m)
+    origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
     draws = GroupDraws(
         sobol_bits(int(np.ceil(np.log2(group * max(mixture))))),
         np.arange(count // group) if stream is None else stream,
@@ -329,17 +325,17 @@ def trace_lobe_samples(
         points.normal, points.to_camera, alphas, directions.reshape(count, total, 3),
         np.full((count, total), -1, np.int32),
     )  # fmt: skip
-    draw_directions(aimed, origin, draws, mixture, lights.groups)
-    hits = rays.closest(np.repeat(origin, total, axis=0), directions)
+    draw_directions(aimed, origin, draws, mixture, groups)
+    hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
     samples = LobeSamples(
         cos_in=np.zeros((count, total), np.float32),
         sin2_half=np.zeros((count, total), np.float32),
         grazing=np.zeros((count, total), np.float32),
-        weighted=radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3),
+        weighted=lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3),
         cos_out=np.einsum("rd,rd->r", points.normal, points.to_camera),
     )
     hits = Hits._make(values.reshape(count, total) for values in hits)
-    weigh(aimed, hits, mixture, lights.groups, environment, samples)
+    weigh(aimed, hits, mixture, groups, lit.environment, samples)
     return samples
 
 
@@ -357,10 +353,8 @@ def lobe_basis(
 
     @cache
     def samples() -> LobeSamples:
-        return trace_lobe_samples(
-            lit.rays, points, lit.radiance, lit.lights, lit.environment, mixture, lit.diagonal_m,
-            seed, stream, group=len(points.face) // max(num_groups, 1),
-        )  # fmt: skip
+        group = len(points.face) // max(num_groups, 1)
+        return trace_lobe_samples(lit, points, mixture, seed, stream, group=group)
 
     def basis(phis: Sequence[float]) -> tuple[Float, Float]:
         # As many as vector instructions take at once.
@@ -402,10 +396,8 @@ def lobe_radiance(
     step = max(1, _RAYS_AT_ONCE // rays)
     for start in range(0, len(phi), step):
         part = np.arange(start, min(start + step, len(phi)))
-        samples = trace_lobe_samples(
-            lit.rays, points.take(part), lit.radiance, lit.lights, lit.environment, mixture,
-            lit.diagonal_m, seed, part if stream is None else stream[part], alphas[part],
-        )  # fmt: skip
+        numbers = part if stream is None else stream[part]
+        samples = trace_lobe_samples(lit, points.take(part), mixture, seed, numbers, alphas[part])
         base, slope = non_diffuse(samples, phi[part, None].astype(np.float32))
         result[part] = base[..., 0] + psi[part, None] * slope[..., 0]
     return result
@@ -432,9 +424,8 @@ def specular_irradiance(
     count = len(position)
     origin = np.tile(lift_from_surface(position, normal, lit.diagonal_m), (rays, 1))
     directions = cosine_rays(normal, identity, seed, rays)
-    points = points_of_rays(lit.rays, lit.scene, origin, directions)
-    emits = lit.emission.at(points.face, points.u, points.v)[:, 0] > 0.5
-    reflects = np.flatnonzero((points.face >= 0) & ~emits)
+    points = points_of_rays(lit, origin, directions)
+    reflects = np.flatnonzero((points.face >= 0) & ~lit.emits(points))
     owner = lit.scene.face_object[points.face[reflects]]
     arriving = np.zeros((len(directions), 3), np.float32)
     number = (rays * identity + np.arange(rays)[:, None]).ravel()[reflects]

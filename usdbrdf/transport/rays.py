@@ -16,7 +16,6 @@ from usdbrdf.transport.embree import Hits as Hits
 
 # Rays are traced one at a time without Python's lock: chunks this long keep every core busy.
 _CHUNK = 1 << 16
-
 BOX_FACES = 64
 
 

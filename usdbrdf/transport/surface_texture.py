@@ -23,7 +23,6 @@ _AT_A_TIME, _LINE = 1 << 16, 64
 
 # Of a prefetch: to be read, for long, data.
 _READ, _KEEP, _DATA = 0, 3, 1
-
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
@@ -203,12 +202,6 @@ def look_at(texture: SurfaceTexture, looks: Looks, i: int, f: int, u: float, v: 
 
 
 @loop
-def colour_looked_at(texture: SurfaceTexture, looks: Looks, i: int) -> tuple[float, float, float]:
-    """``packed_colour`` at the i-th of ``looks``."""
-    return packed_colour(texture, looks.place[i], looks.width[i], looks.x[i], looks.y[i])
-
-
-@loop
 def add_looked_at(
     texture: SurfaceTexture, looks: Looks, i: int, weight: float, total: Double, k: int
 ) -> None:
@@ -238,6 +231,7 @@ def _lookup(texture: SurfaceTexture, face: Int, u: Float, v: Float) -> Float:
             look_at(texture, looks, i, max(face[r], 0), u[r], v[r])
         for i in range(count):
             if face[first + i] >= 0:
-                red, green, blue = colour_looked_at(texture, looks, i)
+                place, width = looks.place[i], looks.width[i]
+                red, green, blue = packed_colour(texture, place, width, looks.x[i], looks.y[i])
                 out[first + i, 0], out[first + i, 1], out[first + i, 2] = red, green, blue
     return out

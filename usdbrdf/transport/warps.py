@@ -12,21 +12,12 @@ from usdbrdf.kernel import kernel, loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Long
 
 
-def sobol_points(log2_count: int, dimensions: int) -> Double:
-    """The first 2**log2_count points of Sobol's sequence, (N, dimensions), unscrambled.
-
-    Shifted modulo 1 by a random vector per point (Cranley and Patterson 1976) they give unbiased
-    estimates whose error falls nearly with 1/N where the integrand is smooth.
-    """
-    points: Double = qmc.Sobol(dimensions, scramble=False).random_base2(log2_count)
-    return points
-
-
 def sobol_bits(log2_count: int) -> Bits:
-    """The first 2**log2_count two-dimensional ones as numbers of 32 bits, (N, 2). Combined with
-    random bits by exclusive or (T. Kollig and A. Keller, "Efficient Multidimensional Sampling",
-    2002) they stay one in each cell of every grid of 2**m cells."""
-    return np.asarray(sobol_points(log2_count, 2) * 2.0**32, np.uint64).astype(np.uint32)
+    """The first 2**log2_count points of Sobol's two-dimensional sequence as numbers of 32 bits,
+    (N, 2). Combined with random bits by exclusive or (T. Kollig and A. Keller, "Efficient
+    Multidimensional Sampling", 2002) they stay one in each cell of every grid of 2**m cells."""
+    points = qmc.Sobol(2, scramble=False).random_base2(log2_count)
+    return np.asarray(points * 2.0**32, np.uint64).astype(np.uint32)
 
 
 @kernel
@@ -101,11 +92,8 @@ def triangle_point(u1: float, u2: float) -> tuple[float, float]:
 
 # Constants in the loops' own precision: with Python's the compiler would go over to doubles.
 _ONE, _TWO, _HALF, _EIGHTH_TURN = (np.float32(c) for c in (1, 2, 0.5, math.pi / 4))
-
 _S3, _S5, _S7, _S9 = (np.float32(c) for c in (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
-
 _C2, _C4, _C6, _C8 = (np.float32(c) for c in (-1 / 2, 1 / 24, -1 / 720, 1 / 40320))
-
 _BIT = np.float32(2.0**-24)
 
 

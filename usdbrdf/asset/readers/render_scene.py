@@ -158,10 +158,11 @@ def lights_from_stage(
     return tuple(lights)
 
 
-def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
-    """A latitude-longitude picture about the stage's up axis, as ``shade --environment`` has it:
-    in a world with z up it is the y-up one turned by 90 degrees about x."""
-    image = np.maximum(read_texture(file, "raw"), 0)
+def sky_of_picture(picture: Float, up_axis: str) -> SkyLight:
+    """A latitude-longitude picture (H, W, 3) about the stage's up axis, as ``shade --environment``
+    has it: in a world with z up it is the y-up one turned by 90 degrees about x. What is not
+    finite or negative is black."""
+    image = np.maximum(np.nan_to_num(picture, nan=0.0, posinf=0.0, neginf=0.0), 0)
     return SkyLight(image=image, world_from_here=turned_up("Y", up_axis)[:3, :3])
 
 
