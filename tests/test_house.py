@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import SLOW
 from usdbrdf.calibration import entries
 
 PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
@@ -463,6 +464,10 @@ def test_only_the_command_line_prints():
         and node.func.id == "print"
     }
     assert printing <= {"cli.py", "commands.py"}
+
+
+def test_what_is_called_slow_is_there():
+    assert [place for place in SLOW if not (PACKAGE.parent / "tests" / place).exists()] == []
 
 
 @pytest.mark.parametrize("word", ["fastmath=True", "# type: ignore\n", "import *"])
