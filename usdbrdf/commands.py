@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from usdbrdf import options
 from usdbrdf.command_parser import Command
-from usdbrdf.errors import InputRefused
 from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show
 from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
@@ -22,7 +21,6 @@ from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from usdbrdf.asset.layout import Asset
     from usdbrdf.job.task import TaskResult
 
 _NOT_RADIOMETRIC = (
@@ -219,7 +217,7 @@ class Package(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.delivery.package import package
-        summary = package(_asset_at(self.asset).folder, self.output, self.options)
+        summary = package(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
@@ -235,9 +233,10 @@ class Validate(Command):
 
     def run(self) -> int:
         with loading():
+            from usdbrdf.asset.layout import Asset
             from usdbrdf.validation.cure_layer import write_cures
             from usdbrdf.validation.validate import has_errors, validate
-        asset = _asset_at(self.asset)
+        asset = Asset.made(self.asset)
         root = asset.root_layer
         findings = validate(root)
         for finding in findings:
@@ -249,20 +248,6 @@ class Validate(Command):
             done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
             say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
         return 7 if has_errors(findings) else 0
-
-
-def _asset_at(place: Path) -> Asset:
-    """The asset of a folder, or of the root layer in it."""
-    from usdbrdf.asset.layout import Asset
-
-    asset = Asset.at(place.parent if place.is_file() else place)
-    root = asset.root_layer
-    if not root.is_file() or (place.is_file() and not place.samefile(root)):
-        raise InputRefused(
-            f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or the "
-            "NAME.usda in it. [asset.missing]"
-        )
-    return asset
 
 
 @dataclass(frozen=True, kw_only=True)

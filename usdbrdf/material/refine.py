@@ -15,7 +15,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -158,7 +158,7 @@ def _means_without_lobes(
     try:
         groups = groups_of_texels(texels, lit.scene, frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
-        say(f"warning: {short}")
+        warn(str(short))
         groups = smallest_groups(texels)
 
     def means(part: slice) -> dict[str, Float]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_file
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.light import DistantLight, ShapeLight, SkyLight
 from usdbrdf.model.material import Material, Surface
@@ -47,7 +47,7 @@ def render_scene_of_others(path: Path, allow: Sequence[Path]) -> RenderScene:
     reader = f"{__name__}:read_published_here"
     found, warnings = render_scene_of_usd(path, reader, allow=allow, parts=parts)
     for sentence in warnings:
-        say(f"warning: {sentence}")
+        warn(sentence)
     assert isinstance(found, RenderScene)
     return found
 

@@ -14,7 +14,7 @@ from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.hashes import hash_of_files
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
@@ -58,7 +58,7 @@ def ingest(
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         for warning in scan.warnings:
-            say(f"warning: {warning}")
+            warn(warning)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)

@@ -15,7 +15,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import Aov, ShadedObject, colour
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.options import ShadeOptions
@@ -55,7 +55,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
         identifiers = [item.identifier for item in objects]
         for doubt in shaded.doubts(identifiers):
-            say(f"warning: {doubt}")
+            warn(doubt)
         return {**shaded.summary(identifiers), "denoise": lightmap_filter}
 
     return task.run(work)
