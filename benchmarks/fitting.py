@@ -26,6 +26,7 @@ from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.material.fit_views import MIXTURE
 from usdbrdf.model.capture import Frames
+from usdbrdf.options import FitOptions
 from usdbrdf.tasks import fit, fit_objects
 from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.lobe_samples import LOBE_ALPHAS, Mixture
@@ -72,7 +73,7 @@ def fitted(
 ) -> tuple[Spent, dict[str, Fitted]]:
     """Time of the pass over the frames, and each object by its label."""
     frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
-    options = fit_objects.FitOptions(seed=seed)
+    options = FitOptions(seed=seed)
     survey, surveying = timed(
         lambda: fit_objects.survey_frames(NoCheckpoints(), lit.atlas, lit.scene, frames, options)
     )
