@@ -115,7 +115,7 @@ def test_help_says_what_the_code_does(capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["convert", "--help"], ["relight", "-h"], ["adapters"], ["--version"]]
+    "arguments", [["--help"], ["convert", "--help"], ["relight", "-h"], ["adapters"]]
 )
 def test_nothing_that_takes_time_is_loaded_for_help_and_lists(arguments):
     code = (
