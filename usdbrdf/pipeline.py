@@ -18,12 +18,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.capture.ingest_options import IngestOptions
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.ownership import edited_files, owned_folder
 from usdbrdf.job.progress import say
+from usdbrdf.job.stamp import known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.tasks.fit import fit
 from usdbrdf.tasks.fit_objects import FitOptions
@@ -86,13 +88,19 @@ def working_on(
     wait_s        how long to wait for another run in the folder before FolderBusy
     without_lock  go on where the file system has no locks, which is FolderBusy otherwise
     """
-    with owned_folder(Path(folder), wait_s=wait_s, without_lock=without_lock):
-        asset = Asset.at(Path(folder))
+    with owned_folder(Path(folder), wait_s=wait_s, without_lock=without_lock) as state:
+        asset, before = Asset.at(Path(folder)), known_hashes(state)
         _settle(asset, edited_files(asset.folder), hand_edits)
         yield asset
+        if known_hashes(state) != before:
+            warn_of_edits(Asset.at(asset.folder))
 
 
-def _settle(asset: Asset, edited: list[str], hand_edits: str) -> None:
+def _settle(asset: Asset, changed: list[str], hand_edits: str) -> None:
+    damaged = [file for file in changed if is_damaged(asset.folder / file)]
+    for file in damaged:
+        say(f"warning: {asset.folder / file}: damaged; it is made again. [layer.damaged]")
+    edited = [file for file in changed if file not in damaged]
     if edited and hand_edits == "refuse":
         raise OwnershipConflict(
             f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `convert` "

@@ -107,8 +107,9 @@ def _check(written: Path, layer: Sdf.Layer, path: Path, folder: Path) -> None:
     if not stored or stored.defaultPrim != layer.defaultPrim:
         raise EnvironmentFailure(_not_written(path))
     UsdUtils.ModifyAssetPaths(stored, lambda asset: _absolute(asset, folder))
-    # Sublayers that are not there yet are published later, or by another stage.
-    stored.subLayerPaths = [sub for sub in stored.subLayerPaths if Path(sub).is_file()]
+    # Each layer is checked when it is written; what lies there now may be damaged, about to be
+    # replaced, or the artist's.
+    stored.subLayerPaths = []
     stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
     problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
     if problems:
