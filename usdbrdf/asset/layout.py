@@ -11,6 +11,7 @@ from pxr import Sdf, Tf
 
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
+from usdbrdf.job.stamp import read_stamp, stamp_path
 
 # The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
@@ -35,7 +36,7 @@ class Asset:
                 f"{str(folder)!r}: the name of the folder, or of one above it, holds characters "
                 "that USD cannot store in a path. Choose another folder. [stage.asset_path]"
             )
-        made_with = _default_prim(folder / "layers" / "scan.usdc")
+        made_with = _default_prim(folder / "layers" / "scan.usdc") or _recorded_name(folder)
         return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
 
     @staticmethod
@@ -147,3 +148,10 @@ def _default_prim(layer: Path) -> str:
     except Tf.ErrorException:
         return ""
     return str(opened.defaultPrim) if opened else ""
+
+
+def _recorded_name(folder: Path) -> str:
+    """The name that ingest gave the root layer, where scan.usdc is damaged or gone."""
+    stamp = read_stamp(stamp_path(folder, 1, "ingest"))
+    roots = {Path(name) for name in (stamp.once if stamp else ())} - {Path("edits.usda")}
+    return next((path.stem for path in sorted(roots) if path.parent == Path()), "")

@@ -13,6 +13,8 @@ _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
 
+_LITTER = (".DS_Store", "._*", "Thumbs.db", "ehthumbs.db", "desktop.ini", ".directory", "*~")
+
 
 def contained(root: Path, candidate: str) -> Path:
     """The absolute path of ``candidate`` below ``root``; symbolic links are judged by their target.
@@ -68,6 +70,19 @@ def refuse_nameless(path: Path | None) -> None:
             f"{str(path)!r}: this name, or that of a folder above, is not UTF-8, so that USD "
             "cannot refer to it. Rename it. [paths.name]"
         ) from error
+
+
+def files_below(folder: Path, *, without: Path) -> list[Path]:
+    """The files in a folder and in those below it, sorted, but for those in ``without`` and what
+    operating systems and editors leave by themselves."""
+    own = without.resolve()
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if not any(path.match(pattern) for pattern in _LITTER)
+        and path.is_file()
+        and not path.is_relative_to(own)
+    )
 
 
 def _refused(root: Path, candidate: str, reason: str) -> InputRefused:

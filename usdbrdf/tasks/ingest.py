@@ -14,6 +14,7 @@ from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.hashes import hash_of_files
+from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
@@ -115,6 +116,4 @@ def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str
 
 
 def _hash_of_folder(folder: Path, asset: Path) -> str:
-    own = asset.resolve()
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
-    return hash_of_files(sorted(files), folder)
+    return hash_of_files(files_below(folder, without=asset), folder)
