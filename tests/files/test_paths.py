@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from usdbrdf.capture.ingest_options import IngestOptions
 
 from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.paths import contained, files_below, inside
+from usdbrdf.options import IngestOptions
 
 
 @pytest.fixture
