@@ -31,10 +31,10 @@ from usdbrdf.asset.layers.preview_surface import lobe, preview_surface_from_fit,
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.views import Views, photographs_of_views
+from usdbrdf.evaluation.evaluate_views import exposure_of_views
 from usdbrdf.evaluation.metrics import Pair, flip_maps, relative_l2
-from usdbrdf.evaluation.score_views import exposure_of_views
 from usdbrdf.evaluation.viewed_asset import measured_atlas
-from usdbrdf.evaluation.views_from_file import Views, views_from_file
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_radiance
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keep the pictures in this folder")
     chosen = parser.parse_args()
     asset, atlas = measured_atlas(chosen.asset)
-    views = views_from_file(chosen.views, asset, atlas.stage, atlas.scene)
+    views = photographs_of_views(chosen.views, asset, atlas.stage, atlas.scene)
     count = min(len(views.frames), chosen.first or len(views.frames))
     exposure = exposure_of_views(views.frames)
     found = {}

@@ -28,6 +28,7 @@ from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
 from usdbrdf.material.fit_views import MIXTURE
 from usdbrdf.model.capture import Frames
+from usdbrdf.options import FitOptions
 from usdbrdf.tasks import fit
 from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.lobe_radiance import LOBE_ALPHAS, Mixture
@@ -74,7 +75,7 @@ def fitted(
 ) -> tuple[Spent, dict[str, Fitted]]:
     """Time of the pass over the frames, and each object by its label."""
     frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
-    options = fit_objects.FitOptions(seed=seed)
+    options = FitOptions(seed=seed)
     texels, usable = lit.atlas.texels, lit.atlas.coverage.measured & ~lit.atlas.emissive
     given = NoCheckpoints(), lit.scene, texels, usable, frames, options
     survey, surveying = timed(lambda: fit_objects.survey_frames(*given))

@@ -99,9 +99,7 @@ def measure(
 ) -> dict[str, Any]:
     settings = QUICK if quick else SETTINGS
     lit = lit_asset(asset)
-    known = {
-        name: (one["phi"], one["psi"]) for name, one in known_objects(truth, lit.atlas).items()
-    }
+    known = {name: (one.phi, one.psi) for name, one in known_objects(truth, lit.atlas).items()}
     ours, measured, labels = our_efforts(lit, asset, 1 if quick else SEEDS)
     if earlier is not None:
         course = stored_course(earlier, diffuse)

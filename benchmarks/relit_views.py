@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.evaluation.metrics import Pair, exposure_of, flip_maps, median_relative
-from usdbrdf.files.colour import to_display_srgb
+from usdbrdf.evaluation.metrics import Pair, flip_maps, median_relative
+from usdbrdf.files.colour import display_exposure, to_display_srgb
 from usdbrdf.files.images import read_exr
 
 
@@ -47,7 +47,7 @@ def measure(names: list[str], truth: Path, rendered: Path) -> dict[str, Any]:
     """Figures of each view, and the mean of their FLIP."""
     true = [read_exr(truth / name)[..., :3] for name in names]
     ours = [read_exr(rendered / name)[..., :3] for name in names]
-    exposure = exposure_of(np.concatenate([image.mean(axis=2).ravel() for image in true]))
+    exposure = display_exposure(np.concatenate([image.mean(axis=2).ravel() for image in true]))
 
     def shown(image: np.ndarray) -> np.ndarray:
         return to_display_srgb(np.maximum(image, 0), exposure_scale=exposure)

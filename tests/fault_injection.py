@@ -72,7 +72,7 @@ class Fault:
         self._around_stamps(patch)
         around(usdbrdf.files.images, "_write", before="image:before_write")
         around(task.TaskRun, "_place", after="{task}:before_write")
-        around(task.Checkpoints, "save", after="{task}:checkpoint")
+        around(task.TaskRun, "save", after="{task}:checkpoint")
         around(task, "move", after="{task}:mid_publish")
         around(task, "_retire", after="{task}:after_publish")
 

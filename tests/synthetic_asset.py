@@ -158,7 +158,8 @@ class Built:
         if role == "scan":
             write_scan_layer(path, self.scan, draft)
         elif role == "texturing":
-            write_texturing_layer(path, self.asset.uv_layer, draft, self.textured)
+            scanned = open_weaker(self.asset, "texturing")
+            write_texturing_layer(path, self.asset.uv_layer, draft, self.textured, scanned)
         elif role == "shading":
             write_shading_layer(path, draft, self.shaded)
             self.write_lights()

@@ -17,13 +17,16 @@ from usdbrdf import pipeline
 from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import Adapter
 from usdbrdf.cli import main
+from usdbrdf.command_parser import parsed
+from usdbrdf.commands import COMMANDS
 from usdbrdf.job.lock import folder_lock
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.options import BEFORE_FILTER, ConvertOptions
 
 COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
-COMMANDS = (
-    *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare"),
-    *("validate", "rules", "adapters", "plugin-path"),
+NAMES = (
+    *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare", "relight"),
+    *("package", "validate", "rules", "adapters", "plugin-path"),
 )
 
 
@@ -43,6 +46,11 @@ def asset(capture):
 def not_quiet():
     yield
     set_quiet(False)
+
+
+def with_package():
+    """An environment that finds the package from every folder."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def refused(capsys, *arguments):
@@ -70,7 +78,7 @@ def run(*arguments, **options):
 # Help
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", NAMES)
 def test_help_of_each_command(name, capsys):
     assert main([name, "--help"]) == 0
     out, err = capsys.readouterr()
@@ -98,6 +106,27 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         said = text.split(f" {name} ")[-1].split(" --")[0]
         assert unit in said, name
         assert default in said, name
+
+
+def test_help_says_what_the_code_does(capsys):
+    main(["convert", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"or {BEFORE_FILTER} times as much where S is filtered" in text
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["convert", "--help"], ["relight", "-h"], ["adapters"]]
+)
+def test_nothing_that_takes_time_is_loaded_for_help_and_lists(arguments):
+    code = (
+        "import sys, usdbrdf.cli; status = usdbrdf.cli.main(sys.argv[1:])\n"
+        "heavy = {'numpy', 'numba', 'pxr', 'scipy', 'trimesh', 'rich', 'tqdm', 'OpenImageIO'}\n"
+        "sys.exit(status or ', '.join(heavy & {*sys.modules}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("name", ["shade", "fit"])
@@ -140,6 +169,14 @@ def test_seed_reaches_shade_and_fit(asset):
         ["--crease-angle", "181"],
         ["--up-axis", "x"],
         ["--wait", "long"],
+        ["--memory", "1e300"],
+        ["--meters-per-unit", "1e300"],
+        ["--meters-per-unit", "1e-300"],
+        ["--pose-scale", "-1"],
+        ["--texel-size", "1e300"],
+        ["--max-texels", "1" + 30 * "0"],
+        ["--max-texels", 5000 * "9"],
+        ["--decimate", "0"],
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_made(options, capture, tmp_path, capsys):
@@ -148,12 +185,33 @@ def test_wrong_options_are_refused_before_anything_is_made(options, capture, tmp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_said_twice_counts_as_said_last_and_reaches_all_who_have_it():
+    words = "scan -o out --seed 3 --seed 4 --memory 2 --allow-outside a --allow-outside b"
+    command = parsed(["convert", *words.split(), "--sampling", "cosine"], COMMANDS)
+    options = command.options
+    assert (options.shade.sampling.seed, options.fit.seed) == (4, 4)
+    assert (options.texture.memory, options.fit.memory) == (2, 2)
+    assert options.ingest.allow_outside == (Path("a"), Path("b"))
+    assert options.shade.sampling.max_rays == 10_000
+    assert parsed(["convert", "scan", "-o", "out"], COMMANDS).options == ConvertOptions()
+
+
 @pytest.mark.parametrize("arguments", [[], ["paint"], ["convert"], ["fit"], ["adapters", "x"]])
 def test_wrong_commands(arguments, capsys):
     assert refused(capsys, *arguments)[0] == 2
 
 
 # Inputs and outputs that cannot be used leave nothing behind
+
+
+def test_names_that_are_not_utf8(tmp_path, capsys):
+    name = os.fsdecode(b"caf\xe9")
+    status, line = refused(capsys, "ingest", tmp_path / name, "-o", tmp_path / "out")
+    assert (status, "caf\\udce9: the name" in line) == (2, True)
+    (tmp_path / name).mkdir()
+    done = run("ingest", "scan", "-o", "out", cwd=tmp_path / name, env=with_package())
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert list((tmp_path / name).iterdir()) == []
 
 
 def test_missing_scan(tmp_path, capsys):
@@ -431,16 +489,114 @@ def test_terminated_while_it_works(capture, tmp_path):
     assert (tmp_path / "out" / "layers" / "scan.usdc").is_file()
 
 
-@pytest.mark.parametrize("arguments", [["convert", "--help"], ["adapters"]])
-def test_reader_that_went_away(arguments):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("module", ["cyclopts", "usdbrdf.pipeline", "pxr.Usd", "numba"])
+def test_signals_while_modules_are_loaded(module, number, capture, tmp_path):
+    """What is being imported may swallow an interrupt, or take it for a failure of its own."""
+    code = f"""
+import os, signal, sys
+from usdbrdf.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            try:
+                os.kill(os.getpid(), {int(number)})
+            except BaseException as error:
+                raise ImportError("taken for a failure") from error
+sys.meta_path.insert(0, Interrupting())
+sys.exit(main(sys.argv[1:]))
+"""
+    arguments = ["ingest", str(capture), "-o", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+    word, status = {
+        signal.SIGINT: ("interrupted", 130),
+        signal.SIGTERM: ("terminated", 143),
+    }[number]
+    assert done.stderr == f"usdbrdf: {word}; the same command goes on from here.\n"
+    assert done.returncode == status
+    assert list(tmp_path.iterdir()) == []
+
+
+# Readers that go away
+
+
+def nowhere(kind):
+    """A descriptor that cannot be written to."""
+    if kind == "full":
+        return os.open("/dev/full", os.O_WRONLY)
     read, write = os.pipe()
     os.close(read)
-    process = subprocess.run(
-        [sys.executable, "-m", "usdbrdf", *arguments], stdout=write, stderr=subprocess.PIPE
+    return write
+
+
+def run_into(*arguments, **streams):
+    """Exit code and what came through a pipe, of a call with its other stream at ``nowhere``."""
+    (stream, kind), pipes = next(iter(streams.items())), {"stdout", "stderr"}
+    target = nowhere(kind)
+    (other,) = pipes - {stream}
+    done = subprocess.run(
+        [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
+        **{stream: target, other: subprocess.PIPE},
+        text=True,
+        check=False,
     )
-    os.close(write)
-    assert process.stderr == b""
-    assert process.returncode == 0
+    os.close(target)
+    return done.returncode, getattr(done, other)
+
+
+KINDS = pytest.mark.parametrize(
+    "kind",
+    [
+        "gone",
+        pytest.param(
+            "full",
+            marks=pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full"),
+        ),
+    ],
+)
+
+
+@KINDS
+def test_what_nobody_hears_changes_neither_work_nor_status(kind, capture, tmp_path):
+    folder = tmp_path / "out"
+    status, out = run_into("ingest", capture, "-o", folder, "--json", stderr=kind)
+    assert status == 0
+    assert json.loads(out)["steps"]["ingest"]["reran"] is True
+    assert (folder / ".usdbrdf/stamps/1-ingest.json").is_file()
+    assert run_into("ingest", tmp_path / "none", "-o", folder, stderr=kind) == (3, "")
+    assert run_into("ingest", capture, stderr=kind) == (2, "")
+
+
+@pytest.mark.parametrize("arguments", [["convert", "--help"], ["adapters"], ["--version"]])
+def test_a_reader_who_has_seen_enough_of_a_list(arguments):
+    assert run_into(*arguments, stdout="gone") == (0, "")
+
+
+def test_findings_that_nobody_reads_are_still_a_status(asset):
+    picture = next((asset / "textures").glob("*.lit.exr"))
+    away = picture.rename(asset.parent / picture.name)
+    try:
+        assert run_into("validate", asset, stdout="gone") == (7, "")
+    finally:
+        away.rename(picture)
+
+
+@KINDS
+def test_a_summary_that_cannot_be_handed_over_is_a_failure(kind, capture, tmp_path):
+    status, err = run_into("ingest", capture, "-o", tmp_path / "out", "-q", "--json", stdout=kind)
+    assert status == {"gone": 1, "full": 4}[kind]
+    assert re.fullmatch(r"usdbrdf: stdout.* \[environment\.output\]\n", err)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("arguments", [["--help"], ["adapters"], ["--version"]])
+def test_a_full_disk_behind_stdout(arguments):
+    status, err = run_into(*arguments, stdout="full")
+    assert (status, err.count("\n")) == (4, 1)
 
 
 def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys):

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import SLOW
 from usdbrdf.calibration import entries
 
 PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
@@ -48,7 +49,8 @@ ARROWS: dict[str, set[str]] = {
     "capture": {"geometry"},
     "shading": {"transport"},
     "material": {"transport"},
-    "asset": {"transport"},
+    # A document of views is read by the adapter of the capture that they belong to.
+    "asset": {"transport", "capture"},
     "tasks": SUBJECTS,
     "pipeline": {"tasks"},
     "delivery": {"asset"},
@@ -85,7 +87,7 @@ IMPORTERS: dict[str, set[str]] = {
     "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
     "pymeshlab": {"geometry/mesh_filters.py"},
     "PyOpenColorIO": {"files/colour.py"},
-    "pyoidn": {"shading/denoise.py", "transport/denoise.py"},
+    "pyoidn": {"transport/denoise.py"},
     "subprocess": {"job/child.py"},
     "threadpoolctl": {"tasks/"},
     "tqdm": {"job/progress.py"},
@@ -212,18 +214,17 @@ HISTORY = re.compile(r"\b(no longer|used to (?!be\b)\w+|previously|was once|form
 
 NOT_YET: dict[str, set[str]] = {
     "arrows": {
-        "asset -> capture", "asset -> geometry", "asset -> shading", "cli -> fit_options",
-        "command_parser -> fit_options", "delivery -> relighting",
-        "evaluation -> capture", "evaluation -> tasks", "material -> texturing",
+        "asset -> geometry", "asset -> shading", "cli -> fit_options",
+        "command_parser -> fit_options",
+        "material -> texturing",
         "options -> capture", "options -> shading", "options -> tasks", "options -> transport",
-        "relighting -> capture", "relighting -> geometry", "relighting -> shading",
-        "untrusted -> geometry", "validation -> delivery",
+        "relighting -> geometry", "untrusted -> geometry",
     },
     "circles": {"asset.layers <- asset.readers"},
     "face": {"cli.py"},
-    "history": {"evaluation/truth.py: no longer", "job/publishing.py: no longer"},
+    "history": {"job/publishing.py: no longer"},
     "importers": {
-        "evaluation/truth.py: trimesh", "evaluation/views_from_file.py: pxr", "model/mesh.py: pxr",
+        "model/mesh.py: pxr",
         "relighting/inserted_models.py: trimesh", "tasks/atlas.py: pxr", "tasks/step.py: pxr",
         "tasks/texture.py: pxr",
     },
@@ -463,6 +464,10 @@ def test_only_the_command_line_prints():
         and node.func.id == "print"
     }
     assert printing <= {"cli.py", "commands.py"}
+
+
+def test_what_is_called_slow_is_there():
+    assert [place for place in SLOW if not (PACKAGE.parent / "tests" / place).exists()] == []
 
 
 @pytest.mark.parametrize("word", ["fastmath=True", "# type: ignore\n", "import *"])

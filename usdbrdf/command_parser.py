@@ -262,26 +262,22 @@ def _entry(said: _Said) -> tuple[str, str]:
 
 def _meaning(owner: type[Options], name: str) -> str:
     """Of a field: what the string below it says."""
-    classes = (base for base in owner.__mro__ if name in _meanings(base.__module__, base.__name__))
-    base = next(classes)
-    return _meanings(base.__module__, base.__name__)[name].format_map(vars(options))
+    places = [f"{base.__name__}.{name}" for base in owner.__mro__]
+    meanings = {**_meanings(options.__name__), **_meanings(owner.__module__)}
+    return next(meanings[place] for place in places if place in meanings)
 
 
 @cache
-def _meanings(module: str, owner: str) -> dict[str, str]:
-    found = {}
-    for statement in _source(module):
-        if isinstance(statement, ast.ClassDef) and statement.name == owner:
-            for field, below in pairwise(statement.body):
-                if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-                    text = ast.literal_eval(below.value)
-                    found[ast.unparse(field.target)] = " ".join(text.split())
-    return found
-
-
-@cache
-def _source(module: str) -> list[ast.stmt]:
-    return ast.parse(inspect.getsource(sys.modules[module])).body if module != "builtins" else []
+def _meanings(module: str) -> dict[str, str]:
+    return {
+        f"{owner.name}.{ast.unparse(field.target)}": " ".join(
+            str(ast.literal_eval(below.value)).format_map(vars(options)).split()
+        )
+        for owner in ast.parse(inspect.getsource(sys.modules[module])).body
+        if isinstance(owner, ast.ClassDef)
+        for field, below in pairwise(owner.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr)
+    }
 
 
 def _table(title: str, entries: Sequence[tuple[str, str]]) -> str:

@@ -14,20 +14,33 @@ from typing import TYPE_CHECKING, Any
 
 from usdbrdf import options
 from usdbrdf.command_parser import Command
-from usdbrdf.errors import InputRefused
 from usdbrdf.job.interrupts import loading
-from usdbrdf.job.progress import hand_over, printable, say, set_quiet, show
+from usdbrdf.job.progress import printable, say, set_quiet, show
 from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from usdbrdf.asset.layout import Asset
     from usdbrdf.job.task import TaskResult
+
+_NOT_RADIOMETRIC = (
+    "warning: the images are not radiometric; albedo and fit have no absolute meaning."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Run(TalkOptions, Command):
+class _Talking(TalkOptions, Command):
+    def told(self, summary: Mapping[str, Any], *lines: str) -> int:
+        """The end of a command that did what it was asked for."""
+        if self.json:
+            show(json.dumps(summary, indent=2), whole=True)
+        for line in lines:
+            say(line)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run(_Talking):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
 
@@ -36,16 +49,14 @@ class _Run(TalkOptions, Command):
         from usdbrdf.asset.layout import Asset
 
         root = Asset.at(folder).root_layer
-        if self.json:
-            tasks = {
-                name: {"reran": result.reran, "reason": result.reason, **result.summary}
-                for name, result in results.items()
-            }
-            _hand_over({"asset": str(root), "steps": tasks})
-        if "ingest" in results and results["ingest"].summary.get("radiometric") is False:
-            say("warning: the images are not radiometric; albedo and fit have no absolute meaning.")
-        say(f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}")
-        return 0
+        steps = {
+            name: {"reran": result.reran, "reason": result.reason, **result.summary}
+            for name, result in results.items()
+        }
+        lines = [f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}"]
+        if steps.get("ingest", {}).get("radiometric") is False:
+            lines = [_NOT_RADIOMETRIC, *lines]
+        return self.told({"asset": str(root), "steps": steps}, *lines)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +144,7 @@ class Fit(_RunOnAsset):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _WithAsset(TalkOptions, Command):
+class _WithAsset(_Talking):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder; it is not changed"
 
@@ -154,17 +165,14 @@ class Evaluate(_WithAsset):
             from usdbrdf.evaluation.report import summary_line, truth_line
         found = evaluate(self.asset, self.views, self.output, self.options)
         truth = {"truth": found["truth"]} if "truth" in found else {}
-        if self.json:
-            _hand_over({"output": str(self.output), **found["summary"], **truth})
-        say(summary_line(found["summary"]))
+        lines = [summary_line(found["summary"]), f"{self.output / DOCUMENT}: written"]
         if truth:
-            say(truth_line(found["truth"]))
-        say(f"{self.output / DOCUMENT}: written")
-        return 0
+            lines.insert(1, truth_line(found["truth"]))
+        return self.told({"output": str(self.output), **found["summary"], **truth}, *lines)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(TalkOptions, Command):
+class Compare(_Talking):
     """Compare two assets of one scene, lit differently."""
 
     first: Path = option("ASSET", REQUIRED)
@@ -178,11 +186,9 @@ class Compare(TalkOptions, Command):
         with loading():
             from usdbrdf.evaluation import compare_assets as made
         found = made.compare(self.first, self.second, self.output)
-        if self.json:
-            _hand_over({"output": str(self.output), **made.figures(found)})
-        say(made.comparison_line(found))
-        say(f"{self.output / made.DOCUMENT}: written")
-        return 0
+        written = f"{self.output / made.DOCUMENT}: written"
+        summary = {"output": str(self.output), **made.figures(found)}
+        return self.told(summary, made.comparison_line(found), written)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,10 +203,7 @@ class Relight(_WithAsset):
         with loading():
             from usdbrdf.relighting.relight import relight
         summary = relight(self.asset, self.output, self.options)
-        if self.json:
-            _hand_over(summary)
-        say(f"{self.output}: written")
-        return 0
+        return self.told(summary, f"{self.output}: written")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,11 +217,8 @@ class Package(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.delivery.package import package
-        summary = package(_asset_at(self.asset).folder, self.output, self.options)
-        if self.json:
-            _hand_over(summary)
-        say(f"{self.output}: written, {summary['bytes']:,} bytes")
-        return 0
+        summary = package(self.asset, self.output, self.options)
+        return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,9 +233,10 @@ class Validate(Command):
 
     def run(self) -> int:
         with loading():
+            from usdbrdf.asset.layout import Asset
             from usdbrdf.validation.cure_layer import write_cures
             from usdbrdf.validation.validate import has_errors, validate
-        asset = _asset_at(self.asset)
+        asset = Asset.made(self.asset)
         root = asset.root_layer
         findings = validate(root)
         for finding in findings:
@@ -247,20 +248,6 @@ class Validate(Command):
             done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
             say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
         return 7 if has_errors(findings) else 0
-
-
-def _asset_at(place: Path) -> Asset:
-    """The asset of a folder, or of the root layer in it."""
-    from usdbrdf.asset.layout import Asset
-
-    asset = Asset.at(place.parent if place.is_file() else place)
-    root = asset.root_layer
-    if not root.is_file() or (place.is_file() and not place.samefile(root)):
-        raise InputRefused(
-            f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or the "
-            "NAME.usda in it. [asset.missing]"
-        )
-    return asset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +262,7 @@ class Rules(Command):
             from usdbrdf.validation.validate import listed_rules
         rules = listed_rules()
         if self.json:
-            _hand_over([asdict(rule) for rule in rules])
+            show(json.dumps([asdict(rule) for rule in rules], indent=2), whole=True)
             return 0
         for rule in rules:
             severity = f" ({rule.severity})" if rule.severity else ""
@@ -314,10 +301,6 @@ class PluginPath(Command):
         folders = [plugin_path()] if self.schemas else [plugin_path(), validators_path()]
         show(os.pathsep.join(str(folder) for folder in folders))
         return 0
-
-
-def _hand_over(summary: Any) -> None:
-    hand_over(json.dumps(summary, indent=2))
 
 
 _TASKS: tuple[type[Command], ...] = (Convert, Ingest, Texture, Shade, Fit)

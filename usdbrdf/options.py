@@ -142,8 +142,8 @@ def _memory() -> float | None:
     return option("--memory GIB", None, (1e-3, 2**20), **more)
 
 
-def _allow_outside() -> tuple[Path, ...]:
-    text = "let the capture's documents name files in this folder too; may be given again"
+def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
+    text = f"let {who} name files in this folder too; may be given again"
     return option("--allow-outside DIR", (), unset="none", help=text)
 
 
@@ -407,6 +407,7 @@ class RelightOptions(Options):
     inserts: tuple[Insert, ...] = option("--insert MODEL [KEY=VALUE ...]", ())
     """put a model in (USD, OBJ, PLY, GLB), lengths in units of the stage; may be given again. Keys:
     """
+    allow_outside: tuple[Path, ...] = _allow_outside("the USD files of --lights and --insert")
     camera: str | None = option("--camera PRIM", None, unset="the capture's")
     "path of a camera in the stage"
     frame: float | None = option("--frame N", None, unset="the first")

@@ -20,13 +20,14 @@ from inspect import signature
 from pathlib import Path
 from typing import ParamSpec
 
-from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.lock import is_held
 from usdbrdf.job.ownership import edited_files, owned_folder
 from usdbrdf.job.progress import say
-from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.options import ConvertOptions, HandEdits
 from usdbrdf.tasks.fit import fit as fit_task
@@ -91,10 +92,12 @@ def working_on(
     if is_held(place / STATE_FOLDER):
         yield Asset.at(place)
         return
-    with owned_folder(place, wait_s=wait_s, without_lock=without_lock):
-        asset = Asset.at(place)
+    with owned_folder(place, wait_s=wait_s, without_lock=without_lock) as state:
+        asset, before = Asset.at(place), known_hashes(state)
         _settle(asset, edited_files(asset.folder), hand_edits)
         yield asset
+        if known_hashes(state) != before:
+            warn_of_edits(Asset.at(asset.folder))
 
 
 def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
@@ -118,7 +121,11 @@ shade = _on_its_folder(shade_task)
 fit = _on_its_folder(fit_task)
 
 
-def _settle(asset: Asset, edited: list[str], hand_edits: HandEdits) -> None:
+def _settle(asset: Asset, changed: list[str], hand_edits: HandEdits) -> None:
+    damaged = [file for file in changed if is_damaged(asset.folder / file)]
+    for file in damaged:
+        say(f"warning: {asset.folder / file}: damaged; it is made again. [layer.damaged]")
+    edited = [file for file in changed if file not in damaged]
     if edited and hand_edits == "refuse":
         raise OwnershipConflict(
             f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `convert` "

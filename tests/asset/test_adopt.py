@@ -3,7 +3,7 @@
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
-from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.errors import OwnershipConflict
 
@@ -82,3 +82,17 @@ def test_a_layer_that_cannot_be_read_is_named(built):
     with pytest.raises(OwnershipConflict, match=r"material\.usda.+\[ownership\.unreadable\]"):
         adopt(built.asset, [built.asset.layer("material")])
     assert not list(built.asset.folder.glob("adopted*"))
+
+
+def test_a_binary_layer_is_damaged_where_usd_cannot_read_it_and_only_there(tmp_path):
+    path = tmp_path / "scan.usdc"
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
+    prim = Sdf.CreatePrimInLayer(layer, "/room")
+    prim.referenceList.Prepend(Sdf.Reference("./gone.usda", "/room"))
+    prim.customData = {"long": "x" * 1000}
+    layer.Export(str(path))
+    assert not is_damaged(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert is_damaged(path)
+    path.with_suffix(".usda").write_text("#usda 1.0\nnot finished {")
+    assert not is_damaged(path.with_suffix(".usda"))

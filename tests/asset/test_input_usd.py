@@ -11,10 +11,10 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.delivery.flat_stage import flattened, stage_in_look
-from usdbrdf.files.naming import unique_identifiers
-from usdbrdf.model.mesh import ObjectLabel
-from usdbrdf.untrusted.usd_meshes import meshes_from_usd
+from usdbrdf.options import IngestOptions
 from usdbrdf.validation.validate import validate
 
 # Every way of binding that could win against ours, and everything stored per polygon.
@@ -136,15 +136,11 @@ def dress(tmp_path, synthetic, text):
     file = tmp_path / "capture" / "haus.usda"
     file.parent.mkdir()
     file.write_text(text)
-    found = meshes_from_usd(file)
-    identifiers = unique_identifiers(found.labels)
+    found = geometry_from_usd(file, IngestOptions(), Findings(), capture_root=file.parent)
     scan = replace(
         synthetic.make_scan(tmp_path / "capture", unit=0.01, up_axis="Y"),
         mesh=found.mesh,
-        objects=tuple(
-            ObjectLabel(identifier=i, label=label)
-            for i, label in zip(identifiers, found.labels, strict=True)
-        ),
+        objects=found.objects,
         usd_geometry=file,
         object_prims=found.object_prims,
     )

@@ -193,9 +193,41 @@ def test_an_application_reads_the_asset_with_and_without_the_schemas(built, know
     }  # fmt: skip
 
 
-def test_importing_the_package_makes_the_schemas_known():
-    code = "import usdbrdf.asset.schema as s; s.verify(); print('known')"
-    assert run_python(code, PXR_PLUGINPATH_NAME="") == "known"
+KNOWN = """
+import os
+definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition("UsdBrdfMaterialFitAPI")
+assert "usdBrdf:fit:phi" in definition.GetPropertyNames()
+assert os.environ["PXR_PLUGINPATH_NAME"] == "", "children get another environment"
+from pxr import Plug
+known = bool(Plug.Registry().GetPluginWithName("usdbrdf.validation.usd_plugin"))
+assert known == (Usd.GetVersion() >= (0, 26, 8))
+print("known")
+"""
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import usdbrdf; from pxr import Usd",
+        "from pxr import Usd; import usdbrdf",
+        "from pxr import Sdf, Plug; import usdbrdf; from pxr import Usd",
+        "import usdbrdf; from pxr import UsdGeom, Usd",
+        "import usdbrdf.asset.layout; from pxr import Usd",
+        "import usdbrdf; usdbrdf.IngestOptions(); import pxr.Usd as Usd",
+    ],
+)
+def test_importing_the_package_makes_the_schemas_known(first):
+    assert run_python(first + KNOWN, PXR_PLUGINPATH_NAME="") == "known"
+
+
+def test_the_package_is_imported_without_usd_and_leaves_its_modules_as_they_are():
+    code = (
+        "import sys, usdbrdf; assert not {'pxr', 'numpy', 'cyclopts'} & {*sys.modules}\n"
+        "before = list(sys.meta_path); import pxr.Usd, inspect\n"
+        "assert not any(type(f).__module__ == 'usdbrdf' for f in sys.meta_path)\n"
+        "assert inspect.getsource(pxr.Usd); print('clean')"
+    )
+    assert run_python(code) == "clean"
 
 
 def test_a_late_import_is_explained_at_the_first_write():

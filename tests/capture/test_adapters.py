@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import types
+import os
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -13,36 +14,40 @@ from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import list_adapters, read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted import plugins
 
 
 @pytest.fixture
-def announce(monkeypatch):
-    """Pretend that packages announce these objects; an exception stands for a failing import."""
+def announce(monkeypatch, tmp_path):
+    """Pretend that a package announces these modules, of which the source is given."""
+    package = tmp_path / "on_path" / "pkg"
 
-    def install(**modules):
-        def load(point):
-            found = modules[point.name]
-            if isinstance(found, BaseException):
-                raise found
-            return found
-
-        points = tuple(EntryPoint(name, f"pkg.{name}", adapters.GROUP) for name in modules)
+    def install(**sources):
+        package.mkdir(parents=True)
+        for name, source in sources.items():
+            (package / f"{name}.py").write_text(source)
+        monkeypatch.syspath_prepend(str(package.parent))
+        points = tuple(EntryPoint(name, f"pkg.{name}", adapters.GROUP) for name in sources)
         monkeypatch.setattr(adapters, "entry_points", lambda group: points)
-        monkeypatch.setattr(EntryPoint, "load", load)
 
-    return install
+    yield install
+    for name in [name for name in sys.modules if name.partition(".")[0] == "pkg"]:
+        del sys.modules[name]
 
 
-def _adapter(**members):
-    return types.SimpleNamespace(
-        **{
-            "NAME": "theirs",
-            "DESCRIPTION": "their format",
-            "matches": lambda path: path.name == "theirs",
-            "read": lambda path, options: ("read by theirs", path, options),
-            **members,
-        }
-    )
+_THEIRS = """
+NAME = "theirs"
+DESCRIPTION = "their format"
+
+def matches(path):
+    return path.name == "theirs"
+
+def read(path, options):
+    return ("read by theirs", path, options)
+
+def explode(*_):
+    raise RuntimeError("boom")
+"""
 
 
 def test_ours_are_there_even_if_nothing_is_installed(announce):
@@ -58,7 +63,7 @@ def test_ours_are_announced_in_the_same_way():
 
 
 def test_theirs_is_found_and_used(announce, tmp_path):
-    announce(theirs=_adapter())
+    announce(theirs=_THEIRS)
     (tmp_path / "theirs").mkdir()
     options = IngestOptions()
     assert read_scan(tmp_path / "theirs", options)[0] == "read by theirs"
@@ -67,16 +72,20 @@ def test_theirs_is_found_and_used(announce, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("module", "problem"),
+    ("source", "problem"),
     [
-        (ImportError("no module named moon"), "ImportError: no module named moon"),
-        (SystemExit(3), "SystemExit: 3"),
-        (_adapter(read=None), "it has no read"),
-        (_adapter(NAME=5, matches=1), "it has no NAME, matches"),
+        ("raise ImportError('no module named moon')", "ImportError: no module named moon"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        (_THEIRS + "read = None", "it has no read"),
+        (_THEIRS + "NAME = 5; matches = 1", "it has no NAME, matches"),
+        (
+            "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+            "its import crashed (SIGSEGV). Repair the input",
+        ),
     ],
 )
-def test_a_broken_one_is_reported_listed_and_skipped(announce, tmp_path, capsys, module, problem):
-    announce(theirs=module)
+def test_a_broken_one_is_reported_listed_and_skipped(announce, tmp_path, capsys, source, problem):
+    announce(theirs=source)
     capture = make_capture(tmp_path / "room")
     assert read_scan(capture.folder, IngestOptions()).adapter == "transforms"
     assert f"'theirs' (pkg.theirs) is skipped: {problem}" in capsys.readouterr().err
@@ -86,11 +95,24 @@ def test_a_broken_one_is_reported_listed_and_skipped(announce, tmp_path, capsys,
         read_scan(capture.folder, IngestOptions(), "theirs")
 
 
-def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_path, capsys):
-    def explode(*_):
-        raise RuntimeError("boom")
+def test_one_that_hangs_at_import_is_reported_and_skipped(announce, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(plugins, "PLUGIN_SECONDS", 5.0)
+    announce(theirs="while True: pass")
+    capture = make_capture(tmp_path / "room")
+    assert read_scan(capture.folder, IngestOptions()).adapter == "transforms"
+    expected = "'theirs' (pkg.theirs) is skipped: its import did not end within 5 s"
+    assert expected in capsys.readouterr().err
 
-    announce(a=_adapter(matches=explode), theirs=_adapter(read=explode))
+
+def test_a_capture_that_usd_cannot_name_is_refused(tmp_path):
+    folder = tmp_path / os.fsdecode(b"\xff")
+    capture = make_capture(folder)
+    with pytest.raises(InputRefused, match=r"not UTF-8.*\[paths\.name\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
+def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_path, capsys):
+    announce(a=_THEIRS + "matches = explode", theirs=_THEIRS + "read = explode")
     (tmp_path / "theirs").mkdir()
     with pytest.raises(InputRefused, match=r"adapter 'theirs' \(pkg.theirs\) failed: .*boom"):
         read_scan(tmp_path / "theirs", IngestOptions())
@@ -98,7 +120,7 @@ def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_p
 
 
 def test_ours_cannot_be_replaced(announce):
-    announce(transforms=_adapter())
+    announce(transforms=_THEIRS)
     assert [a.origin for a in list_adapters()] == list(adapters.MODULES.values())
 
 

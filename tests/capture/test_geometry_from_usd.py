@@ -8,10 +8,12 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.parts import geometry_from_usd
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.options import IngestOptions
-from usdbrdf.untrusted import usd_meshes as foreign
-from usdbrdf.untrusted.usd_meshes import meshes_from_usd
+from usdbrdf.untrusted import bounds
+from usdbrdf.untrusted.usd_files import layers_of_usd, meshes_from_usd, render_scene_of_usd
 
 
 def _mesh(stage, path, points, counts, indices, **attributes):
@@ -30,16 +32,6 @@ def _stage(path, **metadata):
     root = UsdGeom.Xform.Define(stage, "/scan")
     stage.SetDefaultPrim(root.GetPrim())
     return stage
-
-
-@pytest.fixture
-def without_child(monkeypatch):
-    """A new interpreter takes a second; what is read does not depend on where."""
-
-    def call(function, arrays, parameters, timeout_s, label, *, memory_limit_bytes):
-        return foreign.read_in_child(arrays, parameters)
-
-    monkeypatch.setattr(foreign, "run_child", call)
 
 
 @pytest.fixture
@@ -87,7 +79,6 @@ def test_referenced_geometry_is_not_reduced(capture):
         read_scan(capture.folder, IngestOptions(decimate=10))
 
 
-@pytest.mark.usefixtures("without_child")
 def test_units_axis_and_options(tmp_path):
     stage = _stage(tmp_path / "a.usdc", up_axis="Y", meters_per_unit=0.01)
     _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
@@ -97,7 +88,6 @@ def test_units_axis_and_options(tmp_path):
     assert (found.labels, found.object_prims, found.warnings) == (("m",), ("m",), ())
 
 
-@pytest.mark.usefixtures("without_child")
 def test_polygons_normals_and_handedness(tmp_path):
     square = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
     stage = _stage(tmp_path / "a.usda")
@@ -114,7 +104,10 @@ def test_polygons_normals_and_handedness(tmp_path):
     wrong = _mesh(stage, "/scan/wrong", square, [4], range(4))
     wrong.CreateNormalsAttr([Gf.Vec3f(1, 0, 0)] * 3)
     stage.Save()
-    mesh = meshes_from_usd(tmp_path / "a.usda").mesh
+    given = meshes_from_usd(tmp_path / "a.usda").mesh.corner_normals.reshape(5, 2, 3, 3)
+    assert np.isnan(given).all(axis=(1, 2, 3)).tolist() == [True, True, True, False, True]
+    path, options = tmp_path / "a.usda", IngestOptions()
+    mesh = geometry_from_usd(path, options, Findings(), capture_root=tmp_path).mesh
     normals = mesh.corner_normals.reshape(5, 2, 3, 3)  # object, triangle, corner
     np.testing.assert_allclose(normals[0], np.broadcast_to([0, 0, 1], (2, 3, 3)), atol=1e-6)
     np.testing.assert_allclose(normals[1], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-6)
@@ -129,7 +122,6 @@ def test_polygons_normals_and_handedness(tmp_path):
     assert ((facing[:, None] * mesh.corner_normals).sum(axis=2) > 0).all()
 
 
-@pytest.mark.usefixtures("without_child")
 def test_instances_are_objects_one_by_one(tmp_path):
     stage = _stage(tmp_path / "a.usda")
     stage.CreateClassPrim("/chair")
@@ -145,7 +137,6 @@ def test_instances_are_objects_one_by_one(tmp_path):
     assert found.mesh.points[:, 0].tolist() == [1, 0, 0, 6, 5, 5]
 
 
-@pytest.mark.usefixtures("without_child")
 def test_what_is_left_out_is_said(tmp_path):
     stage = _stage(tmp_path / "a.usda")
     _mesh(stage, "/scan/cage", np.eye(3), [3], [0, 1, 2], scheme="catmullClark")
@@ -190,10 +181,17 @@ def _missing_layer(stage):
     stage.GetDefaultPrim().GetReferences().AddReference("./missing.usda")
 
 
+def _metadata(key, value):
+    def author(stage):
+        _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+        stage.GetRootLayer().pseudoRoot.SetInfo(key, value)
+
+    return author
+
+
 _NAN = [(np.nan, 0, 0), (1, 0, 0), (0, 1, 0)]
 
 
-@pytest.mark.usefixtures("without_child")
 @pytest.mark.parametrize(
     ("author", "rule", "words"),
     [
@@ -210,6 +208,10 @@ _NAN = [(np.nan, 0, 0), (1, 0, 0), (0, 1, 0)]
         (_asset("../../secret.png"), "paths.outside", "leads outside"),
         (_asset("https://example.org/a.png"), "paths.outside", "is a URI"),
         (_missing_layer, "stage.input", "does not compose"),
+        (_metadata("metersPerUnit", np.nan), "stage.units", "metersPerUnit is nan"),
+        (_metadata("metersPerUnit", -1.0), "stage.units", "metersPerUnit is -1"),
+        (_metadata("metersPerUnit", 1e300), "stage.units", "metersPerUnit is 1e+300"),
+        (_metadata("upAxis", "X"), "stage.units", "upAxis is 'X'"),
     ],
 )
 def test_unusable_stages_are_refused(tmp_path, author, rule, words):
@@ -222,7 +224,6 @@ def test_unusable_stages_are_refused(tmp_path, author, rule, words):
     assert words in str(refused.value)
 
 
-@pytest.mark.usefixtures("without_child")
 def test_a_reference_may_lead_into_the_capture_but_not_beyond(tmp_path):
     for folder in ("geo", "lib"):
         (tmp_path / folder).mkdir()
@@ -242,3 +243,37 @@ def test_damaged_files_are_refused(tmp_path, content):
     (tmp_path / "a.usd").write_bytes(content)
     with pytest.raises(InputRefused, match=r"a\.usd.*\[(stage|child)\.[a-z_]+\]"):
         meshes_from_usd(tmp_path / "a.usd")
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        meshes_from_usd,
+        lambda file: layers_of_usd(file, ()),
+        lambda file: render_scene_of_usd(file, "builtins:repr"),
+    ],
+    ids=["meshes", "layers", "scene"],
+)
+def test_every_reader_of_usd_is_stopped_at_the_limits(tmp_path, monkeypatch, read):
+    stage = _stage(tmp_path / "a.usdc")
+    _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+    stage.Save()
+
+    def expect(kind, match, file_bytes=1 << 30, seconds=600.0, memory_bytes=64 << 30):
+        limits = bounds.Limits(file_bytes, seconds, memory_bytes)
+        monkeypatch.setitem(bounds.LIMITS, "stage", limits)
+        with pytest.raises(kind, match=match):
+            read(tmp_path / "a.usdc")
+
+    expect(EnvironmentFailure, r"a\.usdc: .*\[child\.timeout\]$", seconds=0.01)
+    expect(EnvironmentFailure, r"a\.usdc: .*memory.*\[environment\.memory\]$", memory_bytes=1 << 20)
+    expect(InputRefused, r"the limit of a stage is 100.*\[stage\.size\]$", file_bytes=100)
+
+
+def test_a_file_and_folders_that_usd_cannot_name_are_refused(tmp_path):
+    for name in ("\udcff.usda", "\udcff/a.usda"):
+        file = tmp_path / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("#usda 1.0")
+        with pytest.raises(InputRefused, match=r"not UTF-8.*\[paths\.name\]$"):
+            meshes_from_usd(file)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.validation.faults import FAULTS
 from usdbrdf.asset.schema import plugin_path
-from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.validate import RULES
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("omni") is None,

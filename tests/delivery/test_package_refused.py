@@ -8,8 +8,7 @@ from pxr import Sdf
 
 from tests.delivery.packing import CHAIR_FILE, edit, packed
 from usdbrdf.delivery.flat_stage import look_of, stage_in_look
-from usdbrdf.delivery.package import package
-from usdbrdf.delivery.usdz import write_usdz
+from usdbrdf.delivery.package import package, write_usdz
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.images import write_exr
 
@@ -99,10 +98,11 @@ def test_an_asset_of_which_nothing_is_measured_yet(synthetic, tmp_path):
 
 
 def test_a_file_in_the_place_of_the_folder(room, tmp_path):
-    with pytest.raises(
-        InputRefused, match=rf"a file\. Name the asset's folder, .*{room.asset.name}"
-    ):
-        package(room.asset.root_layer, tmp_path / "room.usdz")
+    with pytest.raises(InputRefused, match=r"Name the folder.*\[asset\.missing\]"):
+        package(room.asset.edits_layer, tmp_path / "room.usdz")
+    # The root layer stands for its folder, as on the command line.
+    found = package(room.asset.root_layer, tmp_path / "room.usdz")
+    assert found["bytes"] == (tmp_path / "room.usdz").stat().st_size
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,7 @@ from tests.delivery.packing import TIME, edit, extracted, members, packed, surfa
 from usdbrdf.cli import main
 from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.package import package
-from usdbrdf.delivery.packaged_files import texture_uses
-from usdbrdf.delivery.textures import encoded_data, size_within
+from usdbrdf.delivery.packaged_files import encoded_data, size_within, texture_uses
 from usdbrdf.files.images import image_size, write_exr
 from usdbrdf.options import PackageOptions
 from usdbrdf.validation.standard import standard_findings

@@ -11,8 +11,7 @@ import usdbrdf
 from tests.scenes import edited, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.correspondence import correspondence
-from usdbrdf.evaluation.relit import MapNames, matched, relit
+from usdbrdf.evaluation.compare_assets import MapNames, correspondence, matched, relit
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 
 

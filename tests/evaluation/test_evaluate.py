@@ -14,7 +14,7 @@ import usdbrdf
 from tests.scenes import MadeCapture, look_at, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.evaluation.pictures import write_plot
+from usdbrdf.evaluation.report import write_plot
 from usdbrdf.evaluation.truth import compare_with_truth, true_albedo
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.images import image_size, read_exr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.report import FILES, files_of, output_folder
 from usdbrdf.files.documents import read_json, write_json
@@ -53,7 +54,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path, content):
 def test_an_asset_is_no_place_for_results(tmp_path):
     with (
         pytest.raises(UsageError, match=r"\[evaluate.output\]"),
-        output_folder(tmp_path / "asset" / "out", DOCUMENT, (tmp_path / "asset",)),
+        output_folder(tmp_path / "asset" / "out", DOCUMENT, (Asset(tmp_path / "asset", "asset"),)),
     ):
         pass
     assert list(tmp_path.iterdir()) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.evaluation.pictures import change, magma, sheet
+from usdbrdf.evaluation.report import change, magma, sheet
 
 
 def test_magma_runs_from_black_to_pale_yellow():

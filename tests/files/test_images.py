@@ -289,10 +289,18 @@ def test_what_is_not_a_regular_file(tmp_path):
     (tmp_path / "folder.exr").mkdir()
     (tmp_path / "text.exr").write_text("not an image")
     (tmp_path / "dangling.exr").symlink_to("none")
-    names = ("fifo", "folder", "text", "dangling", "none", "x" * 300, "a\0b", "\udcff")
+    names = ("fifo", "folder", "text", "dangling", "none", "x" * 300, "a\0b", "\udcff", "\ud800")
     for name in names:
         with pytest.raises(ImageRefused, match=r"\[image\.unreadable\]$"):
             read_radiance(tmp_path / f"{name}.exr")
+
+
+def test_a_name_that_is_not_utf8_is_refused_though_the_file_is_there(tmp_path, radiance):
+    write_exr(tmp_path / "a.exr", radiance)
+    path = (tmp_path / "a.exr").rename(tmp_path / os.fsdecode(b"\xff.exr"))
+    for read in (read_radiance, read_exr, image_size):
+        with pytest.raises(ImageRefused, match=r"\[image\.unreadable\]$"):
+            read(path)
 
 
 @pytest.mark.parametrize("suffix", [".dng", ".CR2", ".nef"])
@@ -331,6 +339,94 @@ def test_limits(tmp_path, radiance):
     write_with_oiio(tmp_path / "b.exr", np.ones((2, 2, 65), np.float32), names)
     with pytest.raises(ImageRefused, match="65 channels"):
         read_exr(tmp_path / "b.exr")
+
+
+def test_what_is_made_is_limited_not_what_is_stored(tmp_path, radiance):
+    """373 bytes with one pixel in a display window of 16384 x 4096 would be made 768 MiB."""
+    path = tmp_path / "a.exr"
+    write_with_oiio(path, radiance[:1, :1], ("R", "G", "B"), "half", window=(0, 0, 16384, 4096))
+    assert path.stat().st_size < 500
+    for read in (read_radiance, read_exr, image_size):
+        with pytest.raises(ImageRefused, match=r"1 x 1 .* 16384 x 4096.*\[image\.limits\]$"):
+            read(path)
+    # A crop of a usual picture stays what it is.
+    write_with_oiio(path, radiance, ("R", "G", "B"), "half", window=(99, 50, 1920, 1080))
+    image = read_radiance(path)
+    assert image.shape == (1080, 1920, 3)
+    assert np.isfinite(image).all(axis=2).sum() == 24 * 40
+
+
+def test_too_little_memory_is_the_machine_s_fault(tmp_path):
+    """At whatever point it runs out, and however the decoder puts it."""
+    code = """
+import resource, sys
+from pathlib import Path
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.images import read_radiance
+path = Path(sys.argv[1])
+read_radiance(path)
+size = int(next(row for row in open("/proc/self/statm")).split()[0]) * resource.getpagesize()
+for more in (1, 16, 40, 64, 96, 110, 128):
+    resource.setrlimit(resource.RLIMIT_AS, (size + (more << 20), resource.RLIM_INFINITY))
+    try:
+        kept = read_radiance(path)
+        said = "read"
+    except EnvironmentFailure as error:
+        said = str(error)
+    print(more, said)
+"""
+    path = tmp_path / "a.exr"
+    write_exr(path, np.random.default_rng(0).random((3000, 3000, 3)).astype(np.float32))
+    search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    said = subprocess.run(
+        [sys.executable, "-c", code, str(path)],
+        env={**os.environ, "PYTHONPATH": search},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    rows = said.stdout.splitlines()
+    assert len(rows) == 7, said.stderr
+    told = [row for row in rows if row.endswith("[environment.memory]")]
+    assert len(told) >= 5, rows  # what was freed before may serve for the last ones
+    assert all(row.endswith((" read", "[environment.memory]")) for row in rows), rows
+
+
+@pytest.mark.parametrize("error", [SystemError, RuntimeError, IndexError, UnicodeDecodeError])
+def test_whatever_the_decoder_raises_is_a_refusal(tmp_path, monkeypatch, radiance, error):
+    """Damaged PIZ blocks have been seen to raise a SystemError."""
+    write_exr(tmp_path / "a.exr", radiance)
+    source = images._open(tmp_path / "a.exr", images.MAX_SIDE)
+
+    class Stumbling:
+        def __getattr__(self, name):
+            return getattr(source, name)
+
+        def read_image(self, *_):
+            raise error(*(("utf-8", b"", 0, 1, "x") if error is UnicodeDecodeError else ("boom",)))
+
+    monkeypatch.setattr(images, "_open", lambda path, max_side: Stumbling())
+    with pytest.raises(ImageRefused, match=r"truncated or damaged.*\[image\.truncated\]$"):
+        read_radiance(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("compression", ["piz", "dwaa", "b44"])
+def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compression):
+    path = tmp_path / "a.exr"
+    write_with_oiio(path, radiance, ("R", "G", "B"), "half", compression=compression)
+    whole = path.read_bytes()
+    generator = np.random.default_rng(4)
+    refused = 0
+    for _ in range(200):
+        content = bytearray(whole)
+        for place in generator.integers(300, len(whole), 6):
+            content[place] = generator.integers(256)
+        path.write_bytes(content)
+        try:
+            assert read_radiance(path).shape == (24, 40, 3)
+        except ImageRefused:
+            refused += 1
+    assert refused > 20
 
 
 @pytest.mark.parametrize("side", [15_000, 60_000, 1_000_000])

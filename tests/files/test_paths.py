@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from usdbrdf.errors import InputRefused
-from usdbrdf.files.paths import contained
+from usdbrdf.capture.transforms import path_in_capture
+from usdbrdf.errors import InputRefused, OwnershipConflict
+from usdbrdf.files.paths import contained, files_below, inside
+from usdbrdf.options import IngestOptions
 
 
 @pytest.fixture
@@ -58,6 +60,10 @@ def test_link_is_judged_by_its_target(root):
         "data:image/png;base64,AAAA",
         "\\\\server\\share\\x",
         "C:\\x.exr",
+        "x" * 5000,
+        "x/" * 2500,
+        "frames/" + "x" * 256,
+        "frames/\ud800.exr",
         "c:/x.exr",
         "out/secret",
         "leak.exr",
@@ -81,3 +87,41 @@ def test_absolute_path_inside_is_refused_too(root):
 def test_root_may_itself_be_a_link(root, tmp_path):
     (tmp_path / "link").symlink_to(root)
     assert contained(tmp_path / "link", "images/a.exr") == root / "images/a.exr"
+
+
+@pytest.mark.parametrize(("name", "allowed"), [("shared", True), ("shared-secret", False)])
+def test_what_is_allowed_is_a_folder_and_not_the_beginning_of_a_name(root, tmp_path, name, allowed):
+    for folder in ("shared", "shared-secret"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.exr").touch()
+    options = IngestOptions(allow_outside=(tmp_path / "shared",))
+    candidate = f"../{name}/a.exr"
+    if allowed:
+        assert path_in_capture(root, candidate, options) == tmp_path / name / "a.exr"
+    else:
+        with pytest.raises(InputRefused, match=r"\[paths\.outside\]$"):
+            path_in_capture(root, candidate, options)
+
+
+def test_links_that_stay_inside_are_written_through(root, tmp_path):
+    (root / "maps").symlink_to("images")
+    for place in (root, root / "maps", root / "maps/not there", root / "images/x"):
+        assert inside(root, place) == place
+    (tmp_path / "link").symlink_to(root)
+    assert inside(tmp_path / "link", tmp_path / "link/maps") == tmp_path / "link/maps"
+
+
+@pytest.mark.parametrize("name", ["out", "out/not there", "leak.exr", "images/../out"])
+def test_links_that_lead_out_are_not(root, name):
+    with pytest.raises(OwnershipConflict, match=r"leads out of .+\[ownership\.link\]$"):
+        inside(root, root / name)
+
+
+def test_what_systems_and_editors_leave_is_not_part_of_a_folder(tmp_path):
+    kept = ["a.json", "b/.hidden.exr", "b/c.exr", "notes.txt"]
+    litter = [".DS_Store", "b/.DS_Store", "b/._c.exr", "Thumbs.db", "a.json~", "desktop.ini"]
+    for name in (*kept, *litter, "own/d.exr"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = files_below(tmp_path, without=tmp_path / "own")
+    assert [path.relative_to(tmp_path).as_posix() for path in found] == kept

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -10,6 +15,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.job import scratch
 from usdbrdf.job.child import run_child
 
 CHILDREN = """
@@ -25,12 +31,23 @@ def die(arrays, parameters):
     print("about to die", file=sys.stderr, flush=True)
     os.kill(os.getpid(), getattr(signal, parameters["signal"]))
 
+def die_wordless(arrays, parameters):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
 def hang(arrays, parameters):
     grandchild = os.fork()
     if grandchild:
-        with open(parameters["note"], "w") as file:
-            file.write(str(grandchild))
-    time.sleep(60)
+        with open(parameters["note"] + ".part", "w") as file:
+            file.write(f"{os.getpid()} {grandchild}")
+        os.rename(parameters["note"] + ".part", parameters["note"])
+    time.sleep(600)
+
+def leave(arrays, parameters):
+    print("no memory for a thread", file=sys.stderr, flush=True)
+    os._exit(1)
+
+def imports(arrays, parameters):
+    import missing_library
 
 def refuse(arrays, parameters):
     raise InputRefused("mesh: no triangles. [mesh.empty]")
@@ -85,12 +102,81 @@ def test_kill_from_outside_is_the_environment(child):
         child("die", signal="SIGKILL")
 
 
-def test_hang_is_stopped_with_all_that_it_started(child, tmp_path):
-    started = time.monotonic()
-    with pytest.raises(InputRefused, match=r"did not end within 2 s.+\[child\.timeout\]"):
-        child("hang", timeout_s=2, note=str(tmp_path / "pid"))
-    assert time.monotonic() - started < 10
-    assert _ended(int((tmp_path / "pid").read_text()))
+def test_a_crash_without_words_has_none(child):
+    with pytest.raises(InputRefused) as refused:
+        child("die_wordless")
+    expected = "unwrap of <chair> crashed (SIGSEGV). Repair the input. [child.crashed]"
+    assert str(refused.value) == expected
+
+
+def test_a_child_that_cannot_start_is_the_environment(child):
+    with pytest.raises(EnvironmentFailure, match=r"status 1.+for a thread.+\[child\.start\]$"):
+        child("leave")
+    with pytest.raises(EnvironmentFailure, match=r"missing_library.+\[child\.start\]$"):
+        child("imports")
+
+
+def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):
+    """The clock starts when the child says that it hangs, however long its interpreter takes."""
+    note = tmp_path / "pids"
+    wait = subprocess.Popen.wait
+
+    def wait_once_it_hangs(process, timeout=None):
+        if timeout is not None:
+            _appears(note)
+        return wait(process, timeout)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", wait_once_it_hangs)
+    with pytest.raises(EnvironmentFailure, match=r"within 0\.2 s.+\[child\.timeout\]") as late:
+        child("hang", timeout_s=0.2, note=str(note))
+    assert late.value.exit_code == 4
+    assert all(_ended(int(pid)) for pid in note.read_text().split())
+
+
+def test_a_child_dies_with_its_parent_and_its_folder_is_swept(tmp_path, monkeypatch):
+    (tmp_path / "toy_children.py").write_text(CHILDREN)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    note = tmp_path / "pids"
+    code = (
+        "from usdbrdf.job.child import run_child\n"
+        f"run_child('toy_children:hang', {{}}, {{'note': {str(note)!r}}}, 600, 'hanging')"
+    )
+    search = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2]), *sys.path])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": search}
+    )
+    _appears(note)
+    (left,) = tmp_path.glob(f"{scratch.PREFIX}*")
+    os.utime(left, (0, 0))
+    child, grandchild = (int(pid) for pid in note.read_text().split())
+    try:
+        assert _sweeps(tmp_path) == {left}, "it has an owner"
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        assert _ended(child)
+        fresh = tmp_path / f"{scratch.PREFIX}fresh"
+        link = tmp_path / f"{scratch.PREFIX}link"
+        fresh.mkdir()
+        link.symlink_to(tmp_path)
+        assert _sweeps(tmp_path) == {fresh, link}, "one is too young to be without owner"
+    finally:
+        os.kill(grandchild, signal.SIGKILL)
+
+
+def _sweeps(folder):
+    """The scratch folders that the next run leaves."""
+    scratch._sweep.cache_clear()
+    with scratch.scratch_folder() as own:
+        return set(folder.glob(f"{scratch.PREFIX}*")) - {own}
+
+
+def _appears(path):
+    for _ in range(1200):
+        if path.exists():
+            return
+        time.sleep(0.1)
+    pytest.fail(f"{path} did not appear")
 
 
 def _ended(pid):
@@ -123,6 +209,30 @@ def test_bug_in_a_child_is_a_bug(child, name, what):
 def test_memory_limit(child):
     with pytest.raises(EnvironmentFailure, match=r"out of memory"):
         child("hungry", memory_limit_bytes=8 << 30)
+
+
+def test_a_memory_limit_above_that_of_the_shell_is_no_fault(child):
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (64 << 30, before[1]))
+    try:
+        assert child("double", {"x": np.ones(2)}, memory_limit_bytes=1 << 40, factor=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def test_a_child_imports_nothing_but_what_its_function_needs():
+    """What the package itself imports is left out here: a bare module stands for it."""
+    package = Path(__file__).parents[2] / "usdbrdf"
+    probe = (
+        "import sys, types\n"
+        "sys.modules['usdbrdf'] = types.ModuleType('usdbrdf')\n"
+        f"sys.modules['usdbrdf'].__path__ = [{str(package)!r}]\n"
+        "import usdbrdf.job.child\n"
+        "heavy = ('numba', 'pxr', 'mitsuba', 'trimesh', 'OpenImageIO', 'scipy')\n"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert said.stdout == "[]\n"
 
 
 def test_pickled_arrays_do_not_leave(child):

@@ -9,9 +9,11 @@ import pytest
 from pxr import Usd
 
 from tests.nondestruction.artist import EXPECTED, IN_SHOT, edit, in_shot, read
-from tests.nondestruction.conftest import bytes_of, convert
+from tests.nondestruction.conftest import COARSE, bytes_of, convert
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import open_edited, open_measured
+from usdbrdf.cli import main
+from usdbrdf.job.progress import set_quiet
 
 # Options that differ from the first run's, and the layers that come out otherwise because of them.
 RERUNS = {
@@ -100,12 +102,61 @@ def test_a_muted_layer_is_muted_for_the_edits_too(edited, run_again, name):
     assert read(stage) == read(open_measured(asset))
 
 
-def test_an_asset_whose_edits_cannot_be_read_is_still_measured(edited, capture, base):
-    """The pipeline does not open edits.usda at all."""
-    folder = base / "broken" / "room"
-    shutil.copytree(edited.folder, folder)
-    edits = folder / "edits.usda"
-    edits.write_text("#usda 1.0\nnot finished {")
-    asset = convert(capture, folder, "--fit", "paper")
-    assert edits.read_text() == "#usda 1.0\nnot finished {"
-    assert changed_layers(edited.folder, asset.folder) == {"material"}
+# Edits that USD cannot read, does not compose or crashes on
+
+NESTED = 200_000
+BROKEN = {
+    "typing error": "#usda 1.0\nnot finished {",
+    "missing sublayer": "#usda 1.0\n(\n    subLayers = [@./gone.usda@]\n)\n",
+    "nested": "#usda 1.0\n" + 'over "a" {\n' * NESTED + "}\n" * NESTED,
+}
+RUNS = [("typing error", run) for run in RERUNS] + [(kind, "ingest") for kind in list(BROKEN)[1:]]
+
+
+@pytest.fixture
+def broken(edited, base):
+    """A copy of the asset, as far from the capture as the others, with such edits."""
+    made = []
+
+    def with_edits(kind: str) -> Path:
+        folder = base / f"broken_{len(made)}_{kind.replace(' ', '_')}" / "room"
+        made.append(folder.parent)
+        shutil.copytree(edited.folder, folder)
+        (folder / "edits.usda").write_text(BROKEN[kind])
+        return folder
+
+    yield with_edits
+    for folder in made:
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(("kind", "run"), RUNS)
+def test_edits_that_cannot_be_read_change_nothing_of_what_is_measured(
+    capture, run_again, broken, capsys, kind, run
+):
+    folder = broken(kind)
+    set_quiet(False)
+    options = [option for option in COARSE if option != "-q"] + RERUNS[run][0]
+    assert main(["convert", str(capture), "-o", str(folder), *options]) == 0
+    assert "warning: " in (said := capsys.readouterr().err)
+    assert "edits.usda" in said
+    assert (folder / "edits.usda").read_text() == BROKEN[kind]
+    for part in ("layers", "textures", "previews"):
+        assert bytes_of(folder / part) == bytes_of(run_again(run).folder / part)
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_needs_such_edits_says_so_in_a_sentence(broken, tmp_path, capfd, kind):
+    folder = broken(kind)
+    calls = {
+        "validate": ["validate", str(folder)],
+        "package": ["package", str(folder), "-o", str(tmp_path / "room.usdz")],
+        "relight": ["relight", str(folder), "-o", str(tmp_path / "room.exr")],
+    }
+    for name, call in calls.items():
+        expected = 7 if name == "validate" and kind != "nested" else 3
+        assert main(call) == expected, (name, capfd.readouterr())
+        out, err = capfd.readouterr()
+        assert "edits.usda" in out + err
+        assert "Traceback" not in out + err
+    assert not list(tmp_path.iterdir())

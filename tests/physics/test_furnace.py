@@ -37,10 +37,13 @@ def _somewhere_bright(world: World) -> np.ndarray:
     return world.per_object([(1, 1, 1)] * 5 + [(100, 100, 100)] + [(1, 1, 1)] * 6)
 
 
-def _shade(world: World, lights: np.ndarray, estimator: str, rays: int) -> Irradiance:
+def _shade(
+    world: World, lights: np.ndarray, estimator: str, rays: int, lit: np.ndarray | None = None
+) -> Irradiance:
+    lit = _lit(world) if lit is None else lit
     order, tile = tiles_of_texels(world.texels)
     found = irradiance_at(
-        world.rays, world.texture(_lit(world)), world.lights(lights), black_environment(),
+        world.rays, world.texture(lit), world.lights(lights), black_environment(),
         world.texels.position[order], world.texels.normal[order], tile,
         Sampling(estimator=estimator, standard_error=0.0, max_rays=rays, seed=1), world.size,
     )  # fmt: skip
@@ -107,11 +110,17 @@ def test_the_furnace_is_a_fixed_point_of_emission_plus_reflection(furnace: World
     area = furnace.texels.area / furnace.texels.area.sum()
     mean = area @ found.mean
     np.testing.assert_allclose(EMITTED + RHO * mean / np.pi, L, rtol=2e-3)
-    # ... and the one that iterating reaches from darkness: L_k = L (1 - rho^k).
-    lit = np.zeros(3)
-    for _ in range(60):
-        lit = EMITTED + RHO * lit * (mean / (np.pi * L))
-    np.testing.assert_allclose(lit, L, rtol=1e-2)
+
+
+def test_bounce_by_bounce_the_furnace_fills_from_darkness(furnace: World):
+    # L_k = Le + rho S(L_k-1) / pi = L (1 - rho^k), where every S comes out of the estimator.
+    area = (furnace.texels.area / furnace.texels.area.sum())[:, None]
+    lit = np.zeros((len(furnace.texels), 3), np.float32)
+    for bounces in range(1, 9):
+        found = _shade(furnace, _somewhere_bright(furnace), "mis", 256, lit)
+        lit = (EMITTED + RHO * found.mean / np.pi).astype(np.float32)
+        mean = (area * lit).sum(axis=0)
+        np.testing.assert_allclose(mean, L * (1 - RHO**bounces), rtol=2e-3)
 
 
 def test_the_albedo_of_the_reflected_part_comes_back(furnace: World):

@@ -15,7 +15,7 @@ from tests.relighting.conftest import BASE
 from tests.relighting.scenes import MATTE, looking, material, photograph, plate
 from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_file
 from usdbrdf.cli import main
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import Surface
@@ -23,6 +23,7 @@ from usdbrdf.options import Insert
 from usdbrdf.relighting.inserted_models import surfaces_from_model
 from usdbrdf.relighting.relit_scene import relit_scene
 from usdbrdf.relighting.render import mitsuba_variant
+from usdbrdf.untrusted import bounds
 
 
 def _box() -> Any:
@@ -87,6 +88,68 @@ def test_a_damaged_model_is_refused_in_a_sentence(tmp_path: Path) -> None:
         (tmp_path / name).write_text("nonsense")
         with pytest.raises(InputRefused, match=rf"{name}.*\[.*\]$"):
             surfaces_from_model(tmp_path / name)
+
+
+def test_normals_of_the_file_are_taken_and_others_made(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 3 4\nf 1//1 2//1 3//1\n")
+    (given,) = surfaces_from_model(tmp_path / "a.obj")
+    assert given.corner_normals == pytest.approx(np.tile([0, 0.6, 0.8], (1, 3, 1)))
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (made,) = surfaces_from_model(tmp_path / "a.obj")
+    assert made.corner_normals == pytest.approx(np.tile([0, 0, 1], (1, 3, 1)))
+
+
+def test_what_a_model_names_stays_beside_it(tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    secret = tmp_path / "red.mtl"
+    secret.write_text("newmtl red\nKd 0.8 0.2 0.1\n")
+    rows = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n"
+    model = folder / "a.obj"
+    (folder / "link.mtl").symlink_to(secret)
+    for name in ("../red.mtl", str(secret), "link.mtl", "file:///etc/passwd"):
+        model.write_text(f"mtllib {name}\n{rows}")
+        with pytest.raises(InputRefused, match=r"\[paths\.outside\]$"):
+            surfaces_from_model(model)
+    # Where a picture was when it was exported says nothing, if it came along.
+    (folder / "red.mtl").write_text(secret.read_text())
+    model.write_text(f"mtllib C:\\work\\red.mtl\n{rows}")
+    (found,) = surfaces_from_model(model)
+    assert found.material.diffuse.ravel() == pytest.approx([0.8, 0.2, 0.1], abs=0.003)
+    model.write_text(f"mtllib missing.mtl\n{rows}")
+    (found,) = surfaces_from_model(model)
+    assert len(found.triangles) == 1
+
+
+def test_models_are_read_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _box().export(tmp_path / "box.ply")
+    for limits, kind, rule in (
+        (bounds.Limits(100, 60, 64 << 30), InputRefused, "mesh.size"),
+        (bounds.Limits(1 << 20, 0.01, 64 << 30), EnvironmentFailure, "child.timeout"),
+        (bounds.Limits(1 << 20, 60, 1 << 20), EnvironmentFailure, "environment.memory"),
+    ):
+        monkeypatch.setitem(bounds.LIMITS, "mesh", limits)
+        with pytest.raises(kind, match=rf"box\.ply: .*\[{rule}\]$"):
+            surfaces_from_model(tmp_path / "box.ply")
+
+
+def test_usd_of_others_is_read_behind_the_boundary(tmp_path: Path, stage: RenderScene) -> None:
+    """Asset paths and units are looked at first; a folder can be allowed."""
+    (tmp_path / "lib").mkdir()
+    write_exr(tmp_path / "lib" / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
+    (tmp_path / "in").mkdir()
+    thing = tmp_path / "in" / "thing.usda"
+    thing.write_text(_USD.replace("@glow.exr@", "@../lib/glow.exr@"))
+    with pytest.raises(InputRefused, match=r"'\.\./lib/glow\.exr' leads out.*\[paths\.outside\]$"):
+        _inserted(thing, stage)
+    insert = [Insert(model=thing)]
+    allowed = {"keep_emitters": False, "eye_height": 2.0, "allow_outside": (tmp_path / "lib",)}
+    found = relit_scene(stage, thing, insert, **allowed).surfaces[len(stage.surfaces) :]
+    assert [surface.material.emits for surface in found].count(True) == 2
+    for good, bad in (("= 0.1", "= nan"), ("= 0.1", "= -1"), ('"Y"', '"X"')):
+        thing.write_text(_USD.replace(good, bad, 1))
+        with pytest.raises(InputRefused, match=r"thing\.usda: .*\[stage\.units\]$"):
+            _inserted(thing, stage)
 
 
 def _inserted(model: Path, stage: RenderScene, **how: Any) -> tuple[Surface, ...]:

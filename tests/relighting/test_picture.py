@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.relighting.picture import automatic_exposure, exposure_levels
+from usdbrdf.relighting.relight import automatic_exposure, exposure_levels
 
 
 def test_the_levels_of_a_large_picture_are_few_and_tell_the_same() -> None:

@@ -60,7 +60,7 @@ def _scalar(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _choose(monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
     # By its module: usdbrdf.relight is the function.
-    module = sys.modules[RelightOptions.__module__]
+    module = sys.modules[relight.__module__]
     monkeypatch.setattr(module, "mitsuba_variant", partial(mitsuba_variant, variant))
 
 
@@ -249,7 +249,7 @@ def test_what_stands_in_the_place_of_the_output_is_refused_before_rendering(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(sys.modules[RelightOptions.__module__], "render_view", None)
+    monkeypatch.setattr(sys.modules[relight.__module__], "render_view", None)
     folder, file = tmp_path / "d.exr", tmp_path / "file"
     folder.mkdir()
     file.write_text("mine")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from usdbrdf.shading.clipped_groups import clipped_groups
 
 from tests.physics.surfaces import World, quad, room, world_of
+from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.shading.clipped_light import clipped_groups
 
 WALL, LAMP = 2, 6
 BOUND = 3.0
@@ -30,7 +31,7 @@ def _groups(world: World, lit: np.ndarray, clipped: np.ndarray, unseen=()):
     seen[list(unseen)] = False
     over = np.zeros(len(lit), bool)
     over[clipped] = True
-    return clipped_groups(world.texels, lit, seen, over)
+    return clipped_groups(world.texels, lit, CoverageMap.of(seen, over))
 
 
 def test_nothing_clipped_is_no_group(world: World):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 import numpy as np
@@ -14,8 +13,9 @@ from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.command_parser import parsed
+from usdbrdf.commands import COMMANDS
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.options import add_shade_options
 
 OPTIONS = usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64))
 
@@ -40,9 +40,8 @@ def _shaded(asset: Asset) -> tuple[bool, str, str]:
 
 
 def test_the_option_is_auto_by_default():
-    parser = argparse.ArgumentParser()
-    add_shade_options(parser)
-    assert parser.parse_args([]).denoise == usdbrdf.ShadeOptions().denoise == "auto"
+    chosen = parsed(["shade", "room"], COMMANDS)
+    assert chosen.shade.denoise == usdbrdf.ShadeOptions().denoise == "auto"
 
 
 def test_the_asset_says_what_was_done_and_is_shaded_again_when_the_filter_appears(

@@ -17,8 +17,7 @@ from tests.validation.faults import (
 )
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Severity
-from usdbrdf.validation.rules import RULES
-from usdbrdf.validation.validate import own_findings, validate
+from usdbrdf.validation.validate import RULES, own_findings, validate
 
 BY_NAME = {rule.name: rule for rule in RULES}
 

@@ -11,8 +11,8 @@ from pxr import Sdf, Usd, UsdValidation
 from tests.validation.faults import FAULTS
 from usdbrdf.asset.schema import validators_path
 from usdbrdf.cli import main
-from usdbrdf.validation.rules import RULES
 from usdbrdf.validation.usd_plugin import PLUGIN, plug_info
+from usdbrdf.validation.validate import RULES
 
 pytestmark = pytest.mark.skipif(
     not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"),

@@ -11,7 +11,8 @@ from pathlib import Path
 from pxr import Sdf, Tf, UsdUtils
 
 from usdbrdf.asset.layout import Asset, relative_path
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.asset.readers.compose import try_in_child
+from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import temporary_beside
 
 _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
@@ -38,6 +39,18 @@ def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     for path, target in zip(layers, adopted, strict=True):
         _adopt_layer(path, target, asset, copies)
     return [*adopted, *copies.values()]
+
+
+def is_damaged(path: Path) -> bool:
+    """Whether a file is a binary layer that USD cannot read, which is nobody's edit; in text, that
+    may be an artist's slip. What it refers to need not be there."""
+    if path.suffix != ".usdc":
+        return False
+    try:
+        try_in_child(path, composes=False)
+        return not Sdf.Layer.OpenAsAnonymous(str(path))
+    except (InputRefused, Tf.ErrorException):
+        return True
 
 
 def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, Path]) -> None:
@@ -73,7 +86,7 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
 
 def _taken(asset: Asset, number: int) -> bool:
     stem = asset.folder / f"adopted-{number}"
-    return stem.exists() or stem.with_suffix(".usda").exists()
+    return os.path.lexists(stem) or os.path.lexists(stem.with_suffix(".usda"))
 
 
 def _copy(source: Path, target: Path) -> None:

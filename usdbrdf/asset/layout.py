@@ -9,8 +9,9 @@ from pathlib import Path
 
 from pxr import Sdf, Tf
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
+from usdbrdf.job.stamp import read_stamp, stamp_path
 
 # The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
@@ -35,8 +36,21 @@ class Asset:
                 f"{str(folder)!r}: the name of the folder, or of one above it, holds characters "
                 "that USD cannot store in a path. Choose another folder. [stage.asset_path]"
             )
-        made_with = _default_prim(folder / "layers" / "scan.usdc")
+        made_with = _default_prim(folder / "layers" / "scan.usdc") or _recorded_name(folder)
         return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
+
+    @staticmethod
+    def made(place: Path) -> Asset:
+        """The asset of a folder, or of the root layer in it; InputRefused where there is none."""
+        place = Path(place)
+        asset = Asset.at(place.parent if place.is_file() else place)
+        root = asset.root_layer
+        if not root.is_file() or (place.is_file() and not place.samefile(root)):
+            raise InputRefused(
+                f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or "
+                "the NAME.usda in it. [asset.missing]"
+            )
+        return asset
 
     @property
     def root_layer(self) -> Path:
@@ -65,6 +79,14 @@ class Asset:
         """Path of a task's layer; ``role`` is one of ``ROLES``."""
         suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
         return self.folder / "layers" / f"{role}{suffix[role]}"
+
+    def refuse_output(self, output: Path, rule: str) -> None:
+        """UsageError for a place inside the folder: what reads an asset leaves it as it is."""
+        if output.resolve().is_relative_to(self.folder.resolve()):
+            raise UsageError(
+                f"{output}: lies inside the asset {self.folder}, which stays as it is. Name "
+                f"another place with -o. [{rule}]"
+            )
 
     def texture(self, identifier: str, aov: str) -> str:
         """Path of an object's map, relative to the asset folder."""
@@ -126,3 +148,10 @@ def _default_prim(layer: Path) -> str:
     except Tf.ErrorException:
         return ""
     return str(opened.defaultPrim) if opened else ""
+
+
+def _recorded_name(folder: Path) -> str:
+    """The name that ingest gave the root layer, where scan.usdc is damaged or gone."""
+    stamp = read_stamp(stamp_path(folder, 1, "ingest"))
+    roots = {Path(name) for name in (stamp.once if stamp else ())} - {Path("edits.usda")}
+    return next((path.stem for path in sorted(roots) if path.parent == Path()), "")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames
@@ -20,9 +20,6 @@ _MAX_WIDTH = 640
 
 # The camera is chosen among this many frames, by about this many rays through each.
 _CANDIDATES, _RAYS = 64, 2000
-
-# Automatic exposure: this share of the surface's pixels comes out below this linear value.
-_PERCENTILE, _SHOWN_AS = 90, 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +38,7 @@ class Overview:
         texture = surface_texture(texels, self.scene.face_object, values)
         shown = texture.at(self.hits.face, self.hits.u, self.hits.v)
         if exposure is None:
-            exposure = _exposure(shown[self.hits.face >= 0])
+            exposure = display_exposure(shown[self.hits.face >= 0].mean(axis=1))
         picture = shown.reshape(self.height, self.width, 3)
         write_preview_png(path, to_display_srgb8(picture, exposure_scale=exposure))
 
@@ -75,8 +72,3 @@ def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int)
     """First surfaces behind the frame's pixels, were it ``width`` x ``height`` pixels."""
     camera = frames.camera(i).at_size(width, height)
     return rays.closest(*camera.rays(camera.pixels()))
-
-
-def _exposure(surface: Float) -> float:
-    level = float(np.percentile(surface.mean(axis=1), _PERCENTILE)) if len(surface) else 0.0
-    return _SHOWN_AS / level if level > 0 else 1.0

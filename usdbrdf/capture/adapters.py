@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from usdbrdf.capture.formats import DESCRIPTIONS, MODULES
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
+from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
+from usdbrdf.untrusted.plugins import problem_of_plugin
 
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan
@@ -103,17 +105,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
 
 def _loaded(point: EntryPoint) -> Adapter:
-    try:
-        module: Any = point.load()
-        missing = [
-            name
-            for name, kind in (("NAME", str), ("DESCRIPTION", str))
-            if not isinstance(getattr(module, name, None), kind)
-        ] + [name for name in ("matches", "read") if not callable(getattr(module, name, None))]
-        problem = f"it has no {', '.join(missing)}" if missing else ""
-    # Foreign code runs here and may raise anything, SystemExit included.
-    except (Exception, SystemExit) as error:
-        module, problem = None, f"{type(error).__name__}: {error}"
+    module, problem = _imported(point)
     if problem:
         say(
             f"warning: adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]"
@@ -128,6 +120,23 @@ def _loaded(point: EntryPoint) -> Adapter:
         module=cast(AdapterModule, module),
         package="" if point.dist is None else _name_of(point.dist),
     )
+
+
+def _imported(point: EntryPoint) -> tuple[Any, str]:
+    """Another package's module and "", or None and why it cannot be used."""
+    if problem := problem_of_plugin(point):
+        return None, problem
+    try:
+        module = point.load()
+    # What went well in a child may still raise here, SystemExit included.
+    except (Exception, SystemExit) as error:
+        return None, f"{type(error).__name__}: {error}"
+    missing = [
+        name
+        for name, kind in (("NAME", str), ("DESCRIPTION", str))
+        if not isinstance(getattr(module, name, None), kind)
+    ] + [name for name in ("matches", "read") if not callable(getattr(module, name, None))]
+    return module, f"it has no {', '.join(missing)}" if missing else ""
 
 
 def _name_of(package: Distribution) -> str:
@@ -165,6 +174,8 @@ def _recognising(path: Path, adapters: tuple[Adapter, ...]) -> Adapter:
 def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     """What a chosen adapter makes of a capture."""
     assert adapter.module is not None
+    for named in (path, options.mesh, options.objects):
+        refuse_nameless(named)
     try:
         return adapter.module.read(path, options)
     except UsdBrdfError:

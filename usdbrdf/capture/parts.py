@@ -28,7 +28,7 @@ from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import mesh_from_file
-from usdbrdf.untrusted.usd_meshes import meshes_from_usd
+from usdbrdf.untrusted.usd_files import meshes_from_usd
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,15 +63,17 @@ def geometry_from_usd(
         raise InputRefused(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
-    found = meshes_from_usd(
-        path,
-        crease_angle_deg=options.crease_angle_deg,
-        allow=(capture_root, *options.allow_outside),
-    )
+    found = meshes_from_usd(path, allow=(capture_root, *options.allow_outside))
     for sentence in found.warnings:
         findings.warn(sentence)
+    mesh = found.mesh
+    missing = np.isnan(mesh.corner_normals[:, 0, 0])
+    if missing.any():
+        mesh.corner_normals[missing] = corner_normals(
+            mesh.points, mesh.triangles[missing], options.crease_angle_deg
+        )
     return ScanGeometry(
-        mesh=found.mesh,
+        mesh=mesh,
         objects=tuple(
             ObjectLabel(identifier=identifier, label=label)
             for identifier, label in zip(

@@ -42,16 +42,6 @@ def stage_in_look(asset: Asset, look: str | None = None) -> Usd.Stage:
     Raises UsageError for a look that it has not, and InputRefused for layers that lie elsewhere
     than in the asset's folder, but for the captured geometry that the scan layer refers to.
     """
-    if asset.folder.is_file():
-        raise InputRefused(
-            f"{asset.folder}: this is a file. Name the asset's folder, {asset.folder.parent}. "
-            "[asset.missing]"
-        )
-    if not asset.root_layer.is_file():
-        raise InputRefused(
-            f"{asset.folder}: there is no asset in this folder. Name the folder that usdbrdf "
-            "convert wrote. [asset.missing]"
-        )
     stage = open_edited(asset)
     _refuse_foreign_layers(stage, asset)
     looks = stage.GetDefaultPrim().GetVariantSet(VARIANT_SET)

@@ -22,7 +22,7 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual.material import PBRMaterial
 
-from usdbrdf.delivery.textures import encoded_colour, encoded_data, size_within
+from usdbrdf.delivery.packaged_files import encoded_colour, encoded_data, size_within
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.images import resized

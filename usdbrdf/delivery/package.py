@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom
 
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.flat_stage import (
     fit_for_arkit,
@@ -23,22 +26,28 @@ from usdbrdf.delivery.flat_stage import (
 )
 from usdbrdf.delivery.glb import write_glb
 from usdbrdf.delivery.packaged_files import (
+    EXR,
+    PNG,
     NewTexture,
+    PictureOptions,
+    add_file,
+    add_texture,
     file_in_asset,
     other_files,
     replace_files,
     texture_uses,
     use_texture,
 )
-from usdbrdf.delivery.textures import EXR, PNG, PictureOptions, add_file, add_texture
-from usdbrdf.delivery.usdz import write_usdz
-from usdbrdf.errors import OwnershipConflict, UsageError
-from usdbrdf.files.atomic import environment_failures
-from usdbrdf.job.progress import say
+from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsageError, UsdBrdfError
+from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.job.progress import warn
+from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions
-from usdbrdf.relighting.insert import turned_up
 
 USDZ, GLB = ".usdz", ".glb"
+
+# A zip archive stores local times; one and the same, so that equal content is equal bytes.
+_PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)
 
 ARKIT = "arkit"
 
@@ -53,8 +62,8 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     files outside of its folder.
     """
     options = options or PackageOptions()
-    textures = _texture_options(output, folder, options)
-    asset = Asset.at(folder)
+    asset = Asset.made(folder)
+    textures = _texture_options(output, asset, options)
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
@@ -71,7 +80,7 @@ def _write_usdz(
     output: Path, flat: Usd.Stage, asset: Asset, textures: PictureOptions, options: PackageOptions
 ) -> dict[str, Any]:
     if options.profile == ARKIT:
-        fit_for_arkit(flat, _warn)
+        fit_for_arkit(flat, warn)
     with TemporaryDirectory(prefix="usdbrdf-package-") as name:
         folder = Path(name)
         packed = _add_textures(flat, asset, folder, textures)
@@ -91,13 +100,12 @@ def _write_glb(
 ) -> dict[str, Any]:
     texture_uses(flat, asset)  # refuses what lies outside
     take_materials_literally(flat)
-    time = Usd.TimeCode.EarliestTime()
     turn = turned_up(str(UsdGeom.GetStageUpAxis(flat)), "Y")
     subject = asset.root_layer
     if lights := lights_of(flat):
-        _warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
-    surfaces = [s.moved(turn) for s in surfaces_from_stage(flat, time, _warn, subject)]
-    return write_glb(output, surfaces, textures.max_size, _warn)
+        warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
+    surfaces = surfaces_from_stage(flat, Usd.TimeCode.EarliestTime(), warn, subject)
+    return write_glb(output, [s.moved(turn) for s in surfaces], textures.max_size, warn)
 
 
 @contextmanager
@@ -125,7 +133,7 @@ def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: PictureO
     return {new.path for new in done.values()}
 
 
-def _texture_options(output: Path, folder: Path, options: PackageOptions) -> PictureOptions:
+def _texture_options(output: Path, asset: Asset, options: PackageOptions) -> PictureOptions:
     """Everything that can be refused before the asset is opened."""
     suffix = output.suffix.lower()
     if suffix not in (USDZ, GLB):
@@ -140,14 +148,48 @@ def _texture_options(output: Path, folder: Path, options: PackageOptions) -> Pic
         )
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")
-    if output.resolve().is_relative_to(folder.resolve()):
-        raise UsageError(
-            f"{output}: lies inside the asset {folder}, which stays as it is. Name another place "
-            "with -o. [package.output]"
-        )
+    asset.refuse_output(output, "package.output")
     chosen = options.textures or (PNG if eight_bit else EXR)
     return PictureOptions(format=chosen, max_size=options.max_size)
 
 
-def _warn(sentence: str) -> None:
-    say(f"warning: {sentence}")
+def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
+    """Pack files of a folder, the root layer first; opened and checked before it gets its name.
+
+    Exactly these are packed: USD's own packager also takes whatever a layer happens to name.
+    """
+    pinned = time.mktime(_PINNED_TIME)
+    with temporary_beside(path) as staged:
+        try:
+            writer = Sdf.ZipFileWriter.CreateNew(str(staged))
+            for member in members:
+                os.utime(folder / member, (pinned, pinned))
+                writer.AddFile(str(folder / member), member)
+            done = writer.Save()
+        except Tf.ErrorException as error:
+            raise EnvironmentFailure(
+                f"{path}: the package could not be written ({in_one_line(error)}). Free disk space "
+                "or correct the permission. [package.write]"
+            ) from error
+        if not done or not staged.is_file():
+            raise EnvironmentFailure(
+                f"{path}: the package could not be written. Free disk space or correct the "
+                "permission. [package.write]"
+            )
+        _check_package(staged, path)
+        publish(staged, path)
+
+
+def _check_package(staged: Path, path: Path) -> None:
+    stage = Usd.Stage.Open(str(staged))
+    problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
+    for prim in stage.TraverseAll():
+        for attribute in prim.GetAuthoredAttributes():
+            value = attribute.Get()
+            if isinstance(value, Sdf.AssetPath) and value.path and not value.resolvedPath:
+                problems.append(f"<{attribute.GetPath()}> finds no {value.path}")
+    if problems:
+        raise UsdBrdfError(
+            f"{path}: the package does not compose: {problems[0]}. This is a defect of usdbrdf; "
+            "please report it. [package.composition]"
+        )

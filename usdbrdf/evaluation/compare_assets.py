@@ -3,20 +3,64 @@ other? (paper, section 4.2, Fig. 5 and 6)"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.previews import camera_hits
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.relit import MapNames, Relit, errors, matched, relit, write_pictures
-from usdbrdf.evaluation.report import FILES, files_of, output_folder, table_text
+from usdbrdf.evaluation.metrics import MapError, map_error
+from usdbrdf.evaluation.report import (
+    FILES,
+    Row,
+    files_of,
+    magma,
+    output_folder,
+    sheet,
+    table_text,
+)
+from usdbrdf.evaluation.truth import MIN_SAMPLES
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.documents import write_json
-from usdbrdf.job.progress import say
+from usdbrdf.files.images import write_preview_png
+from usdbrdf.job.progress import progress, warn
+from usdbrdf.model.arrays import Bool, Byte, Float, Int
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.texels import Texels
+from usdbrdf.transport.rays import Hits, RayScene
+from usdbrdf.transport.surface_texture import surface_texture
 
 DOCUMENT = "comparison.json"
+
+# Points of two assets this close are the same, as a share of the scene's size.
+_SAME_POINT = 1e-5
+
+# On meshes that differ, a texel may be this many texels away.
+_REACH = 2.0
+
+# Sheets of pictures, at most, and pixels across each of their pictures.
+_CAMERAS, _MAX_WIDTH = 4, 480
+
+# Errors of this share of the reference, or more, are shown palest.
+_FULL_ERROR = 0.25
+
+
+class MapNames(NamedTuple):
+    """Which maps are the diffuse radiance, the irradiance and the albedo."""
+
+    radiance: str
+    irradiance: str
+    albedo: str
+
 
 # As textured, and after the specular light was taken out of it.
 _SETS = {
@@ -38,7 +82,7 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
     Raises UsdBrdfError; ``output`` is then as it was.
     """
     (place_a, a), (place_b, b) = measured_atlas(Path(first)), measured_atlas(Path(second))
-    with output_folder(Path(output), DOCUMENT, (place_a.folder, place_b.folder)) as work:
+    with output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
         sets = {key: maps for key, maps in _SETS.items() if _in_both(a, b, maps)}
         forth, back = matched(a, b), matched(b, a)
         if not (forth[1].any() and back[1].any()):
@@ -48,16 +92,17 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
             )
         for name, same in ((place_a.name, forth[0]), (place_b.name, back[0])):
             if same.missing:
-                say(f"warning: only {name} has {', '.join(same.missing)}. [compare.objects]")
+                warn(f"only {name} has {', '.join(same.missing)}. [compare.objects]")
         found: dict[str, Any] = {
             "assets": [place_a.name, place_b.name],
             "texels": int(forth[1].sum()),
             "missing": [list(forth[0].missing), list(back[0].missing)],
         }
-        rows: list[dict[str, Any]] = []
+        rows: list[Row] = []
         for key, maps in sets.items():
             pair = relit(a, b, *forth, maps), relit(b, a, *back, maps)
-            found[key] = _figures(*pair)
+            errors = _errors(*pair, forth[1], back[1])
+            found[key] = {name: error._asdict() for name, error in errors.items()}
             rows += _object_rows(key, *pair)
         write_text_atomic(work / "comparison.csv", table_text(rows))
         write_pictures(work / "pictures", *pair, frames_from_stage(a.stage))
@@ -89,39 +134,254 @@ def _percent(value: float | None) -> str:
 
 
 def _in_both(a: AssetMaps, b: AssetMaps, maps: MapNames) -> bool:
-    return all(x.has(name) for x in (a, b) for name in vars(maps).values())
+    return all(x.has(name) for x in (a, b) for name in maps)
 
 
-def _figures(forth: Relit, back: Relit) -> dict[str, Any]:
+def _errors(forth: Relit, back: Relit, own: Bool, theirs: Bool) -> dict[str, MapError]:
+    """Over some texels of A (T,), and of B (T',)."""
     return {
-        "albedo": errors(forth.albedo, forth.other_albedo, forth.atlas.texels.area, forth.scored),
-        **{
-            name: errors(r.measured, r.predicted, r.atlas.texels.area, r.scored)
-            for name, r in (("relit_a", forth), ("relit_b", back))
-        },
+        "albedo": forth.albedo_error(own),
+        "relit_a": forth.radiance_error(own),
+        "relit_b": back.radiance_error(theirs),
     }
 
 
-def _object_rows(key: str, forth: Relit, back: Relit) -> list[dict[str, Any]]:
-    """The same per object of A; B's object is the one of the same identifier."""
+def _object_rows(key: str, forth: Relit, back: Relit) -> list[Row]:
+    """Errors per object of A; B's object is the one of the same identifier."""
     owner, other = forth.atlas.texels.object_index(), back.atlas.texels.object_index()
     theirs = [obj.identifier for obj in back.atlas.scene.objects]
-    rows = []
+    rows: list[Row] = []
     for i, obj in enumerate(forth.atlas.scene.objects):
         own = forth.scored & (owner == i)
-        if not own.any():
-            continue
-        area = forth.atlas.texels.area
-        row: dict[str, Any] = {"maps": key, "object": obj.identifier, "texels": int(own.sum())}
-        figures = {
-            "albedo": errors(forth.albedo, forth.other_albedo, area, own),
-            "relit_a": errors(forth.measured, forth.predicted, area, own),
-        }
-        if obj.identifier in theirs:
-            part = back.scored & (other == theirs.index(obj.identifier))
-            figures["relit_b"] = errors(back.measured, back.predicted, back.atlas.texels.area, part)
-        for name in ("albedo", "relit_a", "relit_b"):
-            for metric in ("nrmse", "median_abs_relative"):
-                row[f"{name}_{metric}"] = figures.get(name, {}).get(metric)
-        rows.append(row)
+        if own.any():
+            j = theirs.index(obj.identifier) if obj.identifier in theirs else -1
+            row: dict[str, Any] = {"maps": key, "object": obj.identifier, "texels": int(own.sum())}
+            for name, error in _errors(forth, back, own, back.scored & (other == j)).items():
+                row[f"{name}_nrmse"] = error.nrmse
+                row[f"{name}_median_abs_relative"] = error.median_abs_relative
+            rows.append(row)
     return rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relit:
+    """On the texels of one asset, (T, 3) each: its radiance, the radiance predicted with the other
+    asset's albedo, both albedos; the texels that are compared, (T,) bool."""
+
+    atlas: AssetMaps
+    measured: Float
+    predicted: Float
+    albedo: Float
+    other_albedo: Float
+    scored: Bool
+
+    def albedo_error(self, part: Bool) -> MapError:
+        """Of the other asset's albedo against this one's, over the texels of ``part``."""
+        return map_error(self.other_albedo, self.albedo, self.atlas.texels.area, part)
+
+    def radiance_error(self, part: Bool) -> MapError:
+        """Of the predicted radiance against the measured one, over the texels of ``part``."""
+        return map_error(self.predicted, self.measured, self.atlas.texels.area, part)
+
+
+def matched(atlas: AssetMaps, other: AssetMaps) -> tuple[Correspondence, Bool]:
+    """The other asset's texels on those of ``atlas``, and which are compared: (T,) bool, seen at
+    least three times, inside a triangle and without emission, in both."""
+    same = correspondence(atlas.scene, atlas.texels, other.scene, other.texels)
+    there = np.asarray(same.nearest(_comparable(other)), np.bool_)
+    return same, _comparable(atlas) & there & same.known()
+
+
+def relit(
+    atlas: AssetMaps, other: AssetMaps, same: Correspondence, scored: Bool, maps: MapNames
+) -> Relit:
+    """Predict the radiance of ``atlas`` with the albedo of ``other``."""
+    theirs = same.interpolated(other.map_where_present(maps.albedo, 3))
+    measured = atlas.map_where_present(maps.radiance, 3)
+    reflected = atlas.map(maps.irradiance) * theirs / np.pi
+    # Lamps are given: what is predicted is what they light.
+    emits = atlas.map_where_present("emission", 3).any(axis=1, keepdims=True)
+    return Relit(
+        atlas=atlas,
+        measured=measured,
+        predicted=np.where(emits, measured, reflected).astype(np.float32),
+        albedo=atlas.map_where_present(maps.albedo, 3),
+        other_albedo=theirs,
+        scored=scored,
+    )
+
+
+def _comparable(atlas: AssetMaps) -> Bool:
+    seen = atlas.map("samples")[:, 0] >= MIN_SAMPLES
+    emits = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
+    return np.asarray(seen & ~emits & atlas.texels.interior, np.bool_)
+
+
+def write_pictures(folder: Path, forth: Relit, back: Relit, frames: Frames) -> None:
+    """A sheet for each of four cameras spread over ``frames``. Its rows: radiance of asset A
+    measured, predicted, error; the same of asset B; albedo of A, of B, difference."""
+    folder.mkdir()
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _CAMERAS).round().astype(int))
+    scenes = [RayScene(r.atlas.scene.points, r.atlas.scene.triangles) for r in (forth, back)]
+    shown = [display_exposure(r.measured[r.scored].mean(axis=1)) for r in (forth, back)]
+    for i in progress(chosen, total=len(chosen), label="pictures", unit="views"):
+        width, height = (int(n) for n in frames.resolution[i])
+        scale = min(1.0, _MAX_WIDTH / width)
+        size = max(1, round(scale * width)), max(1, round(scale * height))
+        hits = [camera_hits(rays, frames, int(i), *size) for rays in scenes]
+        rows = [
+            _row(relit, seen, size, (relit.measured, relit.predicted), exposure)
+            for relit, seen, exposure in zip((forth, back), hits, shown, strict=True)
+        ]
+        albedos = forth.albedo, forth.other_albedo
+        rows.append(_row(forth, hits[0], size, albedos, 1.0))
+        write_preview_png(folder / f"{int(i):04d}.png", sheet(rows))
+
+
+def _row(
+    relit: Relit, hits: Hits, size: tuple[int, int], maps: tuple[Float, Float], exposure: float
+) -> list[Byte]:
+    """Reference, what is compared with it, and the error relative to the reference."""
+    width, height = size
+    reference, values = (_seen(relit, hits, m).reshape(height, width, 3) for m in maps)
+    scored = np.repeat(relit.scored[:, None], 3, axis=1).astype(np.float32)
+    counted = _seen(relit, hits, scored)[:, 0].reshape(height, width) > 0.5
+    error = np.abs(values - reference).mean(axis=2)
+    relative = error / np.maximum(reference.mean(axis=2), 1e-6)
+    pictures = [to_display_srgb8(m, exposure_scale=exposure) for m in (reference, values)]
+    return [*pictures, magma((relative / _FULL_ERROR).astype(np.float32), counted)]
+
+
+def _seen(relit: Relit, hits: Hits, values: Float) -> Float:
+    texture = surface_texture(relit.atlas.texels, relit.atlas.scene.face_object, values)
+    return texture.at(hits.face, hits.u, hits.v)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correspondence:
+    """For each texel (T,) of one asset: the texel of the other there (-1: none); and where the
+    triangles agree but the atlases do not, the other's face with barycentric u, v, else -1.
+
+    missing  identifiers of the objects that the other asset does not have
+    """
+
+    other: Texels
+    other_face_object: Int
+    texel: Int
+    face: Int
+    u: Float
+    v: Float
+    missing: tuple[str, ...]
+
+    def known(self) -> Bool:
+        """(T,) bool: the other asset has something there."""
+        return np.asarray(self.texel >= 0, np.bool_)
+
+    def nearest(self, values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+        """The other asset's values (T', ...) in its nearest texel; the first's where unknown."""
+        return values[np.maximum(self.texel, 0)]
+
+    def interpolated(self, values: Float) -> Float:
+        """The other asset's values (T', 3), bilinear where its atlas differs; 0 where unknown."""
+        found = np.where(self.known()[:, None], values[np.maximum(self.texel, 0)], 0)
+        between = self.face >= 0
+        if between.any():
+            texture = surface_texture(self.other, self.other_face_object, values)
+            found[between] = texture.at(self.face[between], self.u[between], self.v[between])
+        return np.asarray(found, np.float32)
+
+
+def correspondence(
+    scene: Scene, texels: Texels, other_scene: Scene, other: Texels
+) -> Correspondence:
+    """Find the texels of ``other`` at those of ``texels``; objects go by identifier, then label.
+
+    Triangle by triangle where an object has the same ones in both, else by the nearest texel of the
+    same object within two texels. InputRefused where the assets share no object or no surface.
+    """
+    count = len(texels)
+    texel, face = (np.full(count, -1, np.int32) for _ in range(2))
+    missing = []
+    for i, obj in enumerate(scene.objects):
+        own = texels.of_object(i)
+        j = _same_object(obj, other_scene.objects)
+        if j is None:
+            missing.append(obj.identifier)
+        elif not _same_triangles(scene, i, other_scene, j):
+            texel[own] = _nearby(texels, i, other, j)
+        elif _same_atlas(scene, texels, i, other_scene, other, j):
+            texel[own] = np.arange(*other.of_object(j).indices(len(other)), dtype=np.int32)
+        else:
+            first = scene.objects[i].first_face
+            face[own] = texels.face[own] - first + other_scene.objects[j].first_face
+            texel[own] = _texel_at(other, j, face[own], texels.barycentric[own])
+    if len(missing) == len(scene.objects):
+        raise InputRefused(
+            f"the assets share no object: one has {_some(scene)}, the other {_some(other_scene)}. "
+            "Compare two assets of one scene. [compare.objects]"
+        )
+    if not (texel >= 0).any():
+        raise InputRefused(
+            "the assets' objects share names but no surface: nowhere are their texels closer than "
+            "two texels. Compare two assets of one scene in one frame. [compare.surface]"
+        )
+    return Correspondence(
+        other=other,
+        other_face_object=other_scene.face_object,
+        texel=texel,
+        face=face,
+        u=np.ascontiguousarray(texels.barycentric[:, 1]),
+        v=np.ascontiguousarray(texels.barycentric[:, 2]),
+        missing=tuple(missing),
+    )
+
+
+def _same_object(obj: SceneObject, others: tuple[SceneObject, ...]) -> int | None:
+    for key in ("identifier", "label"):
+        names = [getattr(other, key) for other in others]
+        if names.count(getattr(obj, key)) == 1:
+            return names.index(getattr(obj, key))
+    return None
+
+
+def _same_triangles(scene: Scene, i: int, other: Scene, j: int) -> bool:
+    ours = scene.points[scene.triangles[scene.objects[i].faces]]
+    theirs = other.points[other.triangles[other.objects[j].faces]]
+    limit = _SAME_POINT * float(np.linalg.norm(np.ptp(scene.points, axis=0)))
+    return ours.shape == theirs.shape and bool(np.abs(ours - theirs).max() <= limit)
+
+
+def _same_atlas(
+    scene: Scene, texels: Texels, i: int, other_scene: Scene, other: Texels, j: int
+) -> bool:
+    def table(scene: Scene, texels: Texels, k: int) -> tuple[npt.NDArray[np.int64], Float]:
+        own = texels.of_object(k)
+        pixel = texels.pixel[own] - texels.first_pixel[k]
+        face = texels.face[own] - scene.objects[k].first_face
+        return np.stack([pixel, face]), texels.barycentric[own]
+
+    (ours, weights), (theirs, other_weights) = table(scene, texels, i), table(other_scene, other, j)
+    return np.array_equal(ours, theirs) and np.allclose(weights, other_weights, atol=1e-3)
+
+
+def _texel_at(texels: Texels, index: int, face: Int, barycentric: Float) -> Int:
+    """The texel nearest to points of object ``index``, given by face and barycentric (R, 3)."""
+    width, height = texels.resolution[index]
+    place = np.einsum("rc,rcd->rd", barycentric, texels.corner_pixel[face]).astype(np.int64)
+    x, y = np.clip(place[:, 0], 0, width - 1), np.clip(place[:, 1], 0, height - 1)
+    found: Int = texels.nearest_texel[texels.first_pixel[index] + y * width + x]
+    return found
+
+
+def _nearby(texels: Texels, i: int, other: Texels, j: int) -> Int:
+    own, theirs = texels.of_object(i), other.of_object(j)
+    if own.stop == own.start or theirs.stop == theirs.start:
+        return np.full(own.stop - own.start, -1, np.int32)
+    side = np.sqrt(max(float(np.median(t.area[s])) for t, s in ((texels, own), (other, theirs))))
+    distance, nearest = cKDTree(other.position[theirs]).query(texels.position[own])
+    return np.where(distance <= _REACH * side, theirs.start + nearest, -1).astype(np.int32)
+
+
+def _some(scene: Scene) -> str:
+    names = [obj.identifier for obj in scene.objects]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -13,9 +13,6 @@ from usdbrdf.errors import UsdBrdfError
 from usdbrdf.job.child import run_child
 from usdbrdf.model.arrays import Bool, Float
 
-# The exposure brings this percentile of the mean of R, G and B to this linear value.
-PERCENTILE, SHOWN_AS = 90, 0.8
-
 
 def relative_l2(image: Float, reference: Float, counted: Bool) -> float:
     """||image - reference|| / ||reference|| over the pixels ``counted``; NaN without light there.
@@ -36,12 +33,6 @@ def psnr(image: Float, reference: Float, counted: Bool) -> float:
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
-def exposure_of(level: Float) -> float:
-    """The factor that shows the 90th percentile of ``level`` (P,), mean of R, G and B, as 0.8."""
-    bright = float(np.percentile(level, PERCENTILE)) if len(level) else 0.0
-    return SHOWN_AS / bright if bright > 0 else 1.0
-
-
 def nrmse(values: Float, reference: Float, area: Float) -> float:
     """||values - reference|| / ||reference|| of maps (T, C), weighted by texel area (T,): root mean
     square error over root mean square. NaN where the reference is 0 everywhere or empty."""
@@ -57,6 +48,22 @@ def median_relative(values: Float, reference: Float) -> tuple[float, float]:
         return math.nan, math.nan
     relative = values / np.maximum(reference, 1e-6) - 1
     return float(np.median(np.abs(relative))), float(np.median(relative))
+
+
+class MapError(NamedTuple):
+    """How far a map is from its reference over the texels compared; None where there are none."""
+
+    nrmse: float | None
+    median_abs_relative: float | None
+    median_signed: float | None
+
+
+def map_error(values: Float, reference: Float, area: Float, scored: Bool) -> MapError:
+    """NRMSE, weighted by ``area`` (T,), and median relative errors of maps (T, C) over ``scored``
+    (T,)."""
+    absolute, signed = median_relative(values[scored], reference[scored])
+    whole = nrmse(values[scored], reference[scored], area[scored])
+    return MapError(finite(whole), finite(absolute), finite(signed))
 
 
 def finite(value: float, digits: int | None = None) -> float | None:

@@ -8,24 +8,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
-import trimesh
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.metrics import finite, median_relative, nrmse
+from usdbrdf.evaluation.metrics import finite, map_error, nrmse
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Float
-
-Known: TypeAlias = Mapping[str, Mapping[str, Any]]
+from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 # Fewer observations than this are no median.
 MIN_SAMPLES = 3
+
+
+class KnownObject(NamedTuple):
+    """An object of the truth: its number in the capture's mesh, its lobe, whether it emits."""
+
+    number: int
+    phi: float
+    psi: float
+    emits: bool
+
+
+Known: TypeAlias = Mapping[str, KnownObject]
 
 
 def compare_with_truth(
@@ -49,11 +58,13 @@ def compare_with_truth(
 def known_objects(folder: Path, atlas: AssetMaps) -> Known:
     """The truth's objects by name; InputRefused where it lacks one of the asset's."""
     path = folder / "objects.json"
-    listed = read_json(path)
     try:
-        known = {o["name"]: o for o in listed}
-        for o in listed:
-            float(o["phi"]), float(o["psi"]), max(o["emission"]), int(o["id"])
+        known = {
+            o["name"]: KnownObject(
+                int(o["id"]), float(o["phi"]), float(o["psi"]), max(o["emission"]) > 0
+            )
+            for o in read_json(path)
+        }
     except (TypeError, KeyError, ValueError) as error:
         raise InputRefused(
             f"{path}: not a list of objects with id, name, phi, psi and emission ({error!r}). "
@@ -70,7 +81,7 @@ def known_objects(folder: Path, atlas: AssetMaps) -> Known:
 
 def emitters(atlas: AssetMaps, known: Known) -> Bool:
     """(num_objects,) bool, objects that truly emit."""
-    return np.array([max(known[obj.label]["emission"]) > 0 for obj in atlas.scene.objects])
+    return np.array([known[obj.label].emits for obj in atlas.scene.objects])
 
 
 def scored_texels(atlas: AssetMaps, shines: Bool) -> Bool:
@@ -81,30 +92,26 @@ def scored_texels(atlas: AssetMaps, shines: Bool) -> Bool:
 
 
 def albedo_error(atlas: AssetMaps, scored: Bool, found: Float, known: Float) -> dict[str, Any]:
-    """NRMSE, area-weighted, and median relative errors of maps (T, 3) over the texels scored."""
-    area = atlas.texels.area
-    owner = atlas.texels.object_index()
-
-    def over(part: Bool) -> float:
-        return nrmse(found[part], known[part], area[part])
-
-    absolute, signed = median_relative(found[scored], known[scored])
-    return {
-        "nrmse": finite(over(scored)),
-        "median_abs_relative": finite(absolute),
-        "median_signed": finite(signed),
-        "objects": {
-            obj.identifier: finite(over(scored & (owner == i)), 4)
-            for i, obj in enumerate(atlas.scene.objects)
-            if (scored & (owner == i)).any()
-        },
-    }
+    """NRMSE, area-weighted, and median relative errors of maps (T, 3) over the texels scored; NRMSE
+    per object too."""
+    area, owner = atlas.texels.area, atlas.texels.object_index()
+    objects = {}
+    for i, obj in enumerate(atlas.scene.objects):
+        own = scored & (owner == i)
+        if own.any():
+            objects[obj.identifier] = finite(nrmse(found[own], known[own], area[own]), 4)
+    return {**map_error(found, known, area, scored)._asdict(), "objects": objects}
 
 
 def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
     """(T, 3), linear between the vertices of the capture's mesh, a PLY with ``object_id``: each
     face of ours is found in it by its centre, among those of the object of the same name."""
-    source, labels = _labelled_mesh(mesh)
+    source = mesh_from_file(mesh)
+    if source.face_label is None:
+        raise InputRefused(
+            f"{mesh}: its faces have no property object_id. Name the capture's mesh with --mesh. "
+            "[evaluate.truth]"
+        )
     path = folder / "albedo_vertex.npz"
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -114,17 +121,17 @@ def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
             f"{path}: no array 'albedo' can be read from it ({error}). Check --truth. "
             "[evaluate.truth]"
         ) from error
-    if per_vertex.shape != (len(source.vertices), 3):
+    if per_vertex.shape != (len(source.points), 3):
         raise InputRefused(
-            f"{path}: albedo is {per_vertex.shape}, but {mesh} has {len(source.vertices)} "
+            f"{path}: albedo is {per_vertex.shape}, but {mesh} has {len(source.points)} "
             "vertices. Name the mesh that it belongs to with --mesh. [evaluate.truth]"
         )
-    names = {o["id"]: o["name"] for o in read_json(folder / "objects.json")}
-    corners = np.asarray(source.vertices, np.float32)[source.faces]
+    known = known_objects(folder, atlas)
+    corners = source.points[source.triangles]
     result = np.zeros((len(atlas.texels), 3), np.float32)
     for i, obj in enumerate(atlas.scene.objects):
         own = atlas.texels.of_object(i)
-        theirs = np.flatnonzero([names.get(int(label)) == obj.label for label in labels])
+        theirs = np.flatnonzero(source.face_label == known[obj.label].number)
         if not len(theirs):
             raise InputRefused(
                 f"{mesh}: no face belongs to the object {obj.label!r}. Name the mesh of the same "
@@ -136,59 +143,52 @@ def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
         match = theirs[nearest]
         distance = np.linalg.norm(ours[:, :, None] - corners[match][:, None], axis=-1)
         corner = distance.argmin(axis=2)
-        values = per_vertex[source.faces[match[:, None], corner]]
+        values = per_vertex[source.triangles[match[:, None], corner]]
         result[own] = np.einsum("tc,tcd->td", atlas.texels.barycentric[own], values)
     return result
 
 
-def _labelled_mesh(mesh: Path) -> tuple[Any, npt.NDArray[Any]]:
-    try:
-        # Unprocessed, because merged vertices would no longer be the truth's.
-        source = trimesh.load(mesh, process=False)
-        labels = np.asarray(source.metadata["_ply_raw"]["face"]["data"]["object_id"]).ravel()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputRefused(
-            f"{mesh}: not a readable PLY with the face property object_id ({error!r}). Name the "
-            "capture's mesh with --mesh. [evaluate.truth]"
-        ) from error
-    return source, labels
+class _MaterialError(NamedTuple):
+    """|found - true| of an object that does not emit, and whether its values were measured."""
+
+    phi: float
+    psi: float
+    measured: bool
 
 
 def material_error(atlas: AssetMaps, known: Known, shines: Bool) -> dict[str, Any]:
     """Errors of phi and psi of each object that does not emit, and their means by status."""
     rows: dict[str, dict[str, Any]] = {}
+    errors = []
     for obj, emits in zip(atlas.scene.objects, shines, strict=True):
         fit = read_fit(atlas.stage, obj.prim_path)
         if emits or fit is None:
             continue
         truth = known[obj.label]
+        phi, psi = (round(abs(a - b), 3) for a, b in ((fit.phi, truth.phi), (fit.psi, truth.psi)))
+        errors.append(_MaterialError(phi, psi, fit.status == "measured"))
         rows[obj.identifier] = {
-            "truth": [truth["phi"], truth["psi"]],
+            "truth": [truth.phi, truth.psi],
             "found": [round(fit.phi, 3), round(fit.psi, 3)],
             "status": fit.status,
             "evidence": finite(fit.evidence, 3),
             "confidence": [fit.phi_confidence, fit.psi_confidence],
             "stated_error": [finite(fit.phi_error, 3), finite(fit.psi_error, 3)],
-            "error": [round(abs(fit.phi - truth["phi"]), 3), round(abs(fit.psi - truth["psi"]), 3)],
+            "error": [phi, psi],
         }
-
-    def mean(status: str | None, k: int) -> float | None:
-        errors = [r["error"][k] for r in rows.values() if status in (None, r["status"])]
-        return float(np.mean(errors)) if errors else None
-
-    def largest(k: int) -> float | None:
-        return max(
-            (r["error"][k] for r in rows.values() if r["status"] == "measured"), default=None
-        )
-
+    measured = [error for error in errors if error.measured]
     return {
         "objects": len(rows),
-        "mean_abs_phi": mean(None, 0),
-        "mean_abs_psi": mean(None, 1),
-        "measured": sum(r["status"] == "measured" for r in rows.values()),
-        "measured_mean_abs_phi": mean("measured", 0),
-        "measured_mean_abs_psi": mean("measured", 1),
-        "measured_largest_phi": largest(0),
-        "measured_largest_psi": largest(1),
+        "mean_abs_phi": _mean([error.phi for error in errors]),
+        "mean_abs_psi": _mean([error.psi for error in errors]),
+        "measured": len(measured),
+        "measured_mean_abs_phi": _mean([error.phi for error in measured]),
+        "measured_mean_abs_psi": _mean([error.psi for error in measured]),
+        "measured_largest_phi": max((error.phi for error in measured), default=None),
+        "measured_largest_psi": max((error.psi for error in measured), default=None),
         "rows": rows,
     }
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -31,6 +31,9 @@ _NAMES = {
 
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 
+# Pictures are exposed so that this percentile comes out as this linear value.
+_SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
+
 
 def known_encodings() -> tuple[str, ...]:
     """The names that ``to_working_space`` understands."""
@@ -64,6 +67,13 @@ def to_display_srgb(pixels: Float, *, exposure_scale: float) -> Float:
     scaled = np.clip(pixels * np.float32(exposure_scale), 0, 1).astype(np.float32)
     encoded: Float = np.clip(_converted(scaled, WORKING_SPACE, DISPLAY_SPACE), 0, 1)
     return encoded
+
+
+def display_exposure(levels: Float) -> float:
+    """The factor that shows the 90th percentile of ``levels`` (P,), means of R, G and B of linear
+    radiance, as 0.8 of white; 1 where there is no light."""
+    bright = float(np.percentile(levels, _SHOWN_PERCENTILE)) if len(levels) else 0.0
+    return _SHOWN_AS / bright if bright > 0 else 1.0
 
 
 def _converted(pixels: Float, source: str, target: str) -> Float:

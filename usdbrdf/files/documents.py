@@ -1,4 +1,4 @@
-"""JSON without its traps: finite numbers, no key twice, bounded size and depth."""
+"""JSON without its traps: finite numbers, no key twice, no half characters, bounded size, depth."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ import numpy as np
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import write_text_atomic
 
+# Not msgspec: it keeps the last of two equal keys without a word, takes no NaN even where the
+# caller is to judge it, and names the byte of a fault, not its line.
+
 MAX_BYTES = 256 << 20
 
 MAX_DEPTH = 64
@@ -21,6 +24,9 @@ MAX_DEPTH = 64
 _INTEGER_LIMIT = 1 << 63
 
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
+
+
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 class _BadNumber(ValueError):
@@ -70,6 +76,12 @@ def read_json(
         ) from error
     except RecursionError as error:
         raise _too_deep(path, max_depth) from error
+    except UnicodeEncodeError as error:
+        around = error.object[max(0, error.start - 20) : error.start + 1]
+        raise InputRefused(
+            f"{path}: {around!r} holds half of a surrogate pair, which is "
+            "no character. Correct it. [document.json]"
+        ) from error
     if _deeper_than(document, max_depth):
         raise _too_deep(path, max_depth)
     return document
@@ -112,13 +124,16 @@ def _read_text(path: Path, max_bytes: int) -> str:
 
 
 def _parsed(text: str, number: Callable[[str], float]) -> Any:
-    return json.loads(
+    document = json.loads(
         text,
         object_pairs_hook=_object_without_key_twice,
         parse_constant=number,
         parse_float=number,
         parse_int=_integer,
     )
+    if _SURROGATE.search(text):  # most are halves of good pairs
+        json.dumps(document, ensure_ascii=False).encode()
+    return document
 
 
 def _any_nonfinite(node: Any, exempt: Collection[str]) -> bool:

@@ -1,14 +1,18 @@
 """Images in and out; the only importer of OpenImageIO.
 
-Reading gives every pixel or refuses: a truncated file never becomes zeros. Writing clamps to what
+Reading gives every pixel or refuses: a truncated file never becomes zeros, and what is made of a
+file is bounded, whatever it stores. Writing clamps to what
 half floats hold, pins the date so that equal pixels give equal bytes, and reads the file back.
 """
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +32,9 @@ MAX_CHANNELS = 64
 MAX_DECLARED_BYTES = 4 << 30
 
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
+
+# A display window may be larger than what the file holds; beyond this many bytes not by any factor.
+MAX_UNKNOWN_BYTES, MAX_UNKNOWN_SHARE = 64 << 20, 63 / 64
 
 HALF_MAX = 65_504.0
 
@@ -174,18 +181,13 @@ def _open(path: Path, max_side: int) -> Any:
             "to a scene-linear EXR. [image.raw]"
         )
     size = _size_of_regular_file(path)
-    try:
-        # Without the hint, PNG's colours would come multiplied by their alpha.
-        hint = oiio.ImageSpec()
-        hint.attribute("oiio:UnassociatedAlpha", 1)
+    # Without the hint, PNG's colours would come multiplied by their alpha.
+    hint = oiio.ImageSpec()
+    hint.attribute("oiio:UnassociatedAlpha", 1)
+    with _decoding(path, oiio, "not a readable image", "image.unreadable"):
         source = oiio.ImageInput.open(str(path), hint)
-    except UnicodeError:
-        source = None
-    if source is None:
-        raise ImageRefused(
-            f"{path}: not a readable image ({_message(oiio)}). Copy or export it again. "
-            "[image.unreadable]"
-        )
+        if source is None:
+            raise _Undecoded
     spec = source.spec()
     if source.format_name() not in _FORMATS or spec.deep or spec.full_depth > 1 or spec.depth > 1:
         raise ImageRefused(
@@ -194,6 +196,44 @@ def _open(path: Path, max_side: int) -> Any:
         )
     _check_limits(path, spec, size, max_side)
     return source
+
+
+class _Undecoded(Exception):
+    """The decoder gave nothing, or not what its header says."""
+
+
+@contextmanager
+def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0) -> Iterator[None]:
+    """ImageRefused for whatever the decoder stumbles over, in its own words: a damaged file can
+    make it raise anything. But too little memory is no fault of the file.
+
+    making  bytes that are to be made of the file
+    """
+    try:
+        yield
+    except Exception as error:
+        said = _message(decoder)
+        if isinstance(error, MemoryError) or _WANT_OF_MEMORY.search(said) or not _is_free(making):
+            raise EnvironmentFailure(
+                f"{path}: too little memory to read this image. Free some or use a larger "
+                "machine, then run the same command again. [environment.memory]"
+            ) from error
+        raise ImageRefused(f"{path}: {problem} ({said}). Copy or export it again. [{rule}]") from (
+            None if isinstance(error, _Undecoded) else error
+        )
+
+
+# As OpenImageIO and the libraries below it put it.
+_WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
+
+
+def _is_free(num_bytes: int) -> bool:
+    """Whether so much memory can be had, twice: the decoder has buffers of its own."""
+    try:
+        np.zeros(2 * num_bytes, np.uint8)
+    except MemoryError:
+        return False
+    return True
 
 
 def _size_of_regular_file(path: Path) -> int:
@@ -220,7 +260,15 @@ def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
                 f"{path}: {width} x {height} pixels, the limits are {max_side} a side and "
                 f"{MAX_PIXELS} in all. Scale it down. [image.limits]"
             )
-    declared = 4 * spec.width * spec.height * spec.nchannels  # as the floats we would make of it
+    pixel_bytes = 4 * spec.nchannels  # as the floats we would make of it
+    declared = pixel_bytes * spec.width * spec.height
+    shown = pixel_bytes * spec.full_width * spec.full_height
+    if shown > MAX_UNKNOWN_BYTES and declared < (1 - MAX_UNKNOWN_SHARE) * shown:
+        raise ImageRefused(
+            f"{path}: {spec.width} x {spec.height} pixels are to stand in a display window of "
+            f"{spec.full_width} x {spec.full_height}, which would be unknown but for "
+            f"{declared / shown:.2g} of it. Crop it, or export all of it. [image.limits]"
+        )
     inflation = declared / size
     if declared > MAX_DECLARED_BYTES or (declared > 1 << 30 and inflation > MAX_INFLATION):
         raise ImageRefused(
@@ -235,16 +283,13 @@ def _pixels(path: Path, source: Any) -> Float:
     if source.format_name() == "jpeg":
         _refuse_cut_jpeg(path)
     spec = source.spec()
-    try:
+    shape = (spec.height, spec.width, spec.nchannels)
+    with _decoding(
+        path, source, "truncated or damaged", "image.truncated", making=4 * math.prod(shape)
+    ):
         pixels = source.read_image(0, 0, 0, spec.nchannels, "float")
-        complete = pixels is not None and not source.has_error
-    except (UnicodeError, MemoryError):
-        complete = False
-    if not complete or pixels.shape != (spec.height, spec.width, spec.nchannels):
-        raise ImageRefused(
-            f"{path}: truncated or damaged ({_message(source)}). Copy or export it again. "
-            "[image.truncated]"
-        )
+        if pixels is None or source.has_error or pixels.shape != shape:
+            raise _Undecoded
     return np.asarray(pixels, dtype=np.float32)
 
 
@@ -295,5 +340,5 @@ def _message(speaker: Any) -> str:
     """OpenImageIO's own words, in one line; damaged files can make them invalid UTF-8."""
     try:
         return " ".join(str(speaker.geterror()).split())[:300] or "no reason given"
-    except UnicodeError:
+    except Exception:
         return "no readable reason given"

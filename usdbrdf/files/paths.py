@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from usdbrdf.errors import InputRefused, OwnershipConflict
@@ -11,6 +12,8 @@ from usdbrdf.errors import InputRefused, OwnershipConflict
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
+
+_LITTER = (".DS_Store", "._*", "Thumbs.db", "ehthumbs.db", "desktop.ini", ".directory", "*~")
 
 
 def contained(root: Path, candidate: str) -> Path:
@@ -28,8 +31,11 @@ def contained(root: Path, candidate: str) -> Path:
     try:
         home = root.resolve()
         path = (home / candidate).resolve()
+        candidate.encode()  # half of a surrogate pair names no file
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            path.stat()
     except (OSError, RuntimeError, ValueError) as error:  # too long a name, a loop of links
-        raise _refused(root, candidate, f"cannot be resolved ({error})") from error
+        raise _refused(root, candidate, f"cannot be resolved ({_words(error)})") from error
     if not path.is_relative_to(home):
         raise _refused(root, candidate, "leads outside that folder")
     return path
@@ -47,6 +53,36 @@ def inside(root: Path, place: Path) -> Path:
             "it; put a folder in its place. [ownership.link]"
         )
     return place
+
+
+def _words(error: Exception) -> str:
+    """What is wrong, without the path, which may be the long part."""
+    words = getattr(error, "strerror", None) or getattr(error, "reason", None) or error
+    return str(words)[:200]
+
+
+def refuse_nameless(path: Path | None) -> None:
+    """InputRefused where the absolute path is not UTF-8, as every path in a layer of USD is."""
+    try:
+        str(path and path.resolve()).encode()
+    except UnicodeEncodeError as error:
+        raise InputRefused(
+            f"{str(path)!r}: this name, or that of a folder above, is not UTF-8, so that USD "
+            "cannot refer to it. Rename it. [paths.name]"
+        ) from error
+
+
+def files_below(folder: Path, *, without: Path) -> list[Path]:
+    """The files in a folder and in those below it, sorted, but for those in ``without`` and what
+    operating systems and editors leave by themselves."""
+    own = without.resolve()
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if not any(path.match(pattern) for pattern in _LITTER)
+        and path.is_file()
+        and not path.is_relative_to(own)
+    )
 
 
 def _refused(root: Path, candidate: str, reason: str) -> InputRefused:

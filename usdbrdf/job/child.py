@@ -1,12 +1,14 @@
 """Run a function in a process of its own, because it may crash or hang on a bad mesh or file.
 
 A fresh interpreter is started, not forked: our threads and locks stay here, and a caller's script
-needs no ``__main__`` guard. Arrays travel as files without pickles.
+needs no ``__main__`` guard. It imports nothing of the package but what the function needs. Arrays
+travel as files without pickles. The child dies with us.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import math
 import os
@@ -14,7 +16,6 @@ import resource
 import signal
 import subprocess
 import sys
-import tempfile
 import traceback
 from collections.abc import Mapping
 from importlib import import_module
@@ -26,11 +27,17 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.documents import json_text
+from usdbrdf.job.scratch import scratch_folder
 from usdbrdf.model.arrays import Array
+
+# Not "-m": runpy warns of modules that are imported already, and those would be last words.
+_START = "from usdbrdf.job.child import main; main()"
 
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
 
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 _ERROR_CLASSES = {
     name: value
@@ -56,16 +63,18 @@ def run_child(
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
     returns              the dictionary of arrays that it returned
 
-    A UsdBrdfError raised there is raised here with its class; death by a signal and running out
-    of time become InputRefused, running out of memory EnvironmentFailure.
+    A UsdBrdfError raised there is raised here with its class. Death by a signal is an
+    InputRefused; running out of time or memory, SIGKILL and what cannot be imported there are
+    EnvironmentFailures.
     """
-    with tempfile.TemporaryDirectory(prefix="usdbrdf-") as name:
-        folder = Path(name)
+    with scratch_folder() as folder:
         with environment_failures(label):
             save_arrays(folder / "arrays.npz", arrays)
             task = {
                 "function": function,
                 "parameters": dict(parameters),
+                "label": label,
+                "parent": os.getpid(),
                 "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
                 "memory_limit_bytes": memory_limit_bytes,
             }
@@ -79,12 +88,12 @@ def run_child(
 
 
 def _run(folder: Path, timeout_s: float, label: str) -> int:
-    # The child imports what we can import. It runs in the temporary folder, so that "-m" does not
+    # The child imports what we can import. It runs in the scratch folder, so that "-c" does not
     # put the caller's working folder, and whatever lies there, first on its path.
     search = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
     with environment_failures(label), (folder / "said").open("wb") as said:
         process = subprocess.Popen(
-            [sys.executable, "-m", "usdbrdf.job.child", str(folder)],
+            [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": search},
             stdin=subprocess.DEVNULL,
@@ -95,9 +104,9 @@ def _run(folder: Path, timeout_s: float, label: str) -> int:
     try:
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:
-        raise InputRefused(
-            f"{label} did not end within {timeout_s:g} s and was stopped. Simplify or repair the "
-            "input. [child.timeout]"
+        raise EnvironmentFailure(
+            f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
+            "again when the machine is less busy, or simplify the input. [child.timeout]"
         ) from error
     finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
         with contextlib.suppress(ProcessLookupError):
@@ -116,39 +125,58 @@ def _told_error(folder: Path, label: str) -> UsdBrdfError:
 
 
 def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
-    last = (folder / "said").read_text("utf-8", errors="replace").strip().splitlines()[-1:]
+    text = (folder / "said").read_text("utf-8", errors="replace").strip()
+    last = text.splitlines()[-1:]
     said = f" Its last words: {last[0][:200]!r}." if last else ""
-    if status == -signal.SIGKILL:
+    if status == -signal.SIGKILL or "bad_alloc" in text:
         return EnvironmentFailure(
-            f"{label} was killed from outside, most likely out of memory.{said} Use a machine "
-            "with more, or a smaller input. [child.killed]"
+            f"{label} was killed from outside or out of memory.{said} Use a machine with more, or "
+            "a smaller input. [child.killed]"
         )
-    how = signal.Signals(-status).name if status < 0 else f"exit status {status}"
+    if status > 0:  # the child tells every error of its function: it did not come as far
+        return EnvironmentFailure(
+            f"{label} could not be started (exit status {status}).{said} Check the installation "
+            "and the limits of this shell (ulimit -a). [child.start]"
+        )
+    how = signal.Signals(-status).name
     return InputRefused(f"{label} crashed ({how}).{said} Repair the input. [child.crashed]")
 
 
-def _main(folder: Path) -> int:
+def main() -> None:
     """The child's side: read the task, call the function, leave its result or its error."""
+    folder = Path(sys.argv[1])
     task = json.loads((folder / "task.json").read_text("utf-8"))
+    _die_with(task["parent"])
     signal.alarm(task["alarm_s"])
     if task["memory_limit_bytes"] is not None:
-        resource.setrlimit(resource.RLIMIT_AS, (task["memory_limit_bytes"],) * 2)
+        limits = (task["memory_limit_bytes"], *resource.getrlimit(resource.RLIMIT_AS))
+        limit = min(limit for limit in limits if limit != resource.RLIM_INFINITY)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     try:
-        module, _, name = task["function"].partition(":")
-        with environment_failures(task["function"]):
+        with environment_failures(task["label"]):
             arrays = load_arrays(folder / "arrays.npz")
+            module, _, name = task["function"].partition(":")
             result = getattr(import_module(module), name)(arrays, task["parameters"])
             save_arrays(folder / "result.npz", result)
     except Exception as error:
-        told = {
+        told: dict[str, str] = {
             "class": type(error).__name__,
             "message": str(error),
             "traceback": traceback.format_exc(),
         }
+        if isinstance(error, ImportError):  # a library is missing, or memory is too small for it
+            told["class"] = EnvironmentFailure.__name__
+            told["message"] = (
+                f"{task['label']}: {error}. Check the installation and the limits of this shell "
+                "(ulimit -a). [child.start]"
+            )
         (folder / "error.json").write_text(json.dumps(told), "utf-8")
-        return _ERROR_TOLD
-    return 0
+        sys.exit(_ERROR_TOLD)
 
 
-if __name__ == "__main__":
-    raise SystemExit(_main(Path(sys.argv[1])))
+def _die_with(parent: int) -> None:
+    """Let the kernel kill this process when its parent dies, which may have happened already."""
+    with contextlib.suppress(OSError, AttributeError):  # another system than Linux
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import json
 import os
 import socket
 import threading
@@ -53,7 +52,8 @@ def folder_lock(
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         try:
             while not _taken(descriptor, path, without_lock):
-                _wait_or_refuse(path, deadline, _holder(descriptor))
+                signed = os.pread(descriptor, 4096, 0).decode("utf-8", "replace")
+                _wait_or_refuse(path, deadline, signed or "another run that has not signed yet")
             if not os.path.samestat(os.fstat(descriptor), path.stat()):
                 raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
             _sign(descriptor)
@@ -90,13 +90,10 @@ def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
 
 
 def _sign(descriptor: int) -> None:
-    holder = {
-        "pid": os.getpid(),
-        "host": socket.gethostname(),
-        "since": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
+    since = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    holder = f"pid {os.getpid()} on {socket.gethostname()} since {since}"
     os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+    os.pwrite(descriptor, holder.encode("utf-8", "replace"), 0)
 
 
 def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:
@@ -107,11 +104,3 @@ def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:
             "stop it. [lock.busy]"
         )
     time.sleep(min(_POLL_SECONDS, left))
-
-
-def _holder(descriptor: int) -> str:
-    try:
-        record = json.loads(os.pread(descriptor, 4096, 0))
-        return f"pid {record['pid']} on {record['host']} since {record['since']}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return "another run that has not signed yet"

@@ -51,36 +51,21 @@ def tell(line: str) -> None:
         _give_up(sys.stderr)
 
 
-def show(text: str) -> None:
-    """Lines to stdout, for a person: who stops reading has seen enough. EnvironmentFailure where
-    they cannot be written."""
-    with suppress(BrokenPipeError):
-        _write(text)
-
-
-def hand_over(document: str) -> None:
-    """A whole document to stdout, for a program. Raises UsdBrdfError where nobody reads it, and
-    EnvironmentFailure where it cannot be written."""
-    try:
-        _write(document)
-    except BrokenPipeError as error:
-        raise UsdBrdfError(
-            "stdout: its reader went away before all was written. [environment.output]"
-        ) from error
-
-
-def _write(text: str) -> None:
+def show(text: str, *, whole: bool = False) -> None:
+    """Lines to stdout. EnvironmentFailure where they cannot be written. A reader who goes away has
+    seen enough, unless it is a program that needs the ``whole``: then UsdBrdfError."""
     try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
-    except BrokenPipeError:
-        _give_up(sys.stdout)
-        raise
     except OSError as error:
         _give_up(sys.stdout)
-        raise EnvironmentFailure(
-            f"stdout cannot be written ({error.strerror}). [environment.output]"
-        ) from error
+        left = isinstance(error, BrokenPipeError)
+        if left and whole:
+            raise UsdBrdfError("stdout: its reader went away. [environment.output]") from error
+        if not left:
+            raise EnvironmentFailure(
+                f"stdout cannot be written ({error.strerror}). [environment.output]"
+            ) from error
 
 
 def _give_up(stream: TextIO) -> None:
@@ -88,6 +73,11 @@ def _give_up(stream: TextIO) -> None:
     make a status of the failure."""
     with suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def warn(sentence: str) -> None:
+    """Say what was left out or may be wrong, and go on."""
+    say(f"warning: {sentence}")
 
 
 def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Iterator[T]:

@@ -9,10 +9,8 @@ The stamp comes last. Hold ``folder_lock`` around it: nothing here expects compa
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -37,11 +35,6 @@ from usdbrdf.job.stamp import (
     why_rerun,
     write_stamp,
 )
-from usdbrdf.model.arrays import Array
-
-# Seconds between saved states of a running computation, and how many times as long as saving one
-# takes: what a kill can cost, and what saving may.
-_SAVE_AFTER, _SAVE_SELDOM = 2.0, 30
 
 # What a layer points at is there before the layer: textures, binary layers, text layers.
 _RANK = {".usdc": 1, ".usd": 1, ".usda": 2}
@@ -56,10 +49,11 @@ class TaskResult:
     reason: str
 
 
-class TaskRun:
+class TaskRun(Checkpoints):
     """What the work of a task gets: places for its outputs, and checkpoints."""
 
     def __init__(self, asset: Path, name: str, folder: Path) -> None:
+        super().__init__(folder / "checkpoints")
         self.asset = asset
         self.name = name
         self.staged = folder / "staged"
@@ -67,10 +61,6 @@ class TaskRun:
         self.once: list[str] = []
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
-        self._checkpoints = Checkpoints(folder / "checkpoints")
-        # When a running computation's state was saved last, and how long that took: the first is
-        # saved at once, which tells.
-        self._saved = -math.inf, 0.0
 
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
@@ -79,49 +69,6 @@ class TaskRun:
     def output_once(self, relative: str) -> Path:
         """The same for a file that is the artist's once it exists: it is never replaced."""
         return self._place(relative, self.once)
-
-    def checkpoint(self, key: str, compute: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
-        """The arrays of ``compute``, from an earlier run of the same task if it got that far."""
-        stored = self.checkpoint_if(key)
-        if stored is not None:
-            return stored
-        arrays = dict(compute())
-        self.save(key, arrays)
-        return arrays
-
-    def checkpoint_if(self, key: str) -> dict[str, Array] | None:
-        """The arrays saved under ``key`` by this run or an interrupted one, or None."""
-        return self._checkpoints.load(key)
-
-    def save(self, key: str, arrays: Mapping[str, Array]) -> None:
-        """Store arrays under ``key`` for a later run of the same task."""
-        self._checkpoints.save(key, arrays)
-
-    def latest(self, prefix: str) -> tuple[int, dict[str, Array]] | None:
-        """Index and arrays of the newest intact state that ``save_latest`` stored, or None."""
-        for index in self._checkpoints.indices(prefix):
-            arrays = self._checkpoints.load(prefix, index)
-            if arrays is not None:
-                return index, arrays
-        return None
-
-    def save_latest(self, prefix: str, index: int, arrays: Mapping[str, Array]) -> None:
-        """Store the state of a running computation after step ``index``; older ones are deleted."""
-        self._checkpoints.save(prefix, arrays, index)
-        for other in self._checkpoints.indices(prefix):
-            if other != index:
-                self._checkpoints.drop(prefix, other)
-
-    def save_latest_in_time(
-        self, prefix: str, index: int, arrays: Callable[[], Mapping[str, Array]]
-    ) -> None:
-        """``save_latest``, but not so often that it costs more than a few per cent of the time."""
-        last, took = self._saved
-        start = time.monotonic()
-        if start - last >= max(_SAVE_AFTER, _SAVE_SELDOM * took):
-            self.save_latest(prefix, index, arrays())
-            end = time.monotonic()
-            self._saved = end, end - start
 
     def _place(self, relative: str, register: list[str]) -> Path:
         relative = check_relative(relative)
@@ -222,7 +169,8 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     step can be repeated."""
     staged = folder / "staged"
     for _, outputs in groupby(sorted(journal.outputs, key=_place_in_order), key=_rank):
-        for changed in {_moved_into(asset, staged, relative) for relative in outputs}:
+        # The asset itself, too: its folders may be new.
+        for changed in {asset, *(_moved_into(asset, staged, relative) for relative in outputs)}:
             flush_folder(changed)
     for relative in journal.once:
         if not (asset / relative).exists():

@@ -16,7 +16,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import read_frames
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -24,12 +24,12 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.albedo import albedo_map
-from usdbrdf.shading.denoise import OIDN
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
 from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
+from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.warps import shifts_of
@@ -159,7 +159,7 @@ def _means_without_lobes(
     try:
         groups = groups_of_texels(texels, lit.scene, frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
-        say(f"warning: {short}")
+        warn(str(short))
         groups = smallest_groups(texels)
 
     def means(part: slice) -> dict[str, Float]:

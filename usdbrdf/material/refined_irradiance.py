@@ -20,8 +20,8 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
-from usdbrdf.shading.denoise import OIDN
 from usdbrdf.shading.irradiance_map import denoised_irradiance, tiles_of_patches
+from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance

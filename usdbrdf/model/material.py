@@ -97,6 +97,15 @@ class Surface:
         return replace(self, points=points, **turned)
 
 
+def turned_up(model_up: str, scene_up: str) -> Double:
+    """(4, 4) rotation about x that brings one up axis, "Y" or "Z", to the other."""
+    turn = np.eye(4)
+    if model_up != scene_up:
+        sign = 1.0 if scene_up == "Z" else -1.0
+        turn[1:3, 1:3] = [[0.0, -sign], [sign, 0.0]]
+    return turn
+
+
 def constant_map(*value: float) -> Float:
     """A 1 x 1 map; one value alone stands for all of three channels."""
     channels = value * 3 if len(value) == 1 else value

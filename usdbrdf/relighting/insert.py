@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from usdbrdf.errors import UsageError
-from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.material import (
     Material,
     Surface,
@@ -20,15 +20,6 @@ from usdbrdf.options import Insert
 from usdbrdf.transport.rays import RayScene
 
 _UP = {"Y": np.array([0.0, 1, 0]), "Z": np.array([0.0, 0, 1])}
-
-
-def turned_up(model_up: str, scene_up: str) -> Double:
-    """(4, 4) rotation about x that brings one up axis to the other."""
-    turn = np.eye(4)
-    if model_up != scene_up:
-        sign = 1.0 if scene_up == "Z" else -1.0
-        turn[1:3, 1:3] = [[0.0, -sign], [sign, 0.0]]
-    return turn
 
 
 def rotation_about(up_axis: str, degrees: float) -> Double:
@@ -56,15 +47,14 @@ def placed(
     eye_height  metres along the up axis, from which it falls unless a height is given
     """
     if insert.matrix is not None:
-        return tuple(
-            surface.moved(_in_metres(insert.matrix, metres_per_unit)) for surface in surfaces
-        )
+        world_from_model = np.array(insert.matrix, np.float64)
+        world_from_model[:3, 3] *= metres_per_unit
+        return tuple(surface.moved(world_from_model) for surface in surfaces)
     turn = rotation_about(up_axis, insert.rotate_deg) @ np.diag([*(insert.scale,) * 3, 1.0])
-    moved = tuple(surface.moved(turn) for surface in surfaces)
+    turned = tuple(surface.moved(turn) for surface in surfaces)
     if insert.drop is None:
-        offset = np.array(insert.at or (0.0, 0.0, 0.0)) * metres_per_unit
-        return tuple(surface.moved(_translation(offset)) for surface in moved)
-    return _dropped(moved, insert, up_axis, metres_per_unit, scene, eye_height)
+        return _shifted(turned, np.array(insert.at or (0.0, 0.0, 0.0)) * metres_per_unit)
+    return _dropped(turned, insert, up_axis, metres_per_unit, scene, eye_height)
 
 
 def with_material(surface: Surface, insert: Insert) -> Surface:
@@ -112,16 +102,10 @@ def _coloured_metal(surface: Surface, material: Material, metallic: float, ior: 
     )
 
 
-def _in_metres(matrix: Double, metres_per_unit: float) -> Double:
-    scaled = np.array(matrix, np.float64)
-    scaled[:3, 3] *= metres_per_unit
-    return scaled
-
-
-def _translation(offset: Double) -> Double:
+def _shifted(surfaces: Sequence[Surface], offset: Double) -> tuple[Surface, ...]:
     matrix = np.eye(4)
     matrix[:3, 3] = offset
-    return matrix
+    return tuple(surface.moved(matrix) for surface in surfaces)
 
 
 def _dropped(
@@ -142,7 +126,7 @@ def _dropped(
     offset = np.zeros(3)
     # In a y-up world the horizontal coordinates are x and z.
     offset[level] = wanted[:2] - middle[level]
-    over = tuple(surface.moved(_translation(offset)) for surface in model)
+    over = _shifted(model, offset)
     start = wanted[2] if len(wanted) == 3 else eye_height
     rest = _resting_height(_soup(over), _soup(scene), vertical, start)
     if rest is None:
@@ -151,9 +135,7 @@ def _dropped(
             f"{','.join(f'{value:g}' for value in insert.drop)} to come to rest on. Choose another "
             "place, or a height as third number. [relight.drop]"
         )
-    offset = np.zeros(3)
-    offset[vertical] = rest
-    return tuple(surface.moved(_translation(offset)) for surface in over)
+    return _shifted(over, np.eye(3)[vertical] * rest)
 
 
 def _resting_height(
@@ -165,34 +147,32 @@ def _resting_height(
     ``start`` rise to the model's. Where an edge alone meets an edge, nothing is noticed.
     """
     points, triangles = model
-    down, up = np.zeros(3, np.float32), np.zeros(3, np.float32)
-    down[vertical], up[vertical] = -1, 1
-    lifts = []
+    points = points[np.unique(triangles)]
+    heights = points[:, vertical]
+    met, distance = _first_hits(scene, points, vertical, start, -1.0)
+    lifts = start - distance[met] - heights[met]
 
-    used = points[np.unique(triangles)]
-    origins = used.astype(np.float32)
-    origins[:, vertical] = start
-    hits = _soup_rays(scene).closest(origins, np.tile(down, (len(origins), 1)))
-    fell = hits.face >= 0
-    lifts.append((start - hits.distance[fell]) - used[fell, vertical])
-
-    low, high = used.min(axis=0), used.max(axis=0)
-    below = scene[0][np.unique(scene[1])]
     level = [axis for axis in range(3) if axis != vertical]
-    under = (below[:, level] >= low[level]).all(axis=1) & (below[:, level] <= high[level]).all(
-        axis=1
-    )
-    under &= below[:, vertical] < start
-    below = below[under]
-    if len(below):
-        origins = below.astype(np.float32)
-        base = low[vertical] - 1.0
-        origins[:, vertical] = base
-        hits = _soup_rays(model).closest(origins, np.tile(up, (len(origins), 1)))
-        met = hits.face >= 0
-        lifts.append(below[met, vertical] - (base + hits.distance[met]))
-    heights = np.concatenate(lifts)
-    return float(heights.max()) if len(heights) else None
+    below = scene[0][np.unique(scene[1])]
+    inside = (below >= points.min(axis=0)) & (below <= points.max(axis=0))
+    below = below[inside[:, level].all(axis=1) & (below[:, vertical] < start)]
+    base = heights.min() - 1.0
+    met, distance = _first_hits(model, below, vertical, base, 1.0)
+    lifts = np.concatenate([lifts, below[met, vertical] - (base + distance[met])])
+    return float(lifts.max()) if len(lifts) else None
+
+
+def _first_hits(
+    soup: tuple[Double, Int], points: Double, vertical: int, height: float, way: float
+) -> tuple[Bool, Float]:
+    """Which of the vertical lines through points (P, 3), from a height on up (way 1) or down (-1),
+    meet the triangles, and how far from there."""
+    origins = points.astype(np.float32)
+    origins[:, vertical] = height
+    directions = np.zeros((len(points), 3), np.float32)
+    directions[:, vertical] = way
+    hits = RayScene(soup[0].astype(np.float32), soup[1]).closest(origins, directions)
+    return hits.face >= 0, hits.distance
 
 
 def _soup(surfaces: Sequence[Surface]) -> tuple[Double, Int]:
@@ -200,7 +180,3 @@ def _soup(surfaces: Sequence[Surface]) -> tuple[Double, Int]:
     points = np.concatenate([surface.points for surface in surfaces])
     triangles = [s.triangles + starts[i] for i, s in enumerate(surfaces)]
     return points, np.concatenate(triangles).astype(np.int32)
-
-
-def _soup_rays(soup: tuple[Double, Int]) -> RayScene:
-    return RayScene(soup[0].astype(np.float32), soup[1])

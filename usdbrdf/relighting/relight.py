@@ -7,6 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.asset.readers.render_scene import (
@@ -15,26 +17,23 @@ from usdbrdf.asset.readers.render_scene import (
     time_code,
     view_from_stage,
 )
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.asset.readers.views import cameras_of_views
+from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
-from usdbrdf.files.images import read_radiance, write_exr
-from usdbrdf.job.progress import say
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
+from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
+from usdbrdf.job.progress import say, warn
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.options import RelightOptions
 from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
-from usdbrdf.relighting.picture import (
-    DISPLAYED,
-    automatic_exposure,
-    check_picture_name,
-    exposure_levels,
-    refuse_taken,
-    write_picture,
-)
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
 from usdbrdf.relighting.render import mitsuba_variant, render_view
-from usdbrdf.relighting.views_from_document import views_from_document
-from usdbrdf.shading.denoise import OIDN, chosen_filter, denoise_picture
+from usdbrdf.transport.denoise import OIDN, chosen_filter, denoise_picture
+
+LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
+
+_LEVELS = 1 << 16  # pixels of a picture that the exposure is taken from
 
 
 def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
@@ -44,28 +43,27 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     of the asset is changed. Returns a summary of plain values.
     """
     options = options or RelightOptions()
-    _check(options, output, folder)
+    asset = Asset.made(folder)
+    _check(options, output, asset)
     mitsuba, noise = mitsuba_variant(), chosen_filter(options.denoise)
-    asset = Asset.at(folder)
-    if not asset.root_layer.is_file():
-        raise InputRefused(f"{folder}: there is no asset in this folder. [asset.missing]")
     stage = open_edited(asset)
     time = time_code(stage, options.frame)
-    inserts = options.inserts
-    captured = render_scene_from_stage(stage, time, lambda sentence: say(f"warning: {sentence}"))
+    captured = render_scene_from_stage(stage, time, warn)
     if options.views is None:
         views: tuple[Camera, ...] = (view_from_stage(stage, options.camera, time),)
     else:
-        views = views_from_document(options.views, asset, captured.metres_per_unit)
+        views = cameras_of_views(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
         views = tuple(view.at_width(options.width) for view in views)
     targets = _targets(output, views, options)
+    falls = any(insert.falls_from_eye_height for insert in options.inserts)
     scene = relit_scene(
         captured,
         options.lights,
-        inserts,
+        options.inserts,
         keep_emitters=options.keep_emitters,
-        eye_height=eye_height(stage) if any(i.falls_from_eye_height for i in inserts) else 0.0,
+        eye_height=eye_height(stage) if falls else 0.0,
+        allow_outside=options.allow_outside,
     )
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):
@@ -94,16 +92,15 @@ def _photograph(
 ) -> float | None:
     """Render and write all views; returns the exposure in stops of displayed pictures."""
     rendered = _rendered(mitsuba, loaded, views, options, denoise=denoise)
-    if targets[0].suffix.lower() not in DISPLAYED:
-        for target, picture in zip(targets, rendered, strict=True):
-            write_picture(target, picture, 0.0)
-        return None
-    if options.exposure is None:
+    displayed = targets[0].suffix.lower() in DISPLAYED
+    if displayed and options.exposure is None:
         stops = _write_exposed_alike(targets, rendered)
     else:
-        stops = options.exposure
+        stops = options.exposure or 0.0
         for target, picture in zip(targets, rendered, strict=True):
             write_picture(target, picture, stops)
+    if not displayed:
+        return None
     say(f"exposure: {stops:+.2f} stops{' (automatic)' if options.exposure is None else ''}")
     return stops
 
@@ -140,16 +137,35 @@ def _write_exposed_alike(targets: Sequence[Path], rendered: Iterator[Float]) -> 
     return stops
 
 
-def _check(options: RelightOptions, output: Path, folder: Path) -> None:
+def exposure_levels(picture: Float) -> Float:
+    """(N,) means of R, G and B at pixels all over the picture: what ``automatic_exposure`` needs
+    of it, at most 65536."""
+    means = picture.mean(axis=2).ravel()
+    return np.ascontiguousarray(means[:: -(-means.size // _LEVELS)])
+
+
+def automatic_exposure(levels: list[Float]) -> float:
+    """Stops that bring the 90th percentile of the mean of R, G and B over all pictures to 0.8."""
+    return float(np.log2(display_exposure(np.concatenate(levels))))
+
+
+def write_picture(path: Path, radiance: Float, stops: float) -> None:
+    """Float radiance as EXR; as PNG or JPEG times 2^stops, clipped, in sRGB."""
+    if path.suffix.lower() in LINEAR:
+        write_exr(path, radiance, half=False)
+    else:
+        write_preview_png(path, to_display_srgb8(radiance, exposure_scale=2.0**stops))
+
+
+def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
     """Everything that can be refused before the renderer is started."""
-    if options.views is None:
-        check_picture_name(output)
-    refuse_taken(output, folder=options.views is not None)
-    if output.resolve().is_relative_to(folder.resolve()):
+    if options.views is None and output.suffix.lower() not in (*LINEAR, *DISPLAYED):
         raise UsageError(
-            f"{output}: lies inside the asset {folder}, which stays as it is. Name another place "
-            "with -o. [relight.output]"
+            f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}. Choose one of "
+            "these extensions. [relight.format]"
         )
+    _refuse_taken(output, folder=options.views is not None)
+    asset.refuse_output(output, "relight.output")
     lights = options.lights
     if lights is not None and lights.suffix.lower() not in USD_SUFFIXES | SKY_SUFFIXES:
         raise UsageError(
@@ -161,10 +177,26 @@ def _check(options: RelightOptions, output: Path, folder: Path) -> None:
             raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
 
 
+def _refuse_taken(path: Path, *, folder: bool) -> None:
+    """OwnershipConflict where a file or folder stands where the other kind is to be written."""
+    if folder and path.exists() and not path.is_dir():
+        raise OwnershipConflict(f"{path}: not a folder. Name another with -o. [relight.output]")
+    if not folder and path.is_dir():
+        raise OwnershipConflict(
+            f"{path}: a folder of this name is in the place of the picture. Name another file "
+            "with -o. [relight.output]"
+        )
+    above = next((parent for parent in path.absolute().parents if parent.exists()), None)
+    if above is not None and not above.is_dir():
+        raise OwnershipConflict(
+            f"{path}: {above} is not a folder. Name another place with -o. [relight.output]"
+        )
+
+
 def _targets(output: Path, views: Sequence[Camera], options: RelightOptions) -> list[Path]:
     if options.views is None:
         return [output]
     targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
     for target in targets:
-        refuse_taken(target, folder=False)
+        _refuse_taken(target, folder=False)
     return targets

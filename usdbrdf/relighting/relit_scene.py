@@ -11,16 +11,16 @@ import numpy as np
 
 from usdbrdf.asset.readers.render_scene import (
     RenderScene,
-    render_scene_from_file,
     sky_of_picture,
 )
 from usdbrdf.errors import InputRefused
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
-from usdbrdf.model.material import Surface
+from usdbrdf.model.material import Surface, turned_up
 from usdbrdf.options import Insert
-from usdbrdf.relighting.insert import placed, turned_up, with_material
-from usdbrdf.relighting.inserted_models import surfaces_from_model
+from usdbrdf.relighting.insert import placed, with_material
+from usdbrdf.relighting.inserted_models import render_scene_of_others, surfaces_from_model
+from usdbrdf.untrusted.pictures import picture_from_file
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their
 # diagonal, or by a millimetre.
@@ -70,11 +70,13 @@ def relit_scene(
     *,
     keep_emitters: bool,
     eye_height: float,
+    allow_outside: Sequence[Path] = (),
 ) -> RelitScene:
     """All surfaces and lights, in metres, in the asset's world.
 
-    lights      USD file or latitude-longitude picture; None is the light of the asset
-    eye_height  metres from which models fall
+    lights         USD file or latitude-longitude picture; None is the light of the asset
+    eye_height     metres from which models fall
+    allow_outside  folders, beside their own, in which USD files may name others
     """
     if not asset.surfaces:
         raise InputRefused(
@@ -82,11 +84,13 @@ def relit_scene(
         )
     scene = RelitScene(surfaces=asset.surfaces, lights=asset.lights)
     if lights is not None:
-        surfaces, given = _light_of_file(lights, asset.up_axis)
+        surfaces, given = _light_of_file(lights, asset.up_axis, allow_outside)
         scene = lit_by_others(scene, surfaces, given, keep_emitters=keep_emitters)
     inserted: list[Surface] = []
     for insert in inserts:
-        dressed = [with_material(surface, insert) for surface in _model(insert, asset)]
+        dressed = [
+            with_material(surface, insert) for surface in _model(insert, asset, allow_outside)
+        ]
         inserted += placed(
             dressed,
             insert,
@@ -97,14 +101,16 @@ def relit_scene(
         )
     scene = RelitScene(surfaces=(*scene.surfaces, *inserted), lights=scene.lights)
     if not emits_light(scene):
-        _warn("nothing in the scene emits light; the picture will be black.")
+        warn("nothing in the scene emits light; the picture will be black.")
     return scene
 
 
-def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequence[Light]]:
+def _light_of_file(
+    file: Path, up_axis: str, allow: Sequence[Path]
+) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
-        return (), (sky_of_picture(file, up_axis),)
-    found = render_scene_from_file(file, _warn)
+        return (), (sky_of_picture(picture_from_file(file), up_axis),)
+    found = render_scene_of_others(file, allow)
     if not found.lights and not any(surface.material.emits for surface in found.surfaces):
         raise InputRefused(
             f"{file}: no light in it, and no mesh that glows. Add UsdLux lights or an "
@@ -115,13 +121,13 @@ def _light_of_file(file: Path, up_axis: str) -> tuple[Sequence[Surface], Sequenc
     return surfaces, [light.moved(turn) for light in found.lights]
 
 
-def _model(insert: Insert, asset: RenderScene) -> tuple[Surface, ...]:
+def _model(insert: Insert, asset: RenderScene, allow: Sequence[Path]) -> tuple[Surface, ...]:
     """In metres, with the asset's up axis."""
     suffix = insert.model.suffix.lower()
     if suffix in USD_SUFFIXES:
-        found = render_scene_from_file(insert.model, _warn)
+        found = render_scene_of_others(insert.model, allow)
         if found.lights:
-            _warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
+            warn(f"{insert.model}: the lights of an inserted model are left out; see --lights.")
         surfaces, model_up, scale = found.surfaces, found.up_axis, 1.0
     else:
         # glTF says metres and y up; the others say nothing and are taken to be as the asset is.
@@ -132,7 +138,3 @@ def _model(insert: Insert, asset: RenderScene) -> tuple[Surface, ...]:
         raise InputRefused(f"{insert.model}: no mesh in it. Export the surface. [relight.model]")
     turn = turned_up(insert.up or model_up, asset.up_axis) @ np.diag([scale, scale, scale, 1.0])
     return tuple(surface.moved(turn) for surface in surfaces)
-
-
-def _warn(sentence: str) -> None:
-    say(f"warning: {sentence}")

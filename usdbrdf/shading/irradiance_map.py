@@ -11,7 +11,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
-from usdbrdf.shading.denoise import denoise_lightmaps
+from usdbrdf.transport.denoise import denoise_lightmaps
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
 from usdbrdf.transport.textured_scene import TexturedScene

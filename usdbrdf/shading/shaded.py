@@ -15,9 +15,9 @@ from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.albedo import albedo_map
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
-from usdbrdf.shading.denoise import OIDN
 from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.shading.irradiance_map import denoised_irradiance, trace_irradiance
+from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.irradiance import Irradiance
 from usdbrdf.transport.textured_scene import TexturedScene

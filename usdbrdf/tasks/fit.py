@@ -22,9 +22,9 @@ from usdbrdf.material.refine import refined_light
 from usdbrdf.material.refined_irradiance import Lobes
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
-from usdbrdf.shading.denoise import AUTO, NONE, OIDN, chosen_filter
-from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task
+from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
+from usdbrdf.transport.environment import environment_from_file
 from usdbrdf.transport.lit_scene import LitScene
 
 # The maps that the fit reads.

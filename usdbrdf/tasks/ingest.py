@@ -14,11 +14,12 @@ from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.hashes import hash_of_files
-from usdbrdf.job.progress import say
+from usdbrdf.files.paths import files_below
+from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.untrusted.usd_paths import layers_of_usd
+from usdbrdf.untrusted.usd_files import layers_of_usd
 
 
 def ingest(
@@ -58,7 +59,7 @@ def ingest(
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         for warning in scan.warnings:
-            say(f"warning: {warning}")
+            warn(warning)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
@@ -115,6 +116,4 @@ def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str
 
 
 def _hash_of_folder(folder: Path, asset: Path) -> str:
-    own = asset.resolve()
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.is_relative_to(own)]
-    return hash_of_files(sorted(files), folder)
+    return hash_of_files(files_below(folder, without=asset), folder)

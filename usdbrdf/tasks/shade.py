@@ -15,15 +15,15 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import Aov, ShadedObject, colour
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Float
 from usdbrdf.options import ShadeOptions
-from usdbrdf.shading.denoise import chosen_filter
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface
-from usdbrdf.tasks.surroundings import environment_from_file
 from usdbrdf.tasks.task import Task
+from usdbrdf.transport.denoise import chosen_filter
+from usdbrdf.transport.environment import environment_from_file
 
 
 def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
@@ -55,7 +55,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
         identifiers = [item.identifier for item in objects]
         for doubt in shaded.doubts(identifiers):
-            say(f"warning: {doubt}")
+            warn(doubt)
         return {**shaded.summary(identifiers), "denoise": lightmap_filter}
 
     return task.run(work)

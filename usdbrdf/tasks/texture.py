@@ -14,7 +14,7 @@ from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import progress, say, warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
@@ -48,7 +48,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
         )
         found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
         for doubt in found.doubts():
-            say(f"warning: {doubt}")
+            warn(doubt)
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, size, options.quantile)
         write_texturing_layer(

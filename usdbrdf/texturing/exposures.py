@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Frames
 
@@ -148,5 +148,5 @@ def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
             f"{what} (limits: half a stop, {_MOST_CONTRADICTING:.0%} of the frames). {cause}. "
             "Export radiance in one unit for all frames. [texturing.exposure]"
         )
-    say(f"warning: {what}. {cause}. Correct them or leave them out. [texturing.exposure]")
+    warn(f"{what}. {cause}. Correct them or leave them out. [texturing.exposure]")
     return factor

@@ -1,7 +1,9 @@
-"""Meshes of PLY, OBJ and GLB files, vertex by vertex as they are stored."""
+"""Meshes and models of PLY, OBJ and GLB files: what ingest takes vertex by vertex as it is stored,
+and what is put into a scene with its materials."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -9,11 +11,16 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from trimesh.exchange.gltf import load_glb
 from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.colour import to_working_space
+from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.material import Material, Surface, constant_map, preview_material
+from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 
 SUFFIXES = (".ply", ".obj", ".glb")
 
@@ -28,6 +35,9 @@ _MIN_DIAGONAL = 1e-4
 
 # Faces with broken corners below this share are removed; above it the file is not what it says.
 _MAX_BROKEN_SHARE = 0.01
+
+# UsdPreviewSurface's own, where a file has no material.
+_GREY, _ROUGHNESS, _IOR = 0.18, 0.5, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,28 +68,44 @@ def mesh_from_file(path: Path) -> FileMesh:
         raise InputRefused(
             f"{path}: meshes are read from {', '.join(SUFFIXES)}. Convert it to PLY. [mesh.format]"
         )
-    if not path.is_file():
-        what = "is not a regular file" if path.exists() else "does not exist"
+    return read_in_child("mesh", f"{__name__}:read_mesh_here", path, FileMesh)
+
+
+def model_from_file(path: Path) -> tuple[Surface, ...]:
+    """The meshes of a file with their materials, in the file's own axes and units.
+
+    Base colour, its texture, vertex colours, metalness, roughness and emission are read; images
+    and 8-bit colours are sRGB, as these formats say. What an OBJ or GLB names must lie in its
+    folder. Corner normals are NaN where the file brings none.
+    """
+    if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
-            f"{path}: this mesh {what}. Name the mesh with --mesh, or put mesh.ply beside the "
-            "poses. [mesh.missing]"
+            f"{path}: models are read from USD, {', '.join(SUFFIXES)}. Convert it. [relight.model]"
         )
+    parts = (Surface, Material)
+    return read_in_child("mesh", f"{__name__}:read_model_here", path, tuple, parts=parts)
+
+
+def read_mesh_here(path: Path) -> FileMesh:
+    """``mesh_from_file`` in this process, which is to be a child."""
+    return checked_mesh(_parsed(path, _READERS[path.suffix.lower()]), path)
+
+
+def _parsed(path: Path, read: Callable[[BinaryIO], Any]) -> Any:
+    """What a reader makes of the open file, or InputRefused in one sentence."""
     try:
         with path.open("rb") as file:
-            mesh = _READERS[path.suffix.lower()](file)
-    except InputRefused:
+            return read(file)
+    except (InputRefused, MemoryError):
         raise
     except OSError as error:
         raise EnvironmentFailure(f"{path}: cannot be read ({error}). [mesh.read]") from error
-    except MemoryError as error:
-        raise EnvironmentFailure(f"{path}: not enough memory to read it. [mesh.memory]") from error
     # The readers raise whatever a damaged file makes them stumble over.
     except Exception as error:
         raise InputRefused(
             f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({_one_line(error)}). "
             "Export it again; a face must have three or four corners. [mesh.read]"
         ) from error
-    return checked_mesh(mesh, path)
 
 
 def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
@@ -229,3 +255,143 @@ _READERS = {
     ".obj": _mesh_from_obj,
     ".glb": _mesh_from_glb,
 }
+
+
+def read_model_here(path: Path) -> tuple[Surface, ...]:
+    """``model_from_file`` in this process, which is to be a child."""
+    # Its checks first: whatever is damaged is refused there, in one sentence.
+    if read_mesh_here(path).kept is not None:
+        raise InputRefused(
+            f"{path}: faces of it have NaN corners or vertices that do not exist. Export it again. "
+            "[relight.model]"
+        )
+    beside = _FilesBeside(path)
+    load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
+    stored = _parsed(path, lambda file: load(file, resolver=beside))
+    if beside.refused:
+        raise beside.refused[0]
+    # Normals are kept apart: a mesh of trimesh makes them up where there are none.
+    meshes = list(stored["geometry"].values()) if "geometry" in stored else [stored]
+    normals = [mesh.pop("vertex_normals", None) for mesh in meshes]
+    for mesh in meshes:
+        mesh["process"] = False
+    scene = trimesh.load_scene(stored)
+    normals_of = dict(zip(scene.geometry, normals, strict=True))
+    found = []
+    for node in sorted(scene.graph.nodes_geometry):
+        world_from_node, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            surface = _surface(f"{path.name}:{node}", mesh, normals_of[name])
+            found.append(surface.moved(np.asarray(world_from_node)))
+    return tuple(found)
+
+
+class _FilesBeside:
+    """Materials and pictures that a model names, as trimesh asks for them: only those in its folder
+    or below. trimesh passes over what fails, so the refusals are kept."""
+
+    def __init__(self, model: Path) -> None:
+        self.folder, self.refused = model.parent, list[InputRefused]()
+
+    def get(self, name: str) -> bytes:
+        last = name.replace("\\", "/").rsplit("/", 1)[-1].strip()
+        # Exporters write down where a picture was; it often travelled with the model.
+        if not (last and (path := self.folder / last).is_file() and not path.is_symlink()):
+            try:
+                path = contained(self.folder, name.strip())
+            except InputRefused as error:
+                self.refused.append(error)
+                raise
+        if path.is_file():  # a model without this texture is still a model
+            refuse_large("picture", path)
+        return path.read_bytes()
+
+    __getitem__ = get
+
+
+def _surface(name: str, mesh: Any, normals: Any) -> Surface:
+    points = np.asarray(mesh.vertices, np.float64)
+    triangles = np.ascontiguousarray(mesh.faces, np.int32)
+    uv = getattr(mesh.visual, "uv", None)
+    corner_uv = None
+    if uv is not None and len(uv) == len(points):
+        corner_uv = np.asarray(uv, np.float32)[triangles]
+    colours = _vertex_colours(mesh.visual)
+    material = _material(mesh.visual, textured=corner_uv is not None)
+    if colours is not None:
+        material = _plain_material(diffuse=constant_map(1.0), roughness=material.roughness)
+    corner_normals = np.full((*triangles.shape, 3), np.nan, np.float32)
+    if normals is not None and len(normals) == len(points):
+        given = np.asarray(normals, np.float32)[triangles]
+        length = np.linalg.norm(given, axis=-1, keepdims=True)
+        if np.isfinite(given).all() and (length > 1e-6).all():
+            corner_normals = np.asarray(given / length, np.float32)
+    return Surface(
+        name=name,
+        points=points,
+        triangles=triangles,
+        corner_normals=corner_normals,
+        corner_uv=corner_uv,
+        corner_colour=None if colours is None else colours[triangles],
+        material=material,
+    )
+
+
+def _vertex_colours(visual: Any) -> Float | None:
+    """(V, 3) linear; None where the file has none."""
+    if visual.kind != "vertex":
+        return None
+    colours = np.asarray(visual.vertex_colors, np.float32)[:, :3] / np.float32(255)
+    return np.asarray(to_working_space(colours[None], "srgb_rec709_scene")[0])
+
+
+def _plain_material(*, diffuse: Float, roughness: Float) -> Material:
+    """No metal, no light."""
+    black = constant_map(0.0)
+    return preview_material(
+        diffuse=diffuse, metallic=black[..., :1], roughness=roughness, emission=black, ior=_IOR
+    )
+
+
+def _material(visual: Any, *, textured: bool) -> Material:
+    stored = getattr(visual, "material", None)
+    if visual.kind != "texture" or stored is None:
+        roughness = constant_map(_ROUGHNESS)[..., :1]
+        return _plain_material(diffuse=constant_map(_GREY), roughness=roughness)
+    if hasattr(stored, "to_pbr"):  # the OBJ's Phong-like one
+        stored = stored.to_pbr()
+    base = _factor(stored.baseColorFactor, 3, 1.0)
+    metal_rough = _image(stored.metallicRoughnessTexture) if textured else None
+    metallic = _factor(stored.metallicFactor, 1, 1.0 if metal_rough is not None else 0.0)
+    roughness = _factor(stored.roughnessFactor, 1, 1.0 if metal_rough is not None else _ROUGHNESS)
+    emission = _factor(stored.emissiveFactor, 3, 0.0)
+    if textured and (picture := _image(stored.baseColorTexture)) is not None:
+        base = base * to_working_space(picture, "srgb_rec709_scene")
+    if textured and (picture := _image(stored.emissiveTexture)) is not None:
+        emission = emission * to_working_space(picture, "srgb_rec709_scene")
+    if metal_rough is not None:  # glTF: roughness in green, metalness in blue
+        roughness = roughness * metal_rough[..., 1:2]
+        metallic = metallic * metal_rough[..., 2:3]
+    mixed = preview_material(
+        diffuse=base, metallic=metallic, roughness=roughness, emission=emission, ior=_IOR
+    )
+    # The default of OBJ and of glTF, whose samplers the reader does not keep.
+    return replace(mixed, wrap="repeat")
+
+
+def _factor(value: Any, channels: int, fallback: float) -> Float:
+    """(1, 1, channels): trimesh keeps some factors as bytes, of which colours are linear."""
+    if value is None:
+        return np.full((1, 1, channels), fallback, np.float32)
+    numbers = np.atleast_1d(np.asarray(value))
+    if numbers.dtype == np.uint8:
+        numbers = numbers / 255.0
+    return np.asarray(numbers[:channels], np.float32).reshape(1, 1, channels)
+
+
+def _image(picture: Any) -> Float | None:
+    """(H, W, 3) float32 in [0, 1] of a PIL image."""
+    if picture is None:
+        return None
+    return np.asarray(picture.convert("RGB"), np.float32) / np.float32(255)

@@ -13,8 +13,8 @@ from pxr import Ar, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.objects import authored
-from usdbrdf.delivery.packaged_files import named_files
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 from usdbrdf.asset.layers.scan_layer import LENS, lens_from_pinhole
 from usdbrdf.asset.readers.objects import authored
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 _TOLERANCE = 1e-3
 
@@ -21,21 +21,8 @@ _EXPOSURE = ("exposure", *(f"exposure:{n}" for n in ("time", "fStop", "iso", "re
 _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
 
 
-def _exposure(scene: AssetStage) -> Iterator[Fault]:
-    for prim in scene.cameras:
-        camera = UsdGeom.Camera(prim)
-        times = _times(prim, _EXPOSURE)
-        scales = [camera.ComputeLinearExposureScale(time) for time in times] if camera else []
-        wrong = [scale for scale in scales if abs(scale - 1.0) > _TOLERANCE]
-        if wrong:
-            yield Fault(
-                site=prim,
-                message=f"the exposure scale is {wrong[0]:.4g} instead of 1 at {len(wrong)} of "
-                f"{len(scales)} times: the photographs are radiance already.",
-            )
-
-
-def _scale_to_one(site: Site) -> bool:
+@cure("exposure:responsivity")
+def scale_to_one(site: Site) -> bool:
     camera = UsdGeom.Camera(site)
     responsivity = camera.GetExposureResponsivityAttr()
     scales = {time: camera.ComputeLinearExposureScale(time) for time in _times(site, _EXPOSURE)}
@@ -46,19 +33,49 @@ def _scale_to_one(site: Site) -> bool:
     return all(done)
 
 
-def _lens(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Author exposure:responsivity so that the product is 1, and use a camera of your own "
+    "for another exposure.",
+    cure=scale_to_one,
+)
+def camera_exposure(scene: AssetStage) -> Iterator[Fault]:
+    """The exposure attributes of the capture camera multiply to 1 at every time. Its photographs
+    are radiance already; renderers that honour the attributes would show the asset brighter or
+    darker than the photographs."""
+    for prim in scene.cameras:
+        camera = UsdGeom.Camera(prim)
+        times = _times(prim, _EXPOSURE)
+        scales = [camera.ComputeLinearExposureScale(time) for time in times] if camera else []
+        wrong = [scale for scale in scales if abs(scale - 1.0) > _TOLERANCE]
+        if wrong:
+            yield Fault(
+                prim,
+                f"the exposure scale is {wrong[0]:.4g} instead of 1 at {len(wrong)} of "
+                f"{len(scales)} times: the photographs are radiance already.",
+            )
+
+
+@rule(
+    Severity.ERROR,
+    advice="Remove the opinions on the lens, and use a camera of your own for another view.",
+)
+def camera_lens(scene: AssetStage) -> Iterator[Fault]:
+    """Focal length, apertures and offsets of the capture camera show what its recorded pinhole
+    shows. Renderers use the first, usdbrdf the second: where they differ, pictures and photographs
+    do not lie over each other."""
     metres = UsdGeom.GetStageMetersPerUnit(scene.stage)
     for prim in scene.cameras:
         for time in _times(prim, (*LENS, *_PINHOLE)):
             pinhole, size = (prim.GetAttribute(name).Get(time) for name in _PINHOLE)
             lens = [prim.GetAttribute(name).Get(time) for name in LENS]
             if pinhole is None or size is None or not all([*list(size), *pinhole[:2]]):
-                yield Fault(site=prim, message="it states no pinhole, or no size of the pictures.")
+                yield Fault(prim, "it states no pinhole, or no size of the pictures.")
                 break
             if None in lens or not _same_view(lens, lens_from_pinhole(pinhole, size, metres)):
                 yield Fault(
-                    site=prim,
-                    message=f"focal length and apertures at time {time} are not those of "
+                    prim,
+                    f"focal length and apertures at time {time} are not those of "
                     "usdBrdf:capture:pinhole.",
                 )
                 break
@@ -79,12 +96,20 @@ def _times(prim: Usd.Prim, names: Sequence[str]) -> list[Usd.TimeCode]:
     return [Usd.TimeCode.Default(), *map(Usd.TimeCode, sorted(samples))]
 
 
-def _coordinates(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Remove the opinions on primvars:st or on the mesh; after a change of the geometry run "
+    "usdbrdf convert.",
+)
+def texture_coordinates(scene: AssetStage) -> Iterator[Fault]:
+    """Objects with maps have primvars:st, one value per corner, from 0 to 1. Without them, or after
+    a change of the mesh that did not carry them along, every texture is shown in the wrong place.
+    """
     for item in scene.objects:
         if authored(item, "usdBrdf:texturing:texelSize") is not None:
             problem = _problem_of(UsdGeom.PrimvarsAPI(item).GetPrimvar("st"), item)
             if problem:
-                yield Fault(site=item, message=problem)
+                yield Fault(item, problem)
 
 
 def _problem_of(st: UsdGeom.Primvar, item: Usd.Prim) -> str:
@@ -106,35 +131,4 @@ def _problem_of(st: UsdGeom.Primvar, item: Usd.Prim) -> str:
     return ""
 
 
-RULES = (
-    Rule(
-        name="CameraExposure",
-        severity=Severity.ERROR,
-        description="The exposure attributes of the capture camera multiply to 1 at every time. "
-        "Its photographs are radiance already; renderers that honour the attributes would show the "
-        "asset brighter or darker than the photographs.",
-        advice="Author exposure:responsivity so that the product is 1, and use a camera of your "
-        "own for another exposure.",
-        check=_exposure,
-        cure=Cure(name="ScaleToOne", description="exposure:responsivity", apply=_scale_to_one),
-    ),
-    Rule(
-        name="CameraLens",
-        severity=Severity.ERROR,
-        description="Focal length, apertures and offsets of the capture camera show what its "
-        "recorded pinhole shows. Renderers use the first, usdbrdf the second: where they differ, "
-        "pictures and photographs do not lie over each other.",
-        advice="Remove the opinions on the lens, and use a camera of your own for another view.",
-        check=_lens,
-    ),
-    Rule(
-        name="TextureCoordinates",
-        severity=Severity.ERROR,
-        description="Objects with maps have primvars:st, one value per corner, from 0 to 1. "
-        "Without them, or after a change of the mesh that did not carry them along, every texture "
-        "is shown in the wrong place.",
-        advice="Remove the opinions on primvars:st or on the mesh; after a change of the geometry "
-        "run usdbrdf convert.",
-        check=_coordinates,
-    ),
-)
+RULES = (camera_exposure, camera_lens, texture_coordinates)

@@ -14,8 +14,8 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Finding, Rule, finding_of
-from usdbrdf.validation.rules import RULES
 from usdbrdf.validation.standard import open_or_finding
+from usdbrdf.validation.validate import RULES
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,25 +9,37 @@ from pxr import Usd, UsdGeom, UsdLux, UsdShade
 from usdbrdf.asset.layers.lights_layer import EMISSIVE, USDLUX, VARIANT_SET
 from usdbrdf.asset.readers.objects import authored
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 
-def _selection(scene: AssetStage) -> Iterator[Fault]:
+@cure("select emissive, which is what shows already")
+def select_emissive(site: Site) -> bool:
+    return bool(site.GetVariantSet(VARIANT_SET).SetVariantSelection(EMISSIVE))
+
+
+@rule(Severity.WARNING, advice="Select emissive or usdlux.", cure=select_emissive)
+def lights_selection(scene: AssetStage) -> Iterator[Fault]:
+    """The variant of the set lights that is selected on the default prim exists. USD takes any name
+    and says nothing; there are then no UsdLux lights, and the lamps glow by their materials."""
     if _has_lights(scene) and scene.root_prim:
         lights = scene.root_prim.GetVariantSet(VARIANT_SET)
         if lights.GetVariantSelection() not in lights.GetVariantNames():
             yield Fault(
-                site=scene.root_prim,
-                message=f"the selected lights are {lights.GetVariantSelection()!r}, which is none "
+                scene.root_prim,
+                f"the selected lights are {lights.GetVariantSelection()!r}, which is none "
                 f"of the variants: the lamps glow as in {EMISSIVE}.",
             )
 
 
-def _select_emissive(site: Site) -> bool:
-    return bool(site.GetVariantSet(VARIANT_SET).SetVariantSelection(EMISSIVE))
-
-
-def _twice(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.WARNING,
+    advice="Select emissive, or give the opinion inside its variant; or deactivate the lights of "
+    "that lamp.",
+)
+def lamp_twice(scene: AssetStage) -> Iterator[Fault]:
+    """Where usdlux is selected in the set lights, the lamps that have lights do not glow by their
+    materials. An opinion that makes one glow again, or binds it a glowing material, beats the
+    variant: renderers count that lamp twice."""
     root = scene.root_prim
     if not _has_lights(scene) or not root or not scene.scopes:
         return
@@ -39,8 +51,7 @@ def _twice(scene: AssetStage) -> Iterator[Fault]:
             for glow in _emission(item):
                 if not scene.is_measured(glow):
                     yield Fault(
-                        site=glow,
-                        message=f"the lamp glows by this opinion, and shines by <{lights}> too.",
+                        glow, f"the lamp glows by this opinion, and shines by <{lights}> too."
                     )
 
 
@@ -85,29 +96,4 @@ def _rgb(attribute: Usd.Attribute) -> list[float]:
     return list(attribute.Get() or ())[:3]
 
 
-RULES = (
-    Rule(
-        name="LightsSelection",
-        severity=Severity.WARNING,
-        description="The variant of the set lights that is selected on the default prim exists. "
-        "USD takes any name and says nothing; there are then no UsdLux lights, and the lamps glow "
-        "by their materials.",
-        advice="Select emissive or usdlux.",
-        check=_selection,
-        cure=Cure(
-            name="SelectEmissive",
-            description="select emissive, which is what shows already",
-            apply=_select_emissive,
-        ),
-    ),
-    Rule(
-        name="LampTwice",
-        severity=Severity.WARNING,
-        description="Where usdlux is selected in the set lights, the lamps that have lights do not "
-        "glow by their materials. An opinion that makes one glow again, or binds it a glowing "
-        "material, beats the variant: renderers count that lamp twice.",
-        advice="Select emissive, or give the opinion inside its variant; or deactivate the lights "
-        "of that lamp.",
-        check=_twice,
-    ),
-)
+RULES = (lights_selection, lamp_twice)

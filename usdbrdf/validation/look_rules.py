@@ -9,10 +9,18 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 from usdbrdf.asset.layers.input_usd import BINDING
 from usdbrdf.asset.layers.looks import LIT, SHADED, VARIANT_SET
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 
-def _beside(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.WARNING,
+    advice="Author the binding inside the variant shaded of the default prim; leave it where the "
+    "object is to show one material in every look.",
+)
+def binding_beside_looks(scene: AssetStage) -> Iterator[Fault]:
+    """Materials are bound inside the variants of the set look. A binding of an object beside them
+    is a local opinion, which beats every variant: switching the look no longer changes that object.
+    """
     if not _own_looks(scene):
         return
     for item in scene.objects:
@@ -23,8 +31,8 @@ def _beside(scene: AssetStage) -> Iterator[Fault]:
                 for binding in spec.relationships if spec else ():
                     if _is_binding(binding):
                         yield Fault(
-                            site=prim,
-                            message=f"{binding.name} in @{layer.realPath}@ is no part of a look "
+                            prim,
+                            f"{binding.name} in @{layer.realPath}@ is no part of a look "
                             "and beats all of them.",
                         )
         yield from _stronger_ancestors(item)
@@ -37,46 +45,52 @@ def _stronger_ancestors(item: Usd.Prim) -> Iterator[Fault]:
             stronger = binding.GetMetadata("bindMaterialAs") == "strongerThanDescendants"
             if stronger and binding.GetName().startswith(BINDING) and binding.GetTargets():
                 yield Fault(
-                    site=item,
-                    message=f"<{binding.GetPath()}> is bound strongerThanDescendants and beats "
-                    "every look.",
+                    item,
+                    f"<{binding.GetPath()}> is bound strongerThanDescendants and beats every look.",
                 )
         prim = prim.GetParent()
 
 
-def _incomplete(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Run usdbrdf convert again, or bind a material to the object inside that look.",
+)
+def look_incomplete(scene: AssetStage) -> Iterator[Fault]:
+    """Every look binds a material to every object. An object without one shows the grey that a
+    viewer falls back to, which is easily taken for a measurement."""
     root = scene.root_prim.GetPath() if scene.root_prim else Sdf.Path()
     inside = [item for item in scene.objects if item.GetPath().HasPrefix(root)]
     for look in sorted(_own_looks(scene)):
         for item in inside:
             targets = _bound_in(scene, root, look, item)
             if not targets:
-                yield Fault(site=item, message=f"the look {look} binds no material to this object.")
+                yield Fault(item, f"the look {look} binds no material to this object.")
             for target in targets:
                 if target.IsPrimPath() and not UsdShade.Material(scene.stage.GetPrimAtPath(target)):
-                    yield Fault(
-                        site=item,
-                        message=f"the look {look} binds <{target}>, which is not a material.",
-                    )
+                    yield Fault(item, f"the look {look} binds <{target}>, which is not a material.")
 
 
-def _selection(scene: AssetStage) -> Iterator[Fault]:
-    if _own_looks(scene) and scene.root_prim:
-        looks = scene.root_prim.GetVariantSet(VARIANT_SET)
-        if looks.GetVariantSelection() not in looks.GetVariantNames():
-            yield Fault(
-                site=scene.root_prim,
-                message=f"the selected look is {looks.GetVariantSelection()!r}, which is none: "
-                "no object has a material.",
-            )
-
-
-def _select_known(site: Site) -> bool:
+@cure("select shaded, or lit")
+def select_known(site: Site) -> bool:
     looks = site.GetVariantSet(VARIANT_SET)
     for name in (SHADED, LIT):
         if name in looks.GetVariantNames():
             return bool(looks.SetVariantSelection(name))
     return False
+
+
+@rule(Severity.ERROR, advice="Select one of the looks that the variant set has.", cure=select_known)
+def look_selection(scene: AssetStage) -> Iterator[Fault]:
+    """The look that is selected on the default prim exists. USD takes any name and says nothing;
+    the objects then have no materials at all."""
+    if _own_looks(scene) and scene.root_prim:
+        looks = scene.root_prim.GetVariantSet(VARIANT_SET)
+        if looks.GetVariantSelection() not in looks.GetVariantNames():
+            yield Fault(
+                scene.root_prim,
+                f"the selected look is {looks.GetVariantSelection()!r}, which is none: "
+                "no object has a material.",
+            )
 
 
 def _own_looks(scene: AssetStage) -> set[str]:
@@ -110,32 +124,4 @@ def _is_binding(binding: Sdf.RelationshipSpec) -> bool:
     return name and bool(binding.targetPathList.GetAddedOrExplicitItems())
 
 
-RULES = (
-    Rule(
-        name="BindingBesideLooks",
-        severity=Severity.WARNING,
-        description="Materials are bound inside the variants of the set look. A binding of an "
-        "object beside them is a local opinion, which beats every variant: switching the look no "
-        "longer changes that object.",
-        advice="Author the binding inside the variant shaded of the default prim; leave it where "
-        "the object is to show one material in every look.",
-        check=_beside,
-    ),
-    Rule(
-        name="LookIncomplete",
-        severity=Severity.ERROR,
-        description="Every look binds a material to every object. An object without one shows the "
-        "grey that a viewer falls back to, which is easily taken for a measurement.",
-        advice="Run usdbrdf convert again, or bind a material to the object inside that look.",
-        check=_incomplete,
-    ),
-    Rule(
-        name="LookSelection",
-        severity=Severity.ERROR,
-        description="The look that is selected on the default prim exists. USD takes any name and "
-        "says nothing; the objects then have no materials at all.",
-        advice="Select one of the looks that the variant set has.",
-        check=_selection,
-        cure=Cure(name="SelectKnown", description="select shaded, or lit", apply=_select_known),
-    ),
-)
+RULES = (binding_beside_looks, look_incomplete, look_selection)

@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdShade
 from usdbrdf.asset.layers.preview_surface import PreviewLobe, preview_surface_from_fit
 from usdbrdf.asset.readers.objects import authored
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 Types = Sdf.ValueTypeNames
 
@@ -32,7 +32,22 @@ _MAPPINGS = (_MEASURED, "matched")
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
 
-def _colour_space(scene: AssetStage) -> Iterator[Fault]:
+@cure("sourceColorSpace = raw")
+def read_raw(site: Site) -> bool:
+    UsdShade.Shader(site).CreateInput("sourceColorSpace", Types.Token).Set("raw")
+    return True
+
+
+@rule(
+    Severity.ERROR,
+    advice="Author inputs:sourceColorSpace = raw on the texture, or remove the opinion that says "
+    "otherwise.",
+    cure=read_raw,
+)
+def texture_color_space(scene: AssetStage) -> Iterator[Fault]:
+    """Textures in OpenEXR or Radiance files hold linear values and are read as such
+    (sourceColorSpace = raw). With auto or sRGB several applications decode them as sRGB, and every
+    colour comes out darker."""
     for scope in _SCOPES:
         for shader in scene.shaders(scope, "UsdUVTexture"):
             file = _input_value(shader, "file")
@@ -40,48 +55,75 @@ def _colour_space(scene: AssetStage) -> Iterator[Fault]:
             space = _input_value(shader, "sourceColorSpace") or "auto"
             if suffix in _LINEAR_FORMATS and space != "raw":
                 yield Fault(
-                    site=shader.GetPrim(),
-                    message=f"sourceColorSpace is {space}, but @{file.path}@ holds linear values.",
+                    shader.GetPrim(),
+                    f"sourceColorSpace is {space}, but @{file.path}@ holds linear values.",
                 )
 
 
-def _read_raw(site: Site) -> bool:
-    UsdShade.Shader(site).CreateInput("sourceColorSpace", Types.Token).Set("raw")
-    return True
-
-
-def _specular_color(scene: AssetStage) -> Iterator[Fault]:
-    for scope in _SCOPES:
-        for shader in scene.shaders(scope, "UsdPreviewSurface"):
-            colour = shader.GetInput("specularColor")
-            if colour and _has_opinion(colour) and not _input_value(shader, "useSpecularWorkflow"):
-                yield Fault(
-                    site=colour.GetAttr(),
-                    message="specularColor is authored, but useSpecularWorkflow is 0: some "
-                    "applications multiply it onto the reflectance that ior gives.",
-                )
-
-
-def _block(site: Site) -> bool:
+@cure("block inputs:specularColor")
+def block(site: Site) -> bool:
     site.SetConnections([])
     site.Block()
     return True
 
 
-def _lobe(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Remove or block inputs:specularColor; or set useSpecularWorkflow to 1, if the measured "
+    "reflectance is to be replaced.",
+    cure=block,
+)
+def specular_color(scene: AssetStage) -> Iterator[Fault]:
+    """Materials of ours state their reflectance by ior and have no specularColor. The specification
+    ignores it while useSpecularWorkflow is 0; Blender and three.js do not, and show a highlight of
+    half the strength."""
+    for scope in _SCOPES:
+        for shader in scene.shaders(scope, "UsdPreviewSurface"):
+            colour = shader.GetInput("specularColor")
+            if colour and _has_opinion(colour) and not _input_value(shader, "useSpecularWorkflow"):
+                yield Fault(
+                    colour.GetAttr(),
+                    "specularColor is authored, but useSpecularWorkflow is 0: some "
+                    "applications multiply it onto the reflectance that ior gives.",
+                )
+
+
+@cure("the record as measured; roughness, ior and factor that it stands for")
+def show_record(site: Site) -> bool:
+    """The record as it was measured, and the material as that record says."""
+    scene = AssetStage(site.GetStage())
+    surface = scene.surface_of(site)
+    if surface is None:
+        return False
+    _restore_record(scene, site)
+    wanted = _recorded_lobe(site)
+    for shown, value in _contradictions(scene, surface, wanted) if wanted else ():
+        scale = shown.GetTypeName() == Types.Float4
+        shown.Set(Gf.Vec4f(value, value, value, 1.0) if scale else value)
+    return True
+
+
+@rule(
+    Severity.ERROR,
+    advice="To change how a surface looks author roughness and ior of its material; leave the "
+    "record of the measurement as it is.",
+    cure=show_record,
+)
+def lobe_matches_fit(scene: AssetStage) -> Iterator[Fault]:
+    """Roughness, ior and the factor on the colour of an object's material are those that its
+    recorded phi and psi stand for under the recorded mapping. Where they differ, the file
+    contradicts itself: somebody edited the record, which changes no picture, or a layer of ours.
+    What an artist's layer says about the material is not judged."""
     for item in scene.objects:
         wanted, surface = _recorded_lobe(item), scene.surface_of(item)
         if wanted is None or surface is None:
             continue
-        for shown, value in _shown(surface, wanted):
-            # What an artist changes on purpose is theirs.
-            if scene.is_measured(shown) and abs(_first(shown.Get()) - value) > _TOLERANCE:
-                yield Fault(
-                    site=item,
-                    message=f"<{shown.GetPath()}> is {_first(shown.Get()):.4g}, but by "
-                    f"usdBrdf:fit:phi and psi under the mapping {_mapping(item)} it is "
-                    f"{value:.4g}.",
-                )
+        for shown, value in _contradictions(scene, surface, wanted):
+            yield Fault(
+                item,
+                f"<{shown.GetPath()}> is {_first(shown.Get()):.4g}, but by usdBrdf:fit:phi and "
+                f"psi under the mapping {_mapping(item)} it is {value:.4g}.",
+            )
 
 
 def _recorded_lobe(item: Usd.Prim) -> PreviewLobe | None:
@@ -95,6 +137,16 @@ def _recorded_lobe(item: Usd.Prim) -> PreviewLobe | None:
 
 def _mapping(item: Usd.Prim) -> str:
     return str(authored(item, "usdBrdf:fit:mapping") or _MEASURED)
+
+
+def _contradictions(
+    scene: AssetStage, surface: UsdShade.Shader, wanted: PreviewLobe
+) -> Iterator[tuple[Usd.Attribute, float]]:
+    """The attributes of our layers that show another lobe, and what they should be; what an artist
+    changes on purpose is theirs."""
+    for shown, value in _shown(surface, wanted):
+        if scene.is_measured(shown) and abs(_first(shown.Get()) - value) > _TOLERANCE:
+            yield shown, value
 
 
 def _shown(surface: UsdShade.Shader, wanted: PreviewLobe) -> Iterator[tuple[Usd.Attribute, float]]:
@@ -115,21 +167,6 @@ def _first(value: Any) -> float:
     return float(value[0] if isinstance(value, Gf.Vec4f) else value)
 
 
-def _show_record(site: Site) -> bool:
-    """The record as it was measured, and the material as that record says."""
-    scene = AssetStage(site.GetStage())
-    surface = scene.surface_of(site)
-    if surface is None:
-        return False
-    _restore_record(scene, site)
-    wanted = _recorded_lobe(site)
-    for shown, value in _shown(surface, wanted) if wanted else ():
-        if scene.is_measured(shown) and abs(_first(shown.Get()) - value) > _TOLERANCE:
-            scale = shown.GetTypeName() == Types.Float4
-            shown.Set(Gf.Vec4f(value, value, value, 1.0) if scale else value)
-    return True
-
-
 def _restore_record(scene: AssetStage, item: Usd.Prim) -> None:
     """What others say of the measurement gives way to what our layers say, be it nothing."""
     for name in _RECORD:
@@ -142,44 +179,62 @@ def _restore_record(scene: AssetStage, item: Usd.Prim) -> None:
                 recorded.Set(ours)
 
 
-def _emitter_albedo(scene: AssetStage) -> Iterator[Fault]:
-    for item in scene.objects:
-        surface = scene.surface_of(item)
-        if authored(item, "usdBrdf:emitter:radiance") is not None and surface:
-            diffuse = surface.GetInput("diffuseColor")
-            if not diffuse or diffuse.HasConnectedSource() or diffuse.Get() != _BLACK:
-                yield Fault(
-                    site=surface.GetPrim(),
-                    message=f"<{item.GetPath()}> emits light, and its emission map is all that "
-                    "leaves it, but its material has a diffuseColor as well.",
-                )
-
-
-def _look_materials(scene: AssetStage) -> Iterator[Fault]:
-    for shader in scene.shaders("looks", "UsdPreviewSurface"):
-        diffuse, ior = shader.GetInput("diffuseColor"), shader.GetInput("ior")
-        lit = not diffuse or diffuse.HasConnectedSource() or diffuse.Get() != _BLACK
-        shiny = not ior or ior.Get() is None or abs(float(ior.Get()) - 1.0) > _TOLERANCE
-        if lit or shiny:
-            what = "diffuseColor is not black" if lit else "ior is not 1"
-            yield Fault(
-                site=shader.GetPrim(),
-                message=f"{what}: light of the scene falls into the picture of the map.",
-            )
-
-
-def _blacken(site: Site) -> bool:
+@cure("diffuseColor = black")
+def blacken(site: Site) -> bool:
     diffuse = UsdShade.Shader(site).CreateInput("diffuseColor", Types.Color3f)
     diffuse.GetAttr().SetConnections([])
     diffuse.Set(_BLACK)
     return True
 
 
-def _reflect_nothing(site: Site) -> bool:
+@rule(
+    Severity.ERROR,
+    advice="Author diffuseColor black without a connection, or edit the emission instead.",
+    cure=blacken,
+)
+def emitter_albedo(scene: AssetStage) -> Iterator[Fault]:
+    """The emission map of an emitter is all the light that was seen to leave it. A diffuseColor
+    beside it adds what the other lamps would cast on it, a second time."""
+    for item in scene.objects:
+        surface = scene.surface_of(item)
+        emits = authored(item, "usdBrdf:emitter:radiance") is not None
+        if emits and surface and not _is_black(surface):
+            yield Fault(
+                surface.GetPrim(),
+                f"<{item.GetPath()}> emits light, and its emission map is all that leaves it, but "
+                "its material has a diffuseColor as well.",
+            )
+
+
+@cure("black, ior 1")
+def only_glow(site: Site) -> bool:
     shader = UsdShade.Shader(site)
     shader.CreateInput("ior", Types.Float).Set(1.0)
     shader.CreateInput("roughness", Types.Float).Set(1.0)
-    return _blacken(site)
+    return bool(blacken.apply(site))
+
+
+@rule(
+    Severity.ERROR,
+    advice="Remove the opinions on the materials below the scope of the looks.",
+    cure=only_glow,
+)
+def look_material(scene: AssetStage) -> Iterator[Fault]:
+    """Materials of the looks that show maps only glow: black diffuseColor, ior 1. Anything else
+    mixes the light of the scene into the map that is looked at."""
+    for shader in scene.shaders("looks", "UsdPreviewSurface"):
+        ior = shader.GetInput("ior")
+        shiny = not ior or ior.Get() is None or abs(float(ior.Get()) - 1.0) > _TOLERANCE
+        if shiny or not _is_black(shader):
+            what = "ior is not 1" if _is_black(shader) else "diffuseColor is not black"
+            yield Fault(
+                shader.GetPrim(), f"{what}: light of the scene falls into the picture of the map."
+            )
+
+
+def _is_black(shader: UsdShade.Shader) -> bool:
+    diffuse = shader.GetInput("diffuseColor")
+    return bool(diffuse and not diffuse.HasConnectedSource() and diffuse.Get() == _BLACK)
 
 
 def _input_value(shader: UsdShade.Shader, name: str) -> Any:
@@ -193,61 +248,4 @@ def _has_opinion(wanted: UsdShade.Input) -> bool:
     return bool(wanted.GetAttr().HasAuthoredValue() or wanted.HasConnectedSource())
 
 
-RULES = (
-    Rule(
-        name="TextureColorSpace",
-        severity=Severity.ERROR,
-        description="Textures in OpenEXR or Radiance files hold linear values and are read as such "
-        "(sourceColorSpace = raw). With auto or sRGB several applications decode them as sRGB, and "
-        "every colour comes out darker.",
-        advice="Author inputs:sourceColorSpace = raw on the texture, or remove the opinion that "
-        "says otherwise.",
-        check=_colour_space,
-        cure=Cure(name="ReadRaw", description="sourceColorSpace = raw", apply=_read_raw),
-    ),
-    Rule(
-        name="SpecularColor",
-        severity=Severity.ERROR,
-        description="Materials of ours state their reflectance by ior and have no specularColor. "
-        "The specification ignores it while useSpecularWorkflow is 0; Blender and three.js do not, "
-        "and show a highlight of half the strength.",
-        advice="Remove or block inputs:specularColor; or set useSpecularWorkflow to 1, if the "
-        "measured reflectance is to be replaced.",
-        check=_specular_color,
-        cure=Cure(name="Block", description="block inputs:specularColor", apply=_block),
-    ),
-    Rule(
-        name="LobeMatchesFit",
-        severity=Severity.ERROR,
-        description="Roughness, ior and the factor on the colour of an object's material are those "
-        "that its recorded phi and psi stand for under the recorded mapping. Where they differ, "
-        "the file contradicts itself: somebody edited the record, which changes no picture, or a "
-        "layer of ours. What an artist's layer says about the material is not judged.",
-        advice="To change how a surface looks author roughness and ior of its material; leave the "
-        "record of the measurement as it is.",
-        check=_lobe,
-        cure=Cure(
-            name="ShowRecord",
-            description="the record as measured; roughness, ior and factor that it stands for",
-            apply=_show_record,
-        ),
-    ),
-    Rule(
-        name="EmitterAlbedo",
-        severity=Severity.ERROR,
-        description="The emission map of an emitter is all the light that was seen to leave it. A "
-        "diffuseColor beside it adds what the other lamps would cast on it, a second time.",
-        advice="Author diffuseColor black without a connection, or edit the emission instead.",
-        check=_emitter_albedo,
-        cure=Cure(name="Blacken", description="diffuseColor = black", apply=_blacken),
-    ),
-    Rule(
-        name="LookMaterial",
-        severity=Severity.ERROR,
-        description="Materials of the looks that show maps only glow: black diffuseColor, ior 1. "
-        "Anything else mixes the light of the scene into the map that is looked at.",
-        advice="Remove the opinions on the materials below the scope of the looks.",
-        check=_look_materials,
-        cure=Cure(name="OnlyGlow", description="black, ior 1", apply=_reflect_nothing),
-    ),
-)
+RULES = (texture_color_space, specular_color, lobe_matches_fit, emitter_albedo, look_material)

@@ -14,7 +14,7 @@ from pxr import Sdf, Usd
 
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Rule, Severity
-from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.validate import RULES
 
 CATEGORY = "usdbrdf"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import NamedTuple
 
 from pxr import Sdf, Usd
@@ -13,7 +12,7 @@ from pxr import Sdf, Usd
 from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, Fact, facts_by_attribute
 from usdbrdf.asset.readers.objects import authored
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Cure, Fault, Rule, Severity, Site
+from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 # The table, by the attributes' names.
 FACTS = facts_by_attribute()
@@ -28,6 +27,42 @@ class Said(NamedTuple):
     instance: str
 
 
+@rule(
+    Severity.ERROR,
+    advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf fit.",
+)
+def fit_range(scene: AssetStage) -> Iterator[Fault]:
+    """phi and psi lie between 0 and 1, and their errors are finite and not negative. Other values
+    have no meaning in the model of the lobe."""
+    return out_of_range(scene, lambda fact: fact.schema == FIT)
+
+
+@rule(
+    Severity.WARNING,
+    advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf convert "
+    "again.",
+)
+def record_range(scene: AssetStage) -> Iterator[Fault]:
+    """What else the layers record of a measurement lies in the range that makes sense: shares
+    between 0 and 1, sizes, errors and radiances finite and not negative."""
+    return out_of_range(scene, lambda fact: fact.schema != FIT and not _is_albedo(fact))
+
+
+@rule(
+    Severity.WARNING,
+    advice="Look at the irradiance map of the object and at the lamps; see the options of usdbrdf "
+    "shade.",
+)
+def albedo_range(scene: AssetStage) -> Iterator[Fault]:
+    """The mean albedo of an object lies between 0 and 1. More means that light was missed: a lamp
+    that no photograph shows, or photographs that are not radiometric."""
+    return out_of_range(scene, _is_albedo)
+
+
+def _is_albedo(fact: Fact) -> bool:
+    return fact.schema == SHADING and fact.name == "meanAlbedo"
+
+
 def out_of_range(
     scene: AssetStage, about: Callable[[Fact], bool], facts: Mapping[str, Fact] = FACTS
 ) -> Iterator[Fault]:
@@ -39,7 +74,7 @@ def out_of_range(
         numbers = [value] if isinstance(value, (int, float)) else list(value)
         if not all(math.isfinite(x) and fact.low <= x <= fact.high for x in numbers):
             shown, limits = ", ".join(f"{x:g}" for x in numbers), f"{fact.low:g} to {fact.high:g}"
-            yield Fault(site=attribute, message=f"the value is {shown}, outside {limits}.")
+            yield Fault(attribute, f"the value is {shown}, outside {limits}.")
 
 
 def _said(scene: AssetStage, facts: Mapping[str, Fact]) -> Iterator[Said]:
@@ -58,7 +93,14 @@ def _said_of(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[Said]:
             yield Said(attribute, facts.get(general if instance else name), instance)
 
 
-def _fit_status(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Run usdbrdf fit again; do not change the status by hand.",
+)
+def fit_status(scene: AssetStage) -> Iterator[Fault]:
+    """An object whose status is measured states phi, psi, their errors and how far the photographs
+    determine them; one whose status is prior states phi and psi. A number without its error must
+    not pass for a measurement."""
     for prim in scene.recorded:
         status = authored(prim, "usdBrdf:fit:status")
         wanted = {"measured": ["phi", "psi", "phiError"], "prior": ["phi", "psi"]}.get(status, [])
@@ -71,9 +113,16 @@ def _fit_status(scene: AssetStage) -> Iterator[Fault]:
             missing += [name for name, value in sure.items() if value in (None, "none")]
         if missing:
             yield Fault(
-                site=prim.GetAttribute("usdBrdf:fit:status"),
-                message=f"the status is {status}, but there is no {', '.join(missing)}.",
+                prim.GetAttribute("usdBrdf:fit:status"),
+                f"the status is {status}, but there is no {', '.join(missing)}.",
             )
+
+
+@rule(Severity.ERROR, advice="Use one of the words that the message lists.")
+def allowed_tokens(scene: AssetStage) -> Iterator[Fault]:
+    """Attributes with a fixed vocabulary, such as usdBrdf:fit:status, hold one of its words. USD
+    itself does not check that."""
+    return not_allowed(scene)
 
 
 def not_allowed(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
@@ -82,7 +131,17 @@ def not_allowed(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterato
         value = attribute.Get()
         if fact and fact.tokens and value not in fact.tokens:
             message = f"{value!r} is none of {', '.join(fact.tokens)}."
-            yield Fault(site=attribute, message=message)
+            yield Fault(attribute, message)
+
+
+@rule(
+    Severity.WARNING,
+    advice="Correct the name, or put values of your own into another namespace.",
+)
+def undeclared_attribute(scene: AssetStage) -> Iterator[Fault]:
+    """Attributes whose names begin with usdBrdf: are declared by the schemas. One that is not is
+    misspelt, or comes from another version of usdbrdf."""
+    return undeclared(scene)
 
 
 def undeclared(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
@@ -90,21 +149,23 @@ def undeclared(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator
     for attribute, fact, _ in _said(scene, facts):
         if fact is None:
             message = "no usdBrdf schema declares an attribute of this name: nothing reads it."
-            yield Fault(site=attribute, message=message)
+            yield Fault(attribute, message)
 
 
-def _not_applied(scene: AssetStage) -> Iterator[Fault]:
-    for prim in scene.recorded:
-        for name in _missing_schemas(prim):
-            yield Fault(
-                site=prim,
-                message=f"it has attributes of {name}, but that schema is not applied to it.",
-            )
-
-
-def _apply_schemas(site: Site) -> bool:
+@cure("apply the missing schemas")
+def apply(site: Site) -> bool:
     done = [site.AddAppliedSchema(name) for name in _missing_schemas(site)]
     return all(done)
+
+
+@rule(Severity.WARNING, advice="Apply the schema to the prim.", cure=apply)
+def schema_not_applied(scene: AssetStage) -> Iterator[Fault]:
+    """A prim with attributes of a usdBrdf schema has that schema applied. Some tools lose applied
+    schemas while they copy attributes; applications then show the values without documentation, and
+    find no objects by their schema."""
+    for prim in scene.recorded:
+        for name in _missing_schemas(prim):
+            yield Fault(prim, f"it has attributes of {name}, but that schema is not applied to it.")
 
 
 def _missing_schemas(prim: Usd.Prim) -> list[str]:
@@ -116,97 +177,34 @@ def _missing_schemas(prim: Usd.Prim) -> list[str]:
     return sorted(wanted.difference(applied))
 
 
-def _identifiers(scene: AssetStage) -> Iterator[Fault]:
+@rule(
+    Severity.ERROR,
+    advice="Author another usdBrdf:identifier on the copy, or remove usdBrdf:label from it: it is "
+    "then no object of the capture.",
+)
+def object_identifier(scene: AssetStage) -> Iterator[Fault]:
+    """Every object has an identifier of its own, which names its material and its textures. A
+    copied object that keeps the identifier shares both with the original, and what is measured of
+    one overwrites the other."""
     first: dict[str, Usd.Prim] = {}
     for item in scene.objects:
         identifier = str(authored(item, "usdBrdf:identifier") or "")
         if not Sdf.Path.IsValidIdentifier(identifier):
-            yield Fault(
-                site=item,
-                message=f"usdBrdf:identifier is {identifier!r}, which names no material.",
-            )
+            yield Fault(item, f"usdBrdf:identifier is {identifier!r}, which names no material.")
         elif identifier in first:
             yield Fault(
-                site=item,
-                message=f"<{first[identifier].GetPath()}> has the identifier {identifier} too.",
+                item, f"<{first[identifier].GetPath()}> has the identifier {identifier} too."
             )
         first.setdefault(identifier, item)
 
 
-def _is_albedo(fact: Fact) -> bool:
-    return fact.schema == SHADING and fact.name == "meanAlbedo"
-
-
 RULES = (
-    Rule(
-        name="FitRange",
-        severity=Severity.ERROR,
-        description="phi and psi lie between 0 and 1, and their errors are finite and not "
-        "negative. Other values have no meaning in the model of the lobe.",
-        advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf fit.",
-        check=partial(out_of_range, about=lambda fact: fact.schema == FIT),
-    ),
-    Rule(
-        name="RecordRange",
-        severity=Severity.WARNING,
-        description="What else the layers record of a measurement lies in the range that makes "
-        "sense: shares between 0 and 1, sizes, errors and radiances finite and not negative.",
-        advice="Remove the opinion that is stronger than the measurement's, or run usdbrdf convert "
-        "again.",
-        check=partial(out_of_range, about=lambda fact: fact.schema != FIT and not _is_albedo(fact)),
-    ),
-    Rule(
-        name="FitStatus",
-        severity=Severity.ERROR,
-        description="An object whose status is measured states phi, psi, their errors and how far "
-        "the photographs determine them; one whose status is prior states phi and psi. A number "
-        "without its error must not pass for a measurement.",
-        advice="Run usdbrdf fit again; do not change the status by hand.",
-        check=_fit_status,
-    ),
-    Rule(
-        name="AllowedTokens",
-        severity=Severity.ERROR,
-        description="Attributes with a fixed vocabulary, such as usdBrdf:fit:status, hold one of "
-        "its words. USD itself does not check that.",
-        advice="Use one of the words that the message lists.",
-        check=not_allowed,
-    ),
-    Rule(
-        name="UndeclaredAttribute",
-        severity=Severity.WARNING,
-        description="Attributes whose names begin with usdBrdf: are declared by the schemas. One "
-        "that is not is misspelt, or comes from another version of usdbrdf.",
-        advice="Correct the name, or put values of your own into another namespace.",
-        check=undeclared,
-    ),
-    Rule(
-        name="SchemaNotApplied",
-        severity=Severity.WARNING,
-        description="A prim with attributes of a usdBrdf schema has that schema applied. Some "
-        "tools lose applied schemas while they copy attributes; applications then show the values "
-        "without documentation, and find no objects by their schema.",
-        advice="Apply the schema to the prim.",
-        check=_not_applied,
-        cure=Cure(name="Apply", description="apply the missing schemas", apply=_apply_schemas),
-    ),
-    Rule(
-        name="ObjectIdentifier",
-        severity=Severity.ERROR,
-        description="Every object has an identifier of its own, which names its material and its "
-        "textures. A copied object that keeps the identifier shares both with the original, and "
-        "what is measured of one overwrites the other.",
-        advice="Author another usdBrdf:identifier on the copy, or remove usdBrdf:label from it: it "
-        "is then no object of the capture.",
-        check=_identifiers,
-    ),
-    Rule(
-        name="AlbedoRange",
-        severity=Severity.WARNING,
-        description="The mean albedo of an object lies between 0 and 1. More means that light was "
-        "missed: a lamp that no photograph shows, or photographs that are not radiometric.",
-        advice="Look at the irradiance map of the object and at the lamps; see the options of "
-        "usdbrdf shade.",
-        check=partial(out_of_range, about=_is_albedo),
-    ),
+    fit_range,
+    record_range,
+    fit_status,
+    allowed_tokens,
+    undeclared_attribute,
+    schema_not_applied,
+    object_identifier,
+    albedo_range,
 )

@@ -25,7 +25,7 @@ class Severity(str, Enum):
     INFO = "info"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Fault:
     """One thing that a rule does not accept; ``severity`` only where it is not the rule's own."""
 
@@ -47,6 +47,9 @@ class Cure:
     apply: Callable[[Site], bool]
 
 
+Check: TypeAlias = Callable[[AssetStage], Iterable[Fault]]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rule:
     """A rule about stages of ours.
@@ -60,8 +63,30 @@ class Rule:
     severity: Severity
     description: str
     advice: str
-    check: Callable[[AssetStage], Iterable[Fault]]
+    check: Check
     cure: Cure | None = None
+
+
+def cure(description: str) -> Callable[[Callable[[Site], bool]], Cure]:
+    """Decorates what authors a cure: the cure of its name (``read_raw`` becomes ReadRaw)."""
+    return lambda apply: Cure(name=_title(apply), description=description, apply=apply)
+
+
+def rule(severity: Severity, *, advice: str, cure: Cure | None = None) -> Callable[[Check], Rule]:
+    """Decorates a check: the rule of its name (``layer_missing`` becomes LayerMissing), whose
+    description is its docstring."""
+    return lambda check: Rule(
+        name=_title(check),
+        severity=severity,
+        description=" ".join((check.__doc__ or "").split()),
+        advice=advice,
+        check=check,
+        cure=cure,
+    )
+
+
+def _title(function: Callable[..., object]) -> str:
+    return function.__name__.title().replace("_", "")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
-from usdbrdf.asset.readers.compose import in_one_line
+from usdbrdf.asset.readers.compose import in_one_line, try_in_child
 from usdbrdf.validation.rule import Finding, Severity, Site, layer_in_words, site_in_words
 
 OPEN = "usd.Open"
@@ -29,7 +29,9 @@ _SEVERITIES = {
 
 
 def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
-    """The stage, from the files as they are now; or why USD cannot open it."""
+    """The stage, from the files as they are now; or why USD cannot open it. InputRefused where it
+    crashes on them."""
+    try_in_child(root_layer, composes=False)
     try:
         with _no_warnings():
             stage = Usd.Stage.Open(str(root_layer))

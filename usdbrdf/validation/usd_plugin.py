@@ -13,7 +13,7 @@ from usdbrdf.asset.schema import validators_path
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Rule, Severity, Site
-from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.validate import RULES
 
 # USD imports the module of this name, and begins the names of its validators with it.
 PLUGIN = "usdbrdf.validation.usd_plugin"

@@ -1,4 +1,4 @@
-"""An asset folder -> findings, and the list of what is looked for."""
+"""All rules of ours; an asset folder -> findings; the list of what is looked for."""
 
 from __future__ import annotations
 
@@ -8,10 +8,28 @@ from pathlib import Path
 
 from pxr import Usd
 
+from usdbrdf.validation import (
+    capture_rules,
+    file_rules,
+    layer_rules,
+    lights_rules,
+    look_rules,
+    material_rules,
+    record_rules,
+)
 from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import PREFIX, Finding, Severity, finding_of
-from usdbrdf.validation.rules import RULES
+from usdbrdf.validation.rule import PREFIX, Finding, Rule, Severity, finding_of
 from usdbrdf.validation.standard import open_or_finding, standard_findings, standard_rules
+
+RULES: tuple[Rule, ...] = (
+    *layer_rules.RULES,
+    *file_rules.RULES,
+    *capture_rules.RULES,
+    *record_rules.RULES,
+    *material_rules.RULES,
+    *look_rules.RULES,
+    *lights_rules.RULES,
+)
 
 
 @dataclass(frozen=True, kw_only=True)

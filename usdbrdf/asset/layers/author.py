@@ -174,8 +174,9 @@ def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
         return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
 
     UsdUtils.ModifyAssetPaths(stored, absolute)
-    # Sublayers that are not there yet are published later, or by another task.
-    stored.subLayerPaths = [sub for sub in stored.subLayerPaths if Path(sub).is_file()]
+    # Each layer is checked when it is written; what lies there now may be damaged, about to be
+    # replaced, or the artist's.
+    stored.subLayerPaths = []
     stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
     problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
     if problems:

@@ -28,7 +28,7 @@ from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.mesh import Triangulation, triangulate
-from usdbrdf.untrusted.usd_meshes import is_deforming, is_moving
+from usdbrdf.untrusted.usd_files import is_deforming, is_moving
 
 Types = Sdf.ValueTypeNames
 

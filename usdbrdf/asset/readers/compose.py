@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.job.child import run_child
+from usdbrdf.job.progress import say
+from usdbrdf.model.arrays import Array
 
 _MAX_LENGTH = 300
+
+_TIMEOUT_S = 600.0
 
 
 def in_one_line(error: object) -> str:
@@ -42,8 +49,47 @@ def open_measured(asset: Asset) -> Usd.Stage:
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
-    """The asset as everybody else opens it: the root layer, with the artist's opinions."""
+    """The asset as everybody else opens it: the root layer, with the artist's opinions.
+
+    InputRefused where it does not compose, or USD crashes on it.
+    """
+    try_in_child(asset.root_layer)
     return open_stage(asset.root_layer)
+
+
+def warn_of_edits(asset: Asset) -> None:
+    """Say what keeps the asset from opening with the artist's opinions, if anything does. What is
+    measured does not depend on them."""
+    try:
+        try_in_child(asset.root_layer)
+    except UsdBrdfError as problem:
+        say(f"warning: {problem} The layers in layers/ are measured all the same.")
+
+
+def try_in_child(layer: Path, *, composes: bool = True) -> None:
+    """Open a stage that an artist may have edited in a child process, to learn whether USD survives
+    it: prims nested 100,000 deep make it crash. InputRefused where it does not.
+
+    composes  refuse what ``open_stage`` refuses, too
+    """
+    run_child(
+        "usdbrdf.asset.readers.compose:open_in_child",
+        {},
+        {"layer": str(layer), "composes": composes},
+        _TIMEOUT_S,
+        f"{layer}: opening it with the layers that it names, edits.usda included,",
+    )
+
+
+def open_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
+    """The child's part of ``try_in_child``."""
+    layer = Path(parameters["layer"])
+    if parameters["composes"]:
+        open_stage(layer)
+    else:
+        with suppress(Tf.ErrorException):
+            Usd.Stage.Open(str(layer))
+    return {}
 
 
 def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
@@ -68,6 +114,21 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             "back the file that it names. [stage.open]"
         )
     return stage
+
+
+def named_files(layer: Sdf.Layer) -> set[str]:
+    """Asset paths as written: sublayers, references, payloads, clips, attributes, metadata, of all
+    variants. The layer is not changed."""
+    copy = Sdf.Layer.CreateAnonymous()
+    copy.TransferContent(layer)
+    found: set[str] = set()
+
+    def collected(path: str) -> str:
+        found.add(path)
+        return path
+
+    UsdUtils.ModifyAssetPaths(copy, collected)
+    return found - {""}
 
 
 def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:

@@ -25,12 +25,9 @@ from usdbrdf.errors import UsageError
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import DistantLight, Light, ShapeLight, SkyLight
-from usdbrdf.model.material import Surface, constant_map
+from usdbrdf.model.material import Surface, constant_map, turned_up
 
 _DEFAULT_WIDTH = 1280
-
-# From a picture about +y to one about +z: 90 degrees about x.
-_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,11 +158,12 @@ def lights_from_stage(
     return tuple(lights)
 
 
-def sky_of_picture(file: Path, up_axis: str) -> SkyLight:
-    """A latitude-longitude picture about the stage's up axis, as ``shade --environment`` has it:
-    in a world with z up it is the y-up one turned by 90 degrees about x."""
-    image = np.maximum(read_texture(file, "raw"), 0)
-    return SkyLight(image=image, world_from_here=_Z_UP if up_axis == "Z" else np.eye(3))
+def sky_of_picture(picture: Float, up_axis: str) -> SkyLight:
+    """A latitude-longitude picture (H, W, 3) about the stage's up axis, as ``shade --environment``
+    has it: in a world with z up it is the y-up one turned by 90 degrees about x. What is not
+    finite or negative is black."""
+    image = np.maximum(np.nan_to_num(picture, nan=0.0, posinf=0.0, neginf=0.0), 0)
+    return SkyLight(image=image, world_from_here=turned_up("Y", up_axis)[:3, :3])
 
 
 class _Source(NamedTuple):
@@ -240,7 +238,7 @@ def _dome(source: _Source) -> SkyLight:
     pole = source.prim.GetAttribute("poleAxis")
     up = UsdGeom.GetStageUpAxis(source.prim.GetStage())
     if pole and (up if pole.Get() == "scene" else pole.Get()) == UsdGeom.Tokens.z:
-        rotation = rotation @ _Z_UP
+        rotation = rotation @ turned_up("Y", "Z")[:3, :3]
     return SkyLight(image=np.maximum(source.picture(), 0), world_from_here=rotation)
 
 

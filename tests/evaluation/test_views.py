@@ -8,14 +8,14 @@ import pytest
 import usdbrdf
 from tests.scenes import edited, make_capture, ring_of_poses
 from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.viewed_asset import measured_atlas
-from usdbrdf.evaluation.views_from_file import views_from_file
 
 
 def read(asset, document):
     place, atlas = measured_atlas(asset)
-    return atlas, views_from_file(document, place, atlas.stage, atlas.scene)
+    return atlas, photographs_of_views(document, place, atlas.stage, atlas.scene)
 
 
 def test_the_captures_own_document_gives_its_frames(room):

@@ -1,22 +1,255 @@
-"""Meshes of a USD file that somebody else made, as one soup; read in a child process."""
+"""USD files that somebody else made: their asset paths, checked before anything is composed, their
+meshes as one soup, and whatever a reader makes of them; all read in child processes.
+
+USD follows absolute paths, ``../`` and links without a question, wherever they lead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Tf, Usd, UsdGeom, UsdSkel
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.job.child import run_child
+from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.mesh import ScanMesh, Triangulation, triangulate
-from usdbrdf.untrusted.usd_paths import check_asset_paths
+from usdbrdf.untrusted.bounds import LIMITS, allowed_folders, read_in_child
+
+_LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
+
+_MAX_LAYERS = 1000
+
+# What fills the sky or lies below an atom is no scan's unit.
+_MIN_UNIT, _MAX_UNIT = 1e-9, 1e9
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsdMeshes:
+    """The captured surface as a USD file holds it, in the file's own units.
+
+    mesh                       world transforms applied; its corner normals are NaN where the file
+                               has none to use
+    labels                     per object, the mesh's display name or its own
+    object_prims               per object, its path below the default prim ("." is the prim itself)
+    meters_per_unit, up_axis   of the stage; the axis is "Y" or "Z"
+    warnings                   sentences about what was left out or simplified
+    """
+
+    mesh: ScanMesh
+    labels: tuple[str, ...]
+    object_prims: tuple[str, ...]
+    meters_per_unit: float
+    up_axis: str
+    warnings: tuple[str, ...]
+
+
+def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
+    """A USD file and every layer that it reaches; InputRefused if one lies elsewhere than beside
+    it or in ``allow``."""
+    layers: tuple[str, ...] = _in_child("check_asset_paths", path, allow, tuple)
+    return tuple(Path(layer) for layer in layers)
+
+
+def meshes_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> UsdMeshes:
+    """Every visible mesh below the default prim, one object each; instances count one by one.
+
+    allow  folders outside the file's own that its asset paths may lead into
+    """
+    return _in_child("read_meshes_here", path, allow, UsdMeshes, parts=(ScanMesh,))
+
+
+def render_scene_of_usd(
+    path: Path, reader: str, *, allow: Sequence[Path] = (), parts: Sequence[type] = ()
+) -> tuple[Any, ...]:
+    """What ``reader`` ("package.module:name") makes of the file, as f(path) in the child, once its
+    asset paths and its units are known to be sound: a tuple in which may be ``parts``."""
+    return _in_child("read_scene_here", path, allow, tuple, parts=parts, reader=reader)
+
+
+def _in_child(
+    name: str,
+    path: Path,
+    allow: Sequence[Path],
+    returns: type[T],
+    *,
+    parts: Sequence[type] = (),
+    **parameters: str,
+) -> T:
+    """One of the functions below, as f(path, allowed=folders, **parameters) in a child."""
+    refuse_nameless(path)
+    allowed = allowed_folders(path, allow)
+    return read_in_child(
+        "stage",
+        f"{__name__}:{name}",
+        path,
+        returns,
+        parts=parts,
+        parameters={"allowed": allowed, **parameters},
+    )
+
+
+def read_scene_here(path: Path, allowed: Sequence[str], reader: str) -> tuple[Any, ...]:
+    """The child's part of ``render_scene_of_usd``."""
+    check_asset_paths(path, allowed)
+    _check_units(_opened(path), path)
+    module, _, name = reader.partition(":")
+    found: tuple[Any, ...] = getattr(import_module(module), name)(path)
+    return found
+
+
+def read_meshes_here(path: Path, allowed: Sequence[str]) -> UsdMeshes:
+    """The child's part of ``meshes_from_usd``."""
+    check_asset_paths(path, allowed)
+    stage = _opened(path)
+    root = stage.GetDefaultPrim()  # valid only as long as the stage is held
+    if not root:
+        raise InputRefused(
+            f"{path}: the stage has no default prim, so nothing can refer to it. Set defaultPrim "
+            "in the file. [stage.default_prim]"
+        )
+    meters_per_unit, up_axis = _check_units(stage, path)
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    meshes, warnings = _meshes_below(root, path)
+    parts = []
+    for mesh in meshes:
+        matrix = np.array(transforms.GetLocalToWorldTransform(mesh.GetPrim()), np.float64)
+        parts.append(_world_part(mesh, matrix, time, path))
+    firsts = np.cumsum([0, *[len(points) for points, _, _ in parts]])
+    prims = [mesh.GetPrim() for mesh in meshes]
+    return UsdMeshes(
+        mesh=ScanMesh(
+            points=np.concatenate([points for points, _, _ in parts]),
+            triangles=np.concatenate(
+                [triangles + firsts[i] for i, (_, triangles, _) in enumerate(parts)],
+                dtype=np.int32,
+            ),
+            corner_normals=np.concatenate([normals for _, _, normals in parts]),
+            face_object=np.repeat(
+                np.arange(len(parts), dtype=np.int32), [len(faces) for _, faces, _ in parts]
+            ),
+        ),
+        labels=tuple(prim.GetDisplayName() or prim.GetName() for prim in prims),
+        object_prims=tuple(str(p.GetPath().MakeRelativePath(root.GetPath())) for p in prims),
+        meters_per_unit=meters_per_unit,
+        up_axis=up_axis,
+        warnings=tuple(warnings),
+    )
+
+
+def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
+    """The layers that ``path`` reaches, itself first; InputRefused unless every path in them stays
+    in one of the ``allowed`` folders, which are absolute and without links.
+
+    Layers, references, payloads, of every variant, and asset-valued attributes count; links are
+    judged by where they lead. What a crafted crate file does to USD's own reader is not caught
+    here: call this in a child process.
+    """
+    waiting, seen, total = [path.resolve()], list[Path](), 0
+    while waiting:
+        layer = waiting.pop()
+        if layer in seen:
+            continue
+        seen.append(layer)
+        total += layer.stat().st_size
+        if len(seen) > _MAX_LAYERS or total > LIMITS["stage"].file_bytes:
+            raise InputRefused(
+                f"{path}: more than {_MAX_LAYERS} layers or {LIMITS['stage'].file_bytes} bytes of "
+                "layers. Flatten the stage, or name the part that was captured. [stage.input_size]"
+            )
+        if layer.suffix.lower() == ".usdz":
+            _check_package(layer)
+        for reference in _references(layer):
+            target = _target(layer, reference, allowed)
+            if target.suffix.lower() in _LAYER_SUFFIXES and target.is_file():
+                waiting.append(target)
+    return seen
+
+
+def _references(layer: Path) -> list[str]:
+    try:
+        found = UsdUtils.ExtractExternalReferences(str(layer))
+    except Tf.ErrorException as error:
+        raise InputRefused(
+            f"{layer}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
+        ) from error
+    return sorted({reference for kind in found for reference in kind if reference})
+
+
+def _check_package(layer: Path) -> None:
+    package = Sdf.ZipFile.Open(str(layer))
+    for name in package.GetFileNames() if package else ():
+        if name.startswith(("/", "\\")) or ".." in Path(name).parts:
+            raise _outside(layer, name, "is an entry that leaves the package")
+
+
+def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
+    name = reference
+    if Ar.IsPackageRelativePath(name):
+        name = Ar.SplitPackageRelativePathOuter(name)[0]
+    if "://" in name or name.startswith(("\\\\", "//")):
+        raise _outside(layer, reference, "is a URI")
+    if os.path.isabs(name):
+        raise _outside(layer, reference, "is an absolute path")
+    name = name.partition(":SDF_FORMAT_ARGS:")[0]
+    target = Path(os.path.realpath(layer.parent / name))
+    if not any(target.is_relative_to(folder) for folder in allowed):
+        raise _outside(layer, reference, "leads outside the capture")
+    return target
+
+
+def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
+    return InputRefused(
+        f"{layer}: the asset path {reference[:200]!r} {reason}. Keep what belongs to the stage "
+        "beside it and name it by relative paths. [paths.outside]"
+    )
+
+
+def _opened(path: Path) -> Usd.Stage:
+    """The composed stage."""
+    try:
+        stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+        problems = stage.GetCompositionErrors()
+    except Tf.ErrorException as error:
+        raise InputRefused(
+            f"{path}: USD cannot open it ({_one_line(error)}). Export it again. [stage.input]"
+        ) from error
+    if problems:
+        raise InputRefused(
+            f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
+            "layers along, or flatten it. [stage.input]"
+        )
+    return stage
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())[:300]
+
+
+def _check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
+    """Metres per unit and the up axis; InputRefused where no scene can have them."""
+    meters, axis = UsdGeom.GetStageMetersPerUnit(stage), str(UsdGeom.GetStageUpAxis(stage))
+    if not (math.isfinite(meters) and _MIN_UNIT <= meters <= _MAX_UNIT):
+        raise InputRefused(
+            f"{path}: metersPerUnit is {meters:g} (limits {_MIN_UNIT:g} to {_MAX_UNIT:g}). Correct "
+            "it in the file. [stage.units]"
+        )
+    if axis not in ("Y", "Z"):
+        raise InputRefused(
+            f"{path}: upAxis is {axis[:40]!r}, not Y or Z. Correct it in the file. [stage.units]"
+        )
+    return float(meters), axis
 
 
 def is_moving(prim: Usd.Prim) -> bool:
@@ -31,124 +264,6 @@ def is_deforming(mesh: UsdGeom.Mesh) -> bool:
         mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(),
     )  # fmt: skip
     return any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
-
-
-# A stage of tens of millions of triangles opens in seconds; what takes longer hangs.
-_TIMEOUT_S = 600.0
-
-_MEMORY_BYTES = 64 << 30  # of addresses; a small crafted file may ask for any number of points
-
-
-@dataclass(frozen=True, kw_only=True)
-class UsdMeshes:
-    """The captured surface as a USD file holds it, in the file's own units.
-
-    mesh                       world transforms applied
-    labels                     per object, the mesh's display name or its own
-    object_prims               per object, its path below the default prim ("." is the prim itself)
-    meters_per_unit, up_axis   of the stage
-    warnings                   sentences about what was left out or simplified
-    """
-
-    mesh: ScanMesh
-    labels: tuple[str, ...]
-    object_prims: tuple[str, ...]
-    meters_per_unit: float
-    up_axis: str
-    warnings: tuple[str, ...]
-
-
-def meshes_from_usd(
-    path: Path, *, crease_angle_deg: float = 40.0, allow: Sequence[Path] = ()
-) -> UsdMeshes:
-    """Every visible mesh below the default prim, one object each; instances count one by one.
-
-    crease_angle_deg  for meshes without authored normals
-    allow             folders outside the file's own that its asset paths may lead into
-    """
-    found = run_child(
-        "usdbrdf.untrusted.usd_meshes:read_in_child",
-        {},
-        {"path": str(path.resolve()), "allow": [str(folder.resolve()) for folder in allow]},
-        _TIMEOUT_S,
-        f"{path}: reading USD",
-        memory_limit_bytes=_MEMORY_BYTES,
-    )
-    points, triangles = found["points"], found["triangles"]
-    normals = found["corner_normals"]
-    missing = np.isnan(normals[:, 0, 0])
-    if missing.any():
-        normals[missing] = corner_normals(points, triangles[missing], crease_angle_deg)
-    return UsdMeshes(
-        mesh=ScanMesh(
-            points=points,
-            triangles=triangles,
-            corner_normals=normals,
-            face_object=found["face_object"],
-        ),
-        labels=tuple(found["labels"].tolist()),
-        object_prims=tuple(found["prims"].tolist()),
-        meters_per_unit=float(found["meters_per_unit"]),
-        up_axis=str(found["up_axis"]),
-        warnings=tuple(found["warnings"].tolist()),
-    )
-
-
-def read_in_child(
-    arrays: Mapping[str, npt.NDArray[Any]], parameters: Mapping[str, Any]
-) -> dict[str, npt.NDArray[Any]]:
-    """The child's part: check the asset paths, open the stage, gather its meshes."""
-    path = Path(parameters["path"])
-    check_asset_paths(path, [Path(folder) for folder in parameters["allow"]])
-    stage = _opened(path)
-    root = stage.GetDefaultPrim()  # valid only as long as the stage is held
-    time = Usd.TimeCode.EarliestTime()
-    transforms = UsdGeom.XformCache(time)
-    meshes, warnings = _meshes_below(root, path)
-    parts = []
-    for mesh in meshes:
-        matrix = np.array(transforms.GetLocalToWorldTransform(mesh.GetPrim()), np.float64)
-        parts.append(_world_part(mesh, matrix, time, path))
-    firsts = np.cumsum([0, *[len(points) for points, _, _ in parts]])
-    prims = [mesh.GetPrim() for mesh in meshes]
-    return {
-        "points": np.concatenate([points for points, _, _ in parts]),
-        "triangles": np.concatenate(
-            [triangles + firsts[i] for i, (_, triangles, _) in enumerate(parts)], dtype=np.int32
-        ),
-        "corner_normals": np.concatenate([normals for _, _, normals in parts]),
-        "face_object": np.repeat(
-            np.arange(len(parts), dtype=np.int32), [len(triangles) for _, triangles, _ in parts]
-        ),
-        "labels": np.array([prim.GetDisplayName() or prim.GetName() for prim in prims]),
-        "prims": np.array([str(p.GetPath().MakeRelativePath(root.GetPath())) for p in prims]),
-        "meters_per_unit": np.array(UsdGeom.GetStageMetersPerUnit(stage)),
-        "up_axis": np.array(str(UsdGeom.GetStageUpAxis(stage))),
-        "warnings": np.array(warnings, dtype=np.str_),
-    }
-
-
-def _opened(path: Path) -> Any:
-    """The composed stage, which has a default prim."""
-    try:
-        stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
-        problems = [str(problem) for problem in stage.GetCompositionErrors()]
-    except Tf.ErrorException as error:
-        raise InputRefused(
-            f"{path}: USD cannot open it ({' '.join(str(error).split())[:200]}). Export it again. "
-            "[stage.input]"
-        ) from error
-    if problems:
-        raise InputRefused(
-            f"{path}: the stage does not compose: {' '.join(problems[0].split())[:300]}. Bring "
-            "the missing layers along, or flatten it. [stage.input]"
-        )
-    if not stage.GetDefaultPrim():
-        raise InputRefused(
-            f"{path}: the stage has no default prim, so nothing can refer to it. Set defaultPrim "
-            "in the file. [stage.default_prim]"
-        )
-    return stage
 
 
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:

@@ -1,4 +1,10 @@
-"""A document with views of a capture -> frames in metres, in the world of the capture's asset."""
+"""A nerfstudio document (transforms.json, views.json) with views of a capture -> the same views in
+metres, in the world of that capture's asset.
+
+Poses are in the capture's frame and unit. The capture's own adapter and checks read them, so that
+they are treated as ingest treated those of the capture: applied_transform undone, scaled axes
+divided by the same --pose-scale.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +27,8 @@ from usdbrdf.capture.parts import frames_at
 from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
@@ -39,42 +46,88 @@ class Views:
     frames: Frames
 
 
-def views_from_file(
+def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
+    """The cameras of a document, named after their images, to render from.
+
+    Images need not exist where the document states width and height. InputRefused where a view
+    cannot be used, or two have images of one name.
+    """
+    findings = Findings()
+    records = _rigid_records(source, asset, IngestOptions(), findings, images=False)
+    if findings.dropped:
+        first = findings.dropped[0]
+        raise InputRefused(
+            f"{source}: the view {first.name!r} cannot be rendered: {first.reason}. Correct the "
+            "document. [relight.views]"
+        )
+    if not records or len({Path(record.name).stem for record in records}) < len(records):
+        raise InputRefused(
+            f"{source}: {'no views' if not records else 'two views have images of one name'}. "
+            "Correct the document. [relight.views]"
+        )
+    return tuple(_camera(record, metres_per_unit) for record in records)
+
+
+def photographs_of_views(
     source: Path,
     asset: Asset,
     stage: Usd.Stage,
     scene: Scene,
     allow_outside: tuple[Path, ...] = (),
 ) -> Views:
-    """Read and check a nerfstudio document (transforms.json, views.json) of the asset's capture.
+    """The photographs of a document, checked as those of a capture are.
 
-    Its poses are in the capture's frame and unit, as those that ingest read, and are treated as
-    ingest treated those: applied_transform undone, scaled axes divided by the same --pose-scale.
     Images have the capture's encoding. Views that cannot be used are dropped with a warning;
     InputRefused where none is left or where the cameras do not see the asset.
     """
     captured = frames_from_stage(stage)
-    options = IngestOptions(allow_outside=allow_outside)
     findings = Findings()
-    records = frame_records(source, options, findings)
+    options = IngestOptions(allow_outside=allow_outside)
+    records = _rigid_records(source, asset, options, findings)
     total = len(records) + len(findings.dropped)
     if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
         records = [_as_the_captures_photographs(r, captured) for r in records]
-    pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
-    rigid = rigid_records(records, findings, source, pose_scale=pose_scale)
-    _refuse_none(rigid, findings, source)
+    _refuse_none(len(records), findings, source)
     frames = frames_from_records(
-        rigid, encoding=captured.encoding, radiometric=captured.radiometric
+        records, encoding=captured.encoding, radiometric=captured.radiometric
     )
     frames.world_from_camera[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
-    refuse_rays_that_miss(frames, _mesh(scene), source)
-    names = [record.name for record in rigid]
+    mesh = ScanMesh(
+        points=scene.points,
+        triangles=scene.triangles,
+        corner_normals=scene.corner_normals,
+        face_object=scene.face_object,
+    )
+    refuse_rays_that_miss(frames, mesh, source)
+    names = [record.name for record in records]
     usable = check_frames(frames, names, findings, max_nonfinite=_MAX_UNKNOWN)
-    _refuse_none(usable, findings, source)
+    _refuse_none(len(usable), findings, source)
     findings.warn_of_dropped_frames(source, total)
-    for warning in findings.warnings:
-        say(f"warning: {warning}")
+    for sentence in findings.warnings:
+        warn(sentence)
     return Views(names=tuple(names[i] for i in usable), frames=frames_at(frames, usable))
+
+
+def _rigid_records(
+    source: Path, asset: Asset, options: IngestOptions, findings: Findings, *, images: bool = True
+) -> list[FrameRecord]:
+    """The usable frames of a document, in the capture's unit; the others are in ``findings``."""
+    records = frame_records(source, options, findings, images=images)
+    pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
+    return rigid_records(records, findings, source, pose_scale=pose_scale)
+
+
+def _camera(record: FrameRecord, metres_per_unit: float) -> Camera:
+    pose = record.world_from_camera.copy()
+    pose[:3, 3] *= metres_per_unit
+    width, height = record.resolution
+    return Camera(
+        name=record.name,
+        world_from_camera=pose,
+        intrinsics=record.intrinsics,
+        width=width,
+        height=height,
+    )
 
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
@@ -93,16 +146,7 @@ def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> Frame
     )
 
 
-def _mesh(scene: Scene) -> ScanMesh:
-    return ScanMesh(
-        points=scene.points,
-        triangles=scene.triangles,
-        corner_normals=scene.corner_normals,
-        face_object=scene.face_object,
-    )
-
-
-def _refuse_none(left: list[FrameRecord] | list[int], findings: Findings, source: Path) -> None:
+def _refuse_none(left: int, findings: Findings, source: Path) -> None:
     if left:
         return
     first = findings.dropped[0] if findings.dropped else None

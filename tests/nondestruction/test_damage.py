@@ -1,0 +1,92 @@
+"""Damaged layers are made again by the run that made them, and litter makes nothing run again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import pytest
+
+from tests.nondestruction.conftest import COARSE, bytes_of, convert
+from usdbrdf.asset.layout import Asset
+from usdbrdf.cli import main
+
+PARTS = ("layers", "textures", "previews")
+
+
+@pytest.fixture
+def copied(base, converted, request):
+    """The converted asset, as far from the capture as before."""
+    folder = base / f"copy-{abs(hash(request.node.name))}" / "room"
+    shutil.copytree(converted.folder, folder)
+    yield folder
+    shutil.rmtree(folder.parent)
+
+
+def cut(path, bytes_gone=500):
+    size = path.stat().st_size
+    assert size > bytes_gone
+    os.truncate(path, size - bytes_gone)
+
+
+@pytest.mark.parametrize("options", [(), ("--adopt",), ("--discard",)])
+@pytest.mark.parametrize("name", ["scan.usdc", "texturing_uv.usdc"])
+def test_a_damaged_binary_layer_is_made_again(capture, converted, copied, name, options):
+    cut(copied / "layers" / name)
+    convert(capture, copied, *options)
+    for part in PARTS:
+        assert bytes_of(copied / part) == bytes_of(converted.folder / part)
+    assert not list(copied.glob("adopted-*"))
+
+
+def test_a_damaged_scan_is_made_again_with_other_options(capture, converted, copied):
+    cut(copied / "layers/scan.usdc")
+    convert(capture, copied, "--crease-angle", "60")
+    assert main(["validate", str(copied)]) == 0
+    convert(capture, copied)
+    for part in PARTS:
+        assert bytes_of(copied / part) == bytes_of(converted.folder / part)
+
+
+@pytest.mark.parametrize("name", ["texturing.usda", "lights.usda", "material.usda"])
+def test_a_text_layer_is_given_up_only_when_told_to(capture, converted, copied, name):
+    """What looks damaged there may be an artist's slip."""
+    cut(copied / "layers" / name, 100)
+    call = ["convert", str(capture), "-o", str(copied), *COARSE]
+    assert main(call) == 6
+    assert main([*call, "--adopt"]) == 6
+    assert main([*call, "--discard"]) == 0
+    for part in PARTS:
+        assert bytes_of(copied / part) == bytes_of(converted.folder / part)
+
+
+def test_a_damaged_asset_in_a_renamed_folder_keeps_its_name(capture, copied):
+    renamed = copied.rename(copied.with_name("lounge"))
+    cut(renamed / "layers/scan.usdc")
+    assert Asset.at(renamed).root_layer == renamed / "room.usda"
+    convert(capture, renamed)
+    assert [path.name for path in renamed.glob("*.usda")] in (
+        ["room.usda", "edits.usda"],
+        ["edits.usda", "room.usda"],
+    )
+
+
+def test_a_damaged_scan_is_named_where_it_cannot_be_made_again(copied, capfd):
+    cut(copied / "layers/scan.usdc")
+    assert main(["texture", str(copied), "--texel-size", "0.25"]) == 3
+    assert "scan.usdc" in capfd.readouterr().err
+
+
+def test_litter_in_the_capture_makes_nothing_run_again(base, converted, copied):
+    capture = base / "scan"
+    litter = [capture / ".DS_Store", capture / "frames" / "Thumbs.db", capture / "._mesh.ply"]
+    before = {path: path.stat().st_ino for path in (copied / "layers").iterdir()}
+    litter = [path for path in litter if path.parent.is_dir()]
+    try:
+        for path in litter:
+            path.write_bytes(b"x")
+        convert(capture, copied)
+    finally:
+        for path in litter:
+            path.unlink(missing_ok=True)
+    assert {path: path.stat().st_ino for path in (copied / "layers").iterdir()} == before

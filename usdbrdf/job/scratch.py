@@ -1,0 +1,58 @@
+"""Folders for the time of a block; those that a killed run left behind go at the next run."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+
+PREFIX = "usdbrdf-scratch-"
+
+# Between its making and its locking a folder seems to have no owner.
+_MIN_AGE_SECONDS = 60
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder beside other temporary ones, of this user alone, gone at the end of the block.
+
+    It is locked as long as this process lives, so that it can be told from what nobody owns.
+    """
+    _sweep(tempfile.gettempdir())
+    with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as name:
+        descriptor = os.open(name, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # a file system without locks: it then has to be swept by hand
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield Path(name)
+        finally:
+            os.close(descriptor)
+
+
+@cache  # once in a process is enough
+def _sweep(parent: str) -> None:
+    with suppress(OSError), os.scandir(parent) as entries:
+        for entry in entries:
+            if entry.name.startswith(PREFIX) and _has_no_owner(entry):
+                shutil.rmtree(entry.path, ignore_errors=True)
+
+
+def _has_no_owner(entry: os.DirEntry[str]) -> bool:
+    with suppress(OSError):
+        status = entry.stat(follow_symlinks=False)
+        old = time.time() - status.st_mtime > _MIN_AGE_SECONDS
+        if not entry.is_dir(follow_symlinks=False) or status.st_uid != os.geteuid() or not old:
+            return False
+        descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        finally:
+            os.close(descriptor)
+        return True
+    return False

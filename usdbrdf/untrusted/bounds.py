@@ -1,0 +1,148 @@
+"""How a foreign file is read: the limits, the child, and the way back of what it found."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.child import run_child
+from usdbrdf.job.memory import machine_bytes
+from usdbrdf.model.arrays import Array
+
+_GIB = 1 << 30
+
+
+class Limits(NamedTuple):
+    """What one file may take: its own bytes, seconds of wall time, bytes of addresses."""
+
+    file_bytes: int
+    seconds: float
+    memory_bytes: int
+
+
+# What is larger or takes longer was not captured: 50 million triangles are a PLY of 1 GB or an OBJ
+# of 4 GB, which are read in minutes. Documents have theirs in ``files.documents``, the frames of a
+# capture in ``files.images``.
+LIMITS = {
+    "mesh": Limits(8 * _GIB, 600.0, 64 * _GIB),
+    "stage": Limits(4 * _GIB, 600.0, 64 * _GIB),  # all of its layers together
+    "picture": Limits(2 * _GIB, 120.0, 24 * _GIB),
+}
+
+PLUGIN_SECONDS = 60.0  # for the import of another package's module, which may be a large one
+
+_CURES = {
+    "mesh": "Name the mesh with --mesh, or put mesh.ply beside the poses.",
+    "stage": "Check its name and permission.",
+    "picture": "Check its name and permission.",
+}
+
+T = TypeVar("T")
+
+
+def read_in_child(
+    kind: str,
+    reader: str,
+    path: Path,
+    returns: type[T],
+    *,
+    parts: Sequence[type] = (),
+    parameters: Mapping[str, Any] | None = None,
+) -> T:
+    """What ``reader`` ("package.module:name") makes of a foreign file, as f(path, **parameters) in
+    a child process; InputRefused where the file is larger than the kind's limit.
+
+    kind        of LIMITS; also begins the names of the rules
+    returns     the type of the result: a dataclass, array or tuple
+    parts       dataclasses that may be inside
+    parameters  JSON
+    """
+    refuse_large(kind, path)
+    limits = LIMITS[kind]
+    found = run_child(
+        f"{__name__}:read_here",
+        {},
+        {"reader": reader, "path": str(path.resolve()), "parameters": dict(parameters or {})},
+        limits.seconds,
+        f"{path}: reading this {kind}",
+        memory_limit_bytes=min(limits.memory_bytes, machine_bytes()),
+    )
+    value = unpacked(found, (returns, *parts))
+    assert isinstance(value, returns)
+    return value
+
+
+def read_here(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
+    """The child's part of ``read_in_child``."""
+    module, _, name = parameters["reader"].partition(":")
+    reader = getattr(import_module(module), name)
+    return packed(reader(Path(parameters["path"]), **parameters["parameters"]))
+
+
+def refuse_large(kind: str, path: Path) -> None:
+    """InputRefused unless this is a regular file within the kind's limit; nothing is opened."""
+    if not os.path.isfile(path) or not os.access(path, os.R_OK):
+        what = "cannot be read" if os.path.isfile(path) else "is not a regular file"
+        what = what if os.path.exists(path) else "does not exist"
+        raise InputRefused(f"{path}: this {kind} {what}. {_CURES[kind]} [{kind}.missing]")
+    size, limit = path.stat().st_size, LIMITS[kind].file_bytes
+    if size > limit:
+        raise InputRefused(
+            f"{path}: {size} bytes, the limit of a {kind} is {limit}. Reduce it. [{kind}.size]"
+        )
+
+
+def allowed_folders(path: Path, allow: Iterable[Path]) -> list[str]:
+    """The folders in which a file may name others, absolute: its own, and ``allow``."""
+    return [str(folder.resolve()) for folder in (path.resolve().parent, *allow)]
+
+
+def packed(value: object) -> dict[str, Array]:
+    """A value of dataclasses, tuples, dictionaries, plain values and arrays as named arrays."""
+    arrays: dict[str, Array] = {}
+    names: dict[int, str] = {}  # an array that many share travels once
+
+    def tree(node: Any) -> Any:
+        if isinstance(node, np.ndarray):
+            name = names.setdefault(id(node), str(len(names)))
+            arrays[name] = node
+            return {"array": name}
+        if is_dataclass(node):
+            members = {field.name: tree(getattr(node, field.name)) for field in fields(node)}
+            return {"class": type(node).__name__, "members": members}
+        if isinstance(node, dict):
+            return {"pairs": [[tree(key), tree(member)] for key, member in node.items()]}
+        if isinstance(node, Path):
+            return str(node)
+        return [tree(member) for member in node] if isinstance(node, tuple | list) else node
+
+    text = json.dumps(tree(value)).encode()
+    return {**arrays, "tree": np.frombuffer(text, np.uint8)}
+
+
+def unpacked(arrays: Mapping[str, Array], classes: Iterable[type]) -> Any:
+    """The value that was ``packed``; lists come back as tuples. No other class than the given is
+    ever called."""
+    known = {each.__name__: each for each in classes}
+
+    def value(node: Any) -> Any:
+        if isinstance(node, list):
+            return tuple(value(member) for member in node)
+        if not isinstance(node, dict):
+            return node
+        if "array" in node:
+            return arrays[node["array"]]
+        if "pairs" in node:
+            return {value(key): value(member) for key, member in node["pairs"]}
+        members = {name: value(member) for name, member in node["members"].items()}
+        return known[node["class"]](**members)
+
+    return value(json.loads(arrays["tree"].tobytes()))
