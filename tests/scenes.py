@@ -75,6 +75,7 @@ def make_capture(
     saturation_radiance: float = 64.0,
     noise_floor_radiance: float = 0.001,
     seed: int = 0,
+    unit: float = 1.0,
 ) -> MadeCapture:
     """Write mesh.ply, objects.json, frames/*.exr and transforms.json into ``folder``.
 
@@ -84,6 +85,7 @@ def make_capture(
     noise                 standard deviation relative to the radiance
     exposure_times        taken in turn; the saturation and the floor of a frame scale with
                           1 / exposure, the given values belonging to the first
+    unit                  factor on all that is radiance; images are floats if it is not 1
     """
     folder.mkdir(parents=True, exist_ok=True)
     points, triangles, face_object, names = room_mesh(room=room, subdivisions=subdivisions)
@@ -112,15 +114,16 @@ def make_capture(
         gain = exposure_times[0] / exposure
         write_exr(
             folder / "frames" / f"{i:04d}.exr",
-            np.minimum(image, saturation_radiance * gain).astype(np.float32),
+            np.float32(unit) * np.minimum(image, saturation_radiance * gain).astype(np.float32),
+            half=unit == 1,
         )
         entries.append(
             {
                 "file_path": f"frames/{i:04d}.exr",
                 "transform_matrix": pose.tolist(),
                 "exposure_time": exposure,
-                "saturation_radiance": saturation_radiance * gain,
-                "noise_floor_radiance": noise_floor_radiance * gain,
+                "saturation_radiance": unit * saturation_radiance * gain,
+                "noise_floor_radiance": unit * noise_floor_radiance * gain,
             }
         )
     camera = dict(zip(("fl_x", "fl_y", "cx", "cy"), intrinsics.tolist(), strict=True))

@@ -66,6 +66,7 @@ _CURE = "Correct them, or leave them out of the capture."  # for rules of other 
 
 _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
+    "capture.camera": "Correct the focal lengths and principal points.",
     "capture.file": "Copy the missing images, or remove their entries.",
     "capture.image": "Export the images again as R, G, B float EXR.",
     "capture.size": "Use the images that the intrinsics are for, or state the w and h of these.",

@@ -94,7 +94,7 @@ def geometry_from_file(
     findings: Findings,
     *,
     capture_root: Path,
-    meters_per_unit: float,
+    meters_per_unit: float = 1.0,
 ) -> ScanGeometry:
     """Read, check, segment and clean a mesh.
 
@@ -156,8 +156,8 @@ def scan_from_parts(
     source: Path,
     encoding: str,
     radiometric: bool,
-    meters_per_unit: float,
-    up_axis: str,
+    meters_per_unit: float = 1.0,
+    up_axis: str = "Z",
 ) -> Scan:
     """Check everything, cheap things first, and put the scan together.
 

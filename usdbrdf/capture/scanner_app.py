@@ -69,7 +69,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
         source=folder,
         encoding=encoding,
         radiometric=False,
-        meters_per_unit=1.0,
         up_axis="Y",
     )
 

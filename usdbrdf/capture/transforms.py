@@ -103,8 +103,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
         source=source,
         encoding=encoding,
         radiometric=not photographs,
-        meters_per_unit=1.0,
-        up_axis="Z",
     )
 
 

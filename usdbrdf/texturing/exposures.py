@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
+from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Double, Float, Int
@@ -23,15 +24,16 @@ from usdbrdf.model.capture import Frames
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
 _MOST_TEXELS, _MOST_SAMPLES = 4096, 1 << 21
 
-# Half a stop counts, if it stands out of the scatter of the frame's own samples by this factor, and
-# if so many of them are of texels that other frames show.
-_HALF_STOP, _STANDING_OUT, _FEWEST = math.log(2) / 2, 2.0, 24
+_CONTRADICTING = calibration.number("exposures.contradicting") * math.log(2)
+_STANDING_OUT = calibration.number("exposures.standing_out")
+_MOST = calibration.number("exposures.most")
+_OUTLYING = calibration.number("exposures.outlying")
 
-# If more of the frames than this contradict the others, none can be believed.
-_MOST_CONTRADICTING = 0.2
+# Samples of texels that other frames show too, without which a frame is not judged.
+_FEWEST = 24
 
-# Samples further off than this, in logarithms, lose weight; and steps of the reweighting.
-_OUTLYING, _STEPS = 0.1, 8
+# Steps of the reweighting.
+_STEPS = 8
 
 # Frames that are named.
 _LISTED = 6
@@ -130,7 +132,9 @@ def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
     gains = gains_of_frames(logarithm)
     compared = gains.samples >= _FEWEST
     size = np.abs(gains.logarithm)
-    off = np.flatnonzero(compared & (size > _HALF_STOP) & (size > _STANDING_OUT * gains.scatter))
+    off = np.flatnonzero(
+        compared & (size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter)
+    )
     factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
     if not factor:
         return {}
@@ -143,9 +147,9 @@ def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
     cause = (
         "Likely their exposure_time was not divided out of the pixels, or the images are not linear"
     )
-    if frames.radiometric and len(off) > _MOST_CONTRADICTING * compared.sum():
+    if frames.radiometric and len(off) > _MOST * compared.sum():
         raise InputRefused(
-            f"{what} (limits: half a stop, {_MOST_CONTRADICTING:.0%} of the frames). {cause}. "
+            f"{what} (limits: half a stop, {_MOST:.0%} of the frames). {cause}. "
             "Export radiance in one unit for all frames. [texturing.exposure]"
         )
     warn(f"{what}. {cause}. Correct them or leave them out. [texturing.exposure]")
