@@ -13,6 +13,7 @@ from usdbrdf.job.progress import set_quiet
 # Files and folders whose tests run the pipeline, kill processes, start other programs or fit
 # materials; `pytest -m "not slow"` leaves them out.
 SLOW = (
+    "asset/test_previews.py",
     "asset/test_schema.py",
     "dcc",
     "evaluation",
@@ -20,6 +21,7 @@ SLOW = (
     "job/test_child.py",
     "job/test_kill_resume.py",
     "material/test_fit_lobe.py",
+    "material/test_refine.py",
     "material/test_view_model.py",
     "nondestruction",
     "physics/test_lobe_samples.py",
@@ -27,8 +29,6 @@ SLOW = (
     "plugins",
     "shading/test_denoise.py",
     "shading/test_denoise_default.py",
-    "tasks/test_preview.py",
-    "tasks/test_refine.py",
     "tasks/test_texture.py",
     "test_cli.py",
     "test_convert.py",

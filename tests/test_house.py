@@ -36,7 +36,7 @@ ARROWS: dict[str, set[str]] = {
     "errors": set(),
     "identity": set(),
     "calibration": set(),
-    "options": {"model"},
+    "options": {"model", "calibration"},
     "kernel_cache": {"identity"},
     "kernel": {"kernel_cache"},
     "model": {"errors"},
@@ -47,10 +47,10 @@ ARROWS: dict[str, set[str]] = {
     "geometry": {"transport"},
     "texturing": {"geometry"},
     "capture": {"geometry"},
-    "shading": {"transport"},
-    "material": {"transport"},
+    "shading": {"texturing"},
+    "material": {"shading"},
     # A document of views is read by the adapter of the capture that they belong to.
-    "asset": {"transport", "capture"},
+    "asset": {"capture"},
     "tasks": SUBJECTS,
     "pipeline": {"tasks"},
     "delivery": {"asset"},
@@ -60,7 +60,6 @@ ARROWS: dict[str, set[str]] = {
     "cli": {"commands", "command_parser"},
     "commands": {"command_parser"},
     "command_parser": {"pipeline", *READERS},
-    "fit_options": {"tasks"},
     "__main__": {"cli"},
     # The public face, which nothing inside may import.
     "": {"pipeline", *READERS},
@@ -89,7 +88,7 @@ IMPORTERS: dict[str, set[str]] = {
     "PyOpenColorIO": {"files/colour.py"},
     "pyoidn": {"transport/denoise.py"},
     "subprocess": {"job/child.py"},
-    "threadpoolctl": {"tasks/"},
+    "threadpoolctl": {"material/fit_objects.py"},
     "tqdm": {"job/progress.py"},
     "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
     "xatlas": {"geometry/unwrap.py"},
@@ -104,12 +103,10 @@ OPENERS: dict[str, str] = {
     "asset/": "USD layers are written by USD",
     "delivery/": "packages are files",
     "calibration.py": "its own data",
-    "cli.py": "stdout that nobody reads is replaced",
     "identity.py": "hashes the sources",
     "kernel_cache.py": "compiled code",
-    "capture/checks.py": "compares photographs by their hashes",
     "evaluation/truth.py": "truth comes as .npz",
-    "relighting/command_options.py": "a matrix comes as a text file",
+    "command_parser.py": "a matrix comes as a text file",
     "validation/cure_layer.py": "the layer of cures is an artist's file",
 }
 _OPEN = {
@@ -154,6 +151,7 @@ ENGINEERING: dict[str, str] = {
     "_LISTED": "what is printed",
     "_LEVEL_1": "discretisation of the search",
     "_LEVEL_2": "discretisation of the search",
+    "_MANY_OVER_ONE": "from here on a warning is printed",
     "_MAX_CELLS": "memory",
     "_MAX_DEVIATION": "numerics: what is a rotation",
     "_MAX_DROPPED_SHARE": "limit of what is refused",
@@ -214,27 +212,7 @@ ENGINEERING: dict[str, str] = {
 MOST_FILES, MOST_LINES, MOST_LINES_OF_TASK = 20, 500, 120
 HISTORY = re.compile(r"\b(no longer|used to (?!be\b)\w+|previously|was once|formerly)\b", re.I)
 
-NOT_YET: dict[str, set[str]] = {
-    "arrows": {
-        "asset -> geometry", "asset -> shading", "cli -> fit_options",
-        "command_parser -> fit_options",
-        "material -> texturing",
-        "options -> capture", "options -> shading", "options -> tasks", "options -> transport",
-        "relighting -> geometry", "untrusted -> geometry",
-    },
-    "circles": {"asset.layers <- asset.readers"},
-    "face": {"cli.py"},
-    "history": {"job/publishing.py: no longer"},
-    "importers": {
-        "model/mesh.py: pxr",
-        "relighting/inserted_models.py: trimesh", "tasks/atlas.py: pxr", "tasks/step.py: pxr",
-        "tasks/texture.py: pxr",
-    },
-    "tasks": {
-        "tasks/atlas.py", "tasks/clipped.py", "tasks/fit.py", "tasks/fit_objects.py",
-        "tasks/ingest.py", "tasks/refine.py", "tasks/shade.py", "tasks/texture.py",
-    },
-}  # fmt: skip
+NOT_YET: dict[str, set[str]] = {}
 
 
 @cache

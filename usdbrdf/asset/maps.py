@@ -89,6 +89,10 @@ class AssetMaps:
         """What the frames know of each texel."""
         return CoverageMap.from_stored(self._decoded("coverage"))
 
+    def is_observed(self, index: int) -> bool:
+        """Whether a frame shows any texel of an object."""
+        return bool(self.coverage.observed[self.texels.of_object(index)].any())
+
     @property
     def lit(self) -> Float:
         """(T, 3) W/(m^2 sr): L_d as the texturing task has it; where lamps clip, a lower bound."""

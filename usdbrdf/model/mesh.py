@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import UsdGeom
 
 from usdbrdf.model.arrays import Double, Float, Int
 
@@ -51,11 +50,11 @@ class Triangulation:
     def element_of_corner(self, interpolation: str) -> Int:
         """(T, 3) int32: which value of a primvar of this interpolation each corner has."""
         by_interpolation: dict[str, Int] = {
-            UsdGeom.Tokens.faceVarying: self.corners,
-            UsdGeom.Tokens.vertex: self.triangles,
-            UsdGeom.Tokens.varying: self.triangles,
-            UsdGeom.Tokens.uniform: np.repeat(self.polygon[:, None], 3, axis=1),
-            UsdGeom.Tokens.constant: np.zeros_like(self.triangles),
+            "faceVarying": self.corners,
+            "vertex": self.triangles,
+            "varying": self.triangles,
+            "uniform": np.repeat(self.polygon[:, None], 3, axis=1),
+            "constant": np.zeros_like(self.triangles),
         }
         return by_interpolation[interpolation]
 
