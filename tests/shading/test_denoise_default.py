@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +13,10 @@ from tests.scenes import make_capture
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.command_parser import parsed
+from usdbrdf.commands import COMMANDS, Shade
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.options import add_shade_options
+from usdbrdf.options import ShadeOptions
 from usdbrdf.tasks.atlas import atlas_from_stage
 
 OPTIONS = usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64))
@@ -40,9 +42,8 @@ def _shaded(asset: Asset) -> tuple[bool, str, str]:
 
 
 def test_the_option_is_auto_by_default():
-    parser = argparse.ArgumentParser()
-    add_shade_options(parser)
-    assert parser.parse_args([]).denoise == usdbrdf.ShadeOptions().denoise == "auto"
+    assert parsed(["shade", "room"], COMMANDS) == Shade(asset=Path("room"), shade=ShadeOptions())
+    assert ShadeOptions().denoise == "auto"
 
 
 def test_the_asset_says_what_was_done_and_is_shaded_again_when_the_filter_appears(
