@@ -199,10 +199,7 @@ def write_frames(folder: Path, scene: Scene, options: argparse.Namespace) -> Non
 
 
 def photograph(
-    scene: Scene,
-    rays: RayScene,
-    camera: Camera,
-    rng: np.random.Generator,
+    scene: Scene, rays: RayScene, camera: Camera, rng: np.random.Generator
 ) -> np.ndarray:
     """(H, W, 3) float32 radiance, cut at the saturation."""
     origins, directions = camera.rays(camera.pixels())

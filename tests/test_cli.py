@@ -512,10 +512,9 @@ sys.exit(main(sys.argv[1:]))
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )
-    word, status = {
-        signal.SIGINT: ("interrupted", 130),
-        signal.SIGTERM: ("terminated", 143),
-    }[number]
+    word, status = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}[
+        number
+    ]
     assert done.stderr == f"usdbrdf: {word}; the same command goes on from here.\n"
     assert done.returncode == status
     assert list(tmp_path.iterdir()) == []

@@ -47,7 +47,6 @@ _HOMES = {
     "usdbrdf.evaluation.evaluate_views": ("evaluate",),
     "usdbrdf.relighting.relight": ("relight",),
 }
-
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 

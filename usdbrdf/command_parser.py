@@ -30,7 +30,6 @@ EXIT_CODES = """exit codes:
   4 disk, memory, permission or a missing package (retry may help)   5 asset folder busy
   6 asset folder is not ours, or files of ours were edited by hand   7 validate found errors
   130 interrupted   143 terminated"""
-
 _INSERT_KEYS = {item.option.name: item for item in option_fields(Insert) if item.option}
 
 

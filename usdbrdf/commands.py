@@ -304,9 +304,7 @@ class PluginPath(Command):
 
 
 _TASKS: tuple[type[Command], ...] = (Convert, Ingest, Texture, Shade, Fit)
-
 _OTHERS = (Evaluate, Compare, Relight, Package, Validate, Rules, Adapters, PluginPath)
-
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
     for command in (*_TASKS, *_OTHERS)

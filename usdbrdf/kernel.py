@@ -15,7 +15,6 @@ import numba
 from usdbrdf.kernel_cache import KernelCache
 
 F = TypeVar("F", bound=Callable[..., Any])
-
 # One kernel at a time runs on all cores: numba's own pool of threads, which is all that some
 # machines have, ends the process when two threads of Python call it.
 _turn = threading.Lock()

@@ -22,11 +22,8 @@ else:
     Double = Any  # its module loads NumPy, for which no list of options has to wait
 
 T = TypeVar("T")
-
 REQUIRED: Any = MISSING
-
 _COUNT = (1, 2**31 - 1)
-
 # Metres, or metres per unit: from an atom's size to more than the Earth's.
 _LENGTH = (1e-10, 1e10)
 
@@ -233,10 +230,8 @@ class TextureOptions(Options):
 
 # What the lightmap filter is given may have this many times the standard error asked for.
 BEFORE_FILTER = calibration.number("shade.before_filter")
-
 # Of "cosine": the paper's number of independent directions per texel.
 _RAYS = {"mis": 2048, "cosine": 10_000}
-
 _BY_ESTIMATOR: Any = None
 
 
@@ -427,10 +422,7 @@ class RelightOptions(Options):
     denoise: Denoise = option("--denoise", "auto")
     "filter the picture; oidn needs usdbrdf[denoise], auto takes it where it is there"
     exposure: float | None = option(
-        "--exposure STOPS",
-        None,
-        (-100, 100),
-        unset="the 90th percentile of mean RGB becomes 0.8",
+        "--exposure STOPS", None, (-100, 100), unset="the 90th percentile of mean RGB becomes 0.8"
     )
     "of .png and .jpg"
 

@@ -39,9 +39,7 @@ def make(tmp_path_factory) -> Callable[..., Made]:
     """make(texel_size, ingest options, **make_capture's)"""
 
     def make(
-        texel_size: float = 0.15,
-        ingest: usdbrdf.IngestOptions | None = None,
-        **capture: Any,
+        texel_size: float = 0.15, ingest: usdbrdf.IngestOptions | None = None, **capture: Any
     ) -> Made:
         set_quiet(True)
         folder = tmp_path_factory.mktemp("made")

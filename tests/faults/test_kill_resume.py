@@ -52,11 +52,7 @@ FAULTS = {
         "publish:before_replace:3",  # after job.json and the journal: scan.usdc
         "ingest:mid_publish",
     ],
-    "texture": [
-        "image:before_write:7",
-        "texture:mid_publish:9",
-        "texture:before_stamp",
-    ],
+    "texture": ["image:before_write:7", "texture:mid_publish:9", "texture:before_stamp"],
     "shade": [
         "publish:before_replace:2",  # the second tile
         "image:before_write:5",

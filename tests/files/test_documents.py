@@ -30,8 +30,7 @@ def test_plain_documents(read):
 
 
 @pytest.mark.parametrize(
-    "number",
-    ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "9223372036854775808", "1" * 5000],
+    "number", ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "9223372036854775808", "1" * 5000]
 )
 def test_numbers_that_are_not_finite(read, number):
     text = f'{{"a": "NaN 1e999",\n\n "b": [1.0, {number}]}}'
@@ -40,8 +39,7 @@ def test_numbers_that_are_not_finite(read, number):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ['{"a": 1,\n"b": {"a": 2},\n"a": 3}', '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]'],
+    "text", ['{"a": 1,\n"b": {"a": 2},\n"a": 3}', '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]']
 )
 def test_key_twice(read, text):
     with pytest.raises(InputRefused, match=r"doc\.json:3: the key 'a' .+\[document\.duplicate\]$"):

@@ -122,8 +122,7 @@ def test_work_for_other_parameters_is_swept_even_where_nothing_runs(tmp_path, to
 
 
 @pytest.mark.parametrize(
-    "fault",
-    ["before_write:4", "checkpoint:2", "before_publish", "mid_publish:2", "before_stamp"],
+    "fault", ["before_write:4", "checkpoint:2", "before_publish", "mid_publish:2", "before_stamp"]
 )
 def test_full_disk_keeps_the_previous_asset_and_resumes(
     tmp_path, toy, toy_process, hashes, undisturbed, fault

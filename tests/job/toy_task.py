@@ -59,9 +59,5 @@ if __name__ == "__main__":
     arm_from_environment()
     options = [argument for argument in sys.argv[2:] if argument.startswith("--")]
     numbers = [int(argument) for argument in sys.argv[2:] if not argument.startswith("--")]
-    result = run_toy(
-        Path(sys.argv[1]),
-        *numbers,
-        textures=2 if "--fewer" in options else 3,
-    )
+    result = run_toy(Path(sys.argv[1]), *numbers, textures=2 if "--fewer" in options else 3)
     print(result.reran, result.reason)

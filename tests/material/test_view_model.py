@@ -120,8 +120,7 @@ def test_costs_are_those_of_generalised_least_squares(updates: int):
     # Not every texel is in every frame.
     kept = np.sort(rng.choice(45, 38, replace=False))
     samples = ViewSamples(
-        **{name: value[kept] for name, value in vars(samples).items() if name != "cell"},
-        cell=CELL,
+        **{name: value[kept] for name, value in vars(samples).items() if name != "cell"}, cell=CELL
     )
     samples = replace(samples, texel=np.unique(samples.texel, return_inverse=True)[1])
     model = ViewModel(samples)

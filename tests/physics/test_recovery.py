@@ -149,11 +149,7 @@ def _whole(studio: Studio) -> np.ndarray:
 @pytest.mark.parametrize(("phi", "psi"), [(0.06, 0.8), (0.12, 0.3), (0.3, 0.5), (0.56, 0.9)])
 def test_the_material_of_a_sphere_comes_back(studio: Studio, phi: float, psi: float):
     image = _render(studio, phi, psi)
-    view = View(
-        radiance=image,
-        valid=_whole(studio),
-        camera=studio.camera,
-    )
+    view = View(radiance=image, valid=_whole(studio), camera=studio.camera)
     exact = _true_radiance(studio.world)
     lit = _lit_scene(studio.world, exact)
     found, used = fit_target_frame(lit, view, SPHERE, "paper", 800, 0)
@@ -193,9 +189,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
             camera=replace(studio.camera, world_from_camera=look_at(eye, CENTRE))
         )
         view = View(
-            radiance=_render(there, phi, psi, samples=32),
-            valid=_whole(there),
-            camera=there.camera,
+            radiance=_render(there, phi, psi, samples=32), valid=_whole(there), camera=there.camera
         )
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
@@ -212,11 +206,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
 def test_a_sphere_without_specular_gets_none(studio: Studio):
     # psi = 0 keeps the grazing part only: hardly anything but L_d is in the picture.
     image = _render(studio, 0.9, 0.0)
-    view = View(
-        radiance=image,
-        valid=_whole(studio),
-        camera=studio.camera,
-    )
+    view = View(radiance=image, valid=_whole(studio), camera=studio.camera)
     lit = _lit_scene(studio.world, _true_radiance(studio.world))
     found, _ = fit_target_frame(lit, view, SPHERE, "paper", 800, 0)
     assert found is not None
@@ -226,11 +216,7 @@ def test_a_sphere_without_specular_gets_none(studio: Studio):
 def test_an_object_of_a_few_pixels_is_not_fitted(studio: Studio):
     nothing = np.zeros((SIZE, SIZE), bool)
     nothing[SIZE // 2, SIZE // 2 - 4 : SIZE // 2 + 4] = True
-    view = View(
-        radiance=np.ones((SIZE, SIZE, 3), np.float32),
-        valid=nothing,
-        camera=studio.camera,
-    )
+    view = View(radiance=np.ones((SIZE, SIZE, 3), np.float32), valid=nothing, camera=studio.camera)
     lit = _lit_scene(studio.world, _true_radiance(studio.world))
     found, used = fit_target_frame(lit, view, SPHERE, "paper", 800, 0)
     assert found is None

@@ -244,10 +244,7 @@ def test_a_matrix_excludes_what_it_holds_itself(
 
 
 def test_what_stands_in_the_place_of_the_output_is_refused_before_rendering(
-    room: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.modules[relight.__module__], "render_view", None)
     folder, file = tmp_path / "d.exr", tmp_path / "file"

@@ -100,10 +100,7 @@ def test_irradiance_of_lights(scalar: Any, kind: str) -> None:
             DistantLight(towards=down, irradiance=np.float32(radiance), half_angle=0.0),
             1.0,
         ),
-        "sun": (
-            DistantLight(towards=down, irradiance=np.float32(radiance), half_angle=0.05),
-            1.0,
-        ),
+        "sun": (DistantLight(towards=down, irradiance=np.float32(radiance), half_angle=0.05), 1.0),
         "sky": (SkyLight(image=image, world_from_here=np.eye(3)), math.pi),
     }[kind]
     # At normal incidence and with little roughness the lobe of f0 = 0 reflects next to nothing.

@@ -79,11 +79,7 @@ def _empty(world: World, part: slice | None = None) -> Observation:
 
 
 def _observe(
-    world: World,
-    frames: Frames,
-    observed: Observation,
-    start: int = 0,
-    part: slice | None = None,
+    world: World, frames: Frames, observed: Observation, start: int = 0, part: slice | None = None
 ) -> list[int]:
     images = read_frames(frames, range(start, len(frames)))
     done = []

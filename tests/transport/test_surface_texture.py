@@ -60,9 +60,7 @@ def test_look_ups_are_bilinear():
 def test_no_face_lies_on_two_lines_of_the_cache():
     pixels = packed_pixels(np.zeros((1, 3), np.float32), np.zeros(1, np.int32), 1)
     faces, places = packed_faces(
-        np.zeros((5, 3, 2), np.float32),
-        np.zeros(5, np.int64),
-        np.ones((5, 2), np.int32),
+        np.zeros((5, 3, 2), np.float32), np.zeros(5, np.int64), np.ones((5, 2), np.int32)
     )
     assert pixels.ctypes.data % 64 == faces.ctypes.data % 64 == 0
     assert faces.strides[0] == 32

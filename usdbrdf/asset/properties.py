@@ -18,10 +18,8 @@ from usdbrdf.model.arrays import Array, Float
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
 # away, not when one is added.
 SCHEMA_VERSION = 1
-
 # In the names of a schema that is applied several times, in the place of the instance.
 INSTANCE = "__INSTANCE_NAME__"
-
 Colour = tuple[float, float, float]
 
 
@@ -132,11 +130,8 @@ FIT = Schema("MaterialFit", "usdBrdf:fit", "Mesh", "status", """The fitted GGX l
     UsdPreviewSurface is derived from it as usdBrdf:fit:mapping says.""")
 EMITTER = Schema("Emitter", "usdBrdf:emitter", "Mesh", "radiance", """An object that emits light of
     its own. Its material has emissiveColor and no albedo.""", flag="emitter")
-
 SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER)
-
 _CONFIDENCES = ("high", "low", "none")
-
 _CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
     of the class the rest; none: {0} is the value of the class."""
 

@@ -10,9 +10,7 @@ from usdbrdf.asset.properties import FIT, SCHEMA_VERSION
 from usdbrdf.errors import UsdBrdfError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-
 _PLUGIN = "usdBrdf"
-
 # Earlier versions of USD take validators from C++ alone.
 _PYTHON_VALIDATORS = (0, 26, 8)
 

@@ -20,31 +20,21 @@ from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
 
 PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-
 # A frame with less than this share of pixels that are not clipped, or not black, says nothing.
 _MIN_USEFUL_SHARE = 0.001
-
 # Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
 _MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
-
 # Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
 # of the image.
 LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
-
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
-
 _MIN_HIT_SHARE = 0.2
-
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
-
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-
 _OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-
 # Mix-ups of conventions that are tried where the poses do not fit the mesh.
 _CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
@@ -82,11 +72,7 @@ def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
 
 
 def rigid_records(
-    records: Sequence[FrameRecord],
-    findings: Findings,
-    source: Path,
-    *,
-    pose_scale: float | None,
+    records: Sequence[FrameRecord], findings: Findings, source: Path, *, pose_scale: float | None
 ) -> list[FrameRecord]:
     """Records with poses made exactly rigid; frames without a sensible camera are dropped.
 

@@ -59,11 +59,8 @@ def frames_from_records(
 
 # Characters of a frame's name that are shown.
 _LONGEST_NAME = 200
-
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
-
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
-
 _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
     "capture.camera": "Correct the focal lengths and principal points.",

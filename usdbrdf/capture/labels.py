@@ -20,7 +20,6 @@ from usdbrdf.model.mesh import ObjectLabel, doubled_areas, welded_ids
 from usdbrdf.untrusted.mesh_files import FileMesh
 
 _MAX_OBJECTS = 65_535
-
 _UNLABELLED = "unlabelled"
 
 

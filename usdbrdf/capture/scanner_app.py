@@ -32,12 +32,9 @@ from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
 
 NAME = "scanner-app"
-
 DESCRIPTION = DESCRIPTIONS[NAME]
-
 # The app's own names, the one with the whole surface first.
 _MESHES = ("export.obj", "textured_output.obj", "export.ply", "export_refined.obj")
-
 _FRAME = re.compile(r"frame_\d+\.json")
 
 

@@ -47,21 +47,15 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
 
 
 NAME = "transforms"
-
 DESCRIPTION = DESCRIPTIONS[NAME]
-
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-
 # No number in a document means anything beyond this; nor, where it must be positive, below its
 # inverse.
 _LARGEST = 1e15
-
 # Where no size is stated: a principal point this far from the image's centre, or an image this much
 # wider than its angle says, in parts of its size, belongs to an image of another size.
 _OFF_CENTRE = 0.2
-
 # Tried where a name has no suffix, as in the NeRF authors' synthetic scenes.
 _SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg")
 

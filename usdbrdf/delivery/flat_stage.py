@@ -25,12 +25,9 @@ from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.job.stamp import code_version
 
 _PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
-
 # Properties and schemas that name files of the capture or of other looks.
 _LEFT_OUT = ("usdBrdf:aov:", "usdBrdf:capture:image", "backPlate:")
-
 _MAPPING = "usdBrdf:fit:mapping"
-
 _LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", "BackPlateAPI:")
 
 

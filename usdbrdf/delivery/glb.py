@@ -30,9 +30,7 @@ from usdbrdf.model.arrays import Byte, Float
 from usdbrdf.model.material import Material, Surface
 
 IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
-
 _WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
-
 _LINEAR, _LINEAR_MIPMAP = 9729, 9987
 
 

@@ -45,10 +45,8 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions
 
 USDZ, GLB = ".usdz", ".glb"
-
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
 _PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)
-
 ARKIT = "arkit"
 
 

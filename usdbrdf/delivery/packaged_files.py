@@ -23,20 +23,14 @@ from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write
 from usdbrdf.model.arrays import Byte, Float
 
 Types = Sdf.ValueTypeNames
-
 EXR, PNG = "exr", "png"
-
 # What a package may hold as it is; of these, what has 8 bits already.
 EIGHT_BIT = frozenset({".png", ".jpg", ".jpeg"})
-
 IMAGES = EIGHT_BIT | {".exr"}
-
 # What becomes EXR or PNG.
 CONVERTED = frozenset({".hdr", ".tif", ".tiff"})
-
 # The start of what no path of a file is, such as https://.
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-
 _COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
 
 

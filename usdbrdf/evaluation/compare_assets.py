@@ -16,15 +16,7 @@ from usdbrdf.asset.previews import camera_hits
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import MapError, map_error
-from usdbrdf.evaluation.report import (
-    FILES,
-    Row,
-    files_of,
-    magma,
-    output_folder,
-    sheet,
-    table_text,
-)
+from usdbrdf.evaluation.report import FILES, Row, files_of, magma, output_folder, sheet, table_text
 from usdbrdf.evaluation.truth import MIN_SAMPLES
 from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
@@ -40,16 +32,12 @@ from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
 DOCUMENT = "comparison.json"
-
 # Points of two assets this close are the same, as a share of the scene's size.
 _SAME_POINT = 1e-5
-
 # On meshes that differ, a texel may be this many texels away.
 _REACH = 2.0
-
 # Sheets of pictures, at most, and pixels across each of their pictures.
 _CAMERAS, _MAX_WIDTH = 4, 480
-
 # Errors of this share of the reference, or more, are shown palest.
 _FULL_ERROR = 0.25
 

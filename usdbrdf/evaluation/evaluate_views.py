@@ -47,15 +47,11 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions
 
 DOCUMENT = "evaluation.json"
-
 MODELS = ("baseline", "full")
-
 # Cameras and renderers smear a lamp over this many pixels around it.
 _LAMP_MARGIN = 2
-
 # Pixels of all photographs together that the exposure is taken from, at most.
 _EXPOSURE_PIXELS = 1 << 24
-
 # Pixels of views that wait for FLIP together, at most: what bounds the memory.
 _WAITING_PIXELS = 1 << 23
 

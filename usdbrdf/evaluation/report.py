@@ -17,18 +17,12 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, OwnershipConflict
-from usdbrdf.files.atomic import (
-    TEMPORARY_PREFIX,
-    environment_failures,
-    publish,
-    temporary_beside,
-)
+from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, publish, temporary_beside
 from usdbrdf.files.documents import read_json
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Bool, Byte, Float
 
 Row: TypeAlias = Mapping[str, Any]
-
 # metric -> whether more of it is better
 _METRICS = {"l2": False, "l2_with_lamps": False, "l2_shown": False, "flip": False, "psnr": True}
 
@@ -109,12 +103,9 @@ _MAGMA = np.array(
     [(0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100),
      (251, 135, 97), (254, 194, 135), (252, 253, 191)], np.float32,
 )  # fmt: skip
-
 _GREY = np.array((96, 96, 96), np.uint8)
-
 # A change of this much in FLIP gets the full colour.
 _FULL_CHANGE = 0.2
-
 _GAP = 4  # pixels between the pictures of a sheet
 
 
@@ -152,13 +143,11 @@ def _masked(colour: Byte, counted: Bool | None) -> Byte:
 
 
 _LINES = (("baseline", "diffuse baseline", "tab:blue"), ("full", "full model", "tab:orange"))
-
 _PANELS = (
     ("l2", "relative $L_2$ without lamps"),
     ("l2_shown", "the same, cut off at display white"),
     ("flip", "mean FLIP"),
 )
-
 _MARKED = 60  # so many views still get a dot each
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from usdbrdf.errors import EnvironmentFailure
 
 TEMPORARY_PREFIX = ".tmp-"
-
 _BLOCK = 1 << 20  # bytes hashed at a time
 
 

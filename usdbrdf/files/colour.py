@@ -14,11 +14,8 @@ from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.model.arrays import Float
 
 WORKING_SPACE = "lin_rec709_scene"
-
 DISPLAY_SPACE = "srgb_rec709_scene"
-
 _CONFIG = "cg-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
-
 # Our names, and what configs older than the pinned one call the same space.
 _NAMES = {
     "lin_ap0_scene": ("lin_ap0_scene", "lin_ap0"),
@@ -28,9 +25,7 @@ _NAMES = {
     "lin_rec709_scene": ("lin_rec709_scene", "lin_rec709_srgb", "lin_rec709"),
     "srgb_rec709_scene": ("srgb_rec709_scene", "srgb_tx"),
 }
-
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
-
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
 

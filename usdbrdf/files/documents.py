@@ -18,11 +18,8 @@ from usdbrdf.files.atomic import write_text_atomic
 # caller is to judge it, and names the byte of a fault, not its line.
 
 MAX_BYTES = 256 << 20
-
 MAX_DEPTH = 64
-
 _INTEGER_LIMIT = 1 << 63
-
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
 
 

@@ -15,13 +15,10 @@ from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
 
 PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
-
 # A half float stores 3.2 as 3.19922: a clipped channel is one close to the saturation.
 _CLIPPED_SHARE = 0.998
-
 # Threads that decode, and frames in memory besides the one that is used.
 _READERS, _AHEAD = 2, 3
-
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
 
@@ -34,7 +31,6 @@ def _linear(code: float) -> float:
 # An 8-bit photograph near its ends tells that a channel is bright or dark, not how much: JPEG
 # compression alone moves values by several codes there. Linear values at one reference exposure.
 PHOTOGRAPH_SATURATION = _linear(250 / 255)
-
 PHOTOGRAPH_NOISE_FLOOR = _linear(3 / 255)
 
 

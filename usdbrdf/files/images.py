@@ -24,33 +24,22 @@ from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.model.arrays import Byte, Float
 
 MAX_SIDE = 65_536  # pixels
-
 MAX_PIXELS = 1 << 28
-
 MAX_CHANNELS = 64
-
 MAX_DECLARED_BYTES = 4 << 30
-
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
-
 # A display window may be larger than what the file holds; beyond this many bytes not by any factor.
 MAX_UNKNOWN_BYTES, MAX_UNKNOWN_SHARE = 64 << 20, 63 / 64
-
 HALF_MAX = 65_504.0
-
 # What halves hold well: a little less than the largest, and all their digits.
 _HALF_FROM, _HALF_UNTIL = 2.0**-14, 60_000.0
-
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
-
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
-
 # fmt: off
 _RAW_SUFFIXES = frozenset((
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
 ))
-
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 

@@ -8,7 +8,6 @@ import unicodedata
 from collections.abc import Sequence
 
 _MAX_LENGTH = 64
-
 # Device names that Windows refuses as a file's stem, whatever the extension.
 _RESERVED = frozenset(
     ["aux", "con", "nul", "prn", *(f"{d}{i}" for d in ("com", "lpt") for i in range(10))]

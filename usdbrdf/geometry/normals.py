@@ -10,10 +10,7 @@ from numba import prange
 
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Double, Float, Int
-from usdbrdf.model.mesh import (
-    face_normals_and_angles,
-    welded_ids,
-)
+from usdbrdf.model.mesh import face_normals_and_angles, welded_ids
 
 # The pairs of corners around one vertex grow with the square of their number. Beyond this a vertex
 # is the hub of a fan that no smoothing can help; its corners keep their faces' normals.

@@ -17,10 +17,8 @@ from usdbrdf.model.texels import Texels
 # A texel whose centre lies outside every triangle, but no further than this from one (in texels),
 # still belongs to the chart: bilinear lookup at the chart's border reads it.
 _BORDER = 0.75
-
 # How far from its triangle's edges a texel's point stays, in texels (less in slivers).
 _INSET = 0.01
-
 # Texels computed at a time, by each thread.
 _AT_A_TIME = 1 << 16
 
@@ -187,10 +185,7 @@ def _unit(vectors: npt.NDArray[np.floating], otherwise: npt.NDArray[np.floating]
 
 
 def _nearest_texel(
-    owner: Int,
-    pixel: npt.NDArray[np.int64],
-    resolution: Int,
-    first_pixel: npt.NDArray[np.int64],
+    owner: Int, pixel: npt.NDArray[np.int64], resolution: Int, first_pixel: npt.NDArray[np.int64]
 ) -> Int:
     index = np.full(len(owner), -1, np.int32)
     index[pixel] = np.arange(len(pixel), dtype=np.int32)

@@ -23,7 +23,6 @@ from usdbrdf.model.scene import Scene
 
 # Texels between charts: bilinear lookup stays inside its own.
 _GAP = 2
-
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -107,7 +106,6 @@ def _paint(corners: Double, chart: Int, owner: Int) -> bool:
 
 # Texels between charts: bilinear lookup and two mip levels stay inside a chart's own gutter.
 PADDING = 4
-
 MAX_SIDE = 16384
 
 
@@ -141,12 +139,7 @@ def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     result = run_child(
         "usdbrdf.geometry.unwrap:unwrap_objects",
-        {
-            "points": scene.points,
-            "triangles": scene.triangles,
-            "first": first,
-            "count": count,
-        },
+        {"points": scene.points, "triangles": scene.triangles, "first": first, "count": count},
         {"texel_size": texel_size},
         timeout_s=120 + 2e-3 * len(scene.triangles),
         label="unwrapping the objects",

@@ -19,14 +19,11 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import BOX_FACES, RayScene
 
 Vector = tuple[float, float, float]
-
 # Rays decide within this many pixels of an edge, and where two depths differ by less than this
 # share: single precision, in which rays are traced, errs by a tenth of both.
 _EDGE, _DEPTH = 4e-3, 2e-5
-
 # Bands of rows, drawn in any order by any thread.
 _BANDS = 32
-
 _BEHIND = 1e-9
 
 

@@ -15,7 +15,6 @@ from usdbrdf.files.atomic import publish, sha256_of, temporary_beside
 from usdbrdf.model.arrays import Array
 
 _NAME = re.compile(r"(?P<key>[^@]*)(?:@(?P<index>\d{9}))?\.(?P<sha256>[0-9a-f]{64})\.npz")
-
 # Seconds between saved states of a running computation, and how many times as long as saving one
 # takes: what a kill can cost, and what saving may.
 _SAVE_AFTER, _SAVE_SELDOM = 2.0, 30

@@ -32,13 +32,9 @@ from usdbrdf.model.arrays import Array
 
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
-
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
-
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
-
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
-
 _ERROR_CLASSES = {
     name: value
     for name, value in vars(errors).items()

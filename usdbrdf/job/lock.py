@@ -16,7 +16,6 @@ from pathlib import Path
 from usdbrdf.errors import FolderBusy
 
 _POLL_SECONDS = 0.2
-
 # Which thread of this process has which lock file. POSIX record locks belong to the process: a
 # second one from another thread would just succeed, and closing any descriptor of the file would
 # free the first. A forked child has none of them.

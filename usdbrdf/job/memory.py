@@ -10,9 +10,7 @@ from pathlib import Path
 import psutil
 
 GIB = 1 << 30
-
 _CGROUPS = Path("/sys/fs/cgroup")
-
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 

@@ -16,9 +16,7 @@ from typing import Any, TextIO, TypeVar
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 
 T = TypeVar("T")
-
 _SECONDS_BETWEEN_LINES = 30.0
-
 _quiet = False
 
 

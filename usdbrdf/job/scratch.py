@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 
 PREFIX = "usdbrdf-scratch-"
-
 # Between its making and its locking a folder seems to have no owner.
 _MIN_AGE_SECONDS = 60
 

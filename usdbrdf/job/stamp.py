@@ -22,7 +22,6 @@ from usdbrdf.files.documents import json_text, read_json, write_json
 from usdbrdf.identity import tasks_identity
 
 STATE_FOLDER = ".usdbrdf"
-
 STAMP_SCHEMA = 1
 
 

@@ -24,7 +24,6 @@ from usdbrdf.model.arrays import Double, Float
 from usdbrdf.transport.lobe_radiance import Basis
 
 Pair = tuple[Float, Float]
-
 # Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
 # many with rays of their own.
 _NOISY = calibration.number("fit.noisy_rays")
@@ -110,9 +109,7 @@ _LEVEL_1 = (
     0.0, 0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.14, 0.19, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9,
     1.0,
 )  # fmt: skip
-
 _LEVEL_2 = 3
-
 # Steps of expectation maximisation, each after a search of level 1; and how many more with another
 # candidate than the first.
 _UPDATES, _MORE = 4, 2

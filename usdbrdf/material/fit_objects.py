@@ -42,7 +42,6 @@ from usdbrdf.transport.lobe_radiance import Mixture
 # Objects that are fitted together: while rays of one are traced on all cores, another is at its
 # algebra, which takes one.
 _AT_A_TIME = 2
-
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
@@ -97,12 +96,7 @@ class ObjectFit(NamedTuple):
 
 
 def survey_frames(
-    run: TaskRun,
-    lit: LitScene,
-    texels: Texels,
-    usable: Bool,
-    frames: Frames,
-    options: FitOptions,
+    run: TaskRun, lit: LitScene, texels: Texels, usable: Bool, frames: Frames, options: FitOptions
 ) -> Survey:
     """Gather all that the fits need of the frames, which are read once.
 
@@ -143,12 +137,7 @@ def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
 
 
 def fitted_objects(
-    run: TaskRun,
-    lit: LitScene,
-    texels: Texels,
-    frames: Frames,
-    survey: Survey,
-    options: FitOptions,
+    run: TaskRun, lit: LitScene, texels: Texels, frames: Frames, survey: Survey, options: FitOptions
 ) -> list[ObjectFit]:
     """``fit_object`` of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))

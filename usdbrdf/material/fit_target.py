@@ -25,10 +25,8 @@ from usdbrdf.transport.rays import lift_from_surface
 
 Basis = Callable[[float], tuple[Float, Float]]
 Projection = Callable[[Double], Double]
-
 # Roughnesses of each level.
 GRID = 11
-
 _FLAT = calibration.number("fit_of_frame.flat_cost")
 
 
@@ -78,12 +76,7 @@ def choose_target_frames(counts: Iterable[FrameCounts]) -> tuple[Int, Int]:
 
 
 def object_pixels(
-    owner: Int,
-    valid: Bool,
-    highlight: Bool,
-    index: int,
-    limit: int,
-    pick: Callable[[int], Long],
+    owner: Int, valid: Bool, highlight: Bool, index: int, limit: int, pick: Callable[[int], Long]
 ) -> tuple[Long, Float]:
     """Flat indices of the pixels of object ``index`` to fit, at most ``limit``, and how many pixels
     each stands for, (P,) float32.
@@ -206,11 +199,9 @@ def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, floa
 
 
 Residual = Literal["paper", "scaled"]
-
 # A pixel sees an area: its rays start at 2 x 2 points of it. On small curved objects the normal
 # turns within a pixel; taken at its centre alone, the highlight looks rougher than it is.
 _SUB_PIXEL = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-
 MIN_PIXELS = calibration.count("fit_of_frame.min_pixels")
 
 

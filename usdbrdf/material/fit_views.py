@@ -26,25 +26,16 @@ from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_point
 from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
 _FOOTPRINT = calibration.number("fit.footprint")
-
 _OTHER_WIDTHS_PX = calibration.numbers("fit.wider_footprints")
-
 _KEPT = calibration.number("fit.kept_in_footprint")
-
 _SPREAD_OF_WIDTHS = math.log(calibration.number("fit.spread_of_footprints"))
-
 _CURVED = calibration.number("fit.curved_from")
-
 MIN_OBSERVATIONS = calibration.count("fit.min_observations")
-
 _MIN_VIEWS = calibration.count("fit.min_views")
-
 _ABOVE_NOISE = calibration.number("fit.above_noise")
-
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
-
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 

@@ -12,11 +12,8 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Double
 
 _PSI_GRID = np.linspace(0, 1, 201)
-
 _MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
-
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
-
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 

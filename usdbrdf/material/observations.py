@@ -22,9 +22,7 @@ from usdbrdf.transport.warps import shifts_of
 
 # Side of the squares in texels, which are about as large as pixels.
 SIDE = 4.0
-
 _FLAT = calibration.number("observations.flat_cosine")
-
 _MOST = calibration.number("observations.squares_share")
 _WIDEST = calibration.number("observations.widest_square")
 
@@ -59,13 +57,9 @@ def on_flat_squares(texels: Texels, reach: int) -> Bool:
 
 # The noise is looked at in windows of so many pixels that show one object alone, so many per frame.
 _WINDOW, _WINDOWS = 24, 60
-
 _FEWEST_WINDOWS = calibration.count("observations.noise.min_tiles")
-
 _LAGS = 3
-
 _WHITE = calibration.number("observations.noise.white")
-
 _WIDEST_BLUR = calibration.number("observations.noise.widest_blur")
 
 
@@ -131,19 +125,15 @@ def smoothing_of(windows: Sequence[Double]) -> float:
 _FOLLOWED = 3000
 _KEPT = 200
 _VIEWS = 12
-
 _MIN_VIEWS = calibration.count("observations.min_views")
-
 # Bounds the table of followed texels times frames, 17 bytes each (12 of radiance, 4 of light, 1 of
 # whether the texel was seen). Rather than fewer texels per object, fewer frames are followed.
 _MAX_CELLS = 12_000_000
 _FEWEST = 40
-
 # The mirror direction is blurred by this many rays within a lobe of this alpha: how far a highlight
 # reaches is not known yet.
 _PROXY_RAYS = 4
 _PROXY_ALPHA = calibration.number("observations.proxy_alpha")
-
 # How far pictures were smoothed is measured on about so many frames.
 _FRAMES_OF_NOISE = 20
 

@@ -37,18 +37,14 @@ from usdbrdf.transport.warps import shifts_of
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
 # see needs fewer of each.
 _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
-
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
 # is left of their noise is far below the other errors.
 _MOST_SAMPLES = 24
-
 # Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
 # sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
-
 _RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
-
 _DARKEST = calibration.number("refine.darkest")
 
 

@@ -31,9 +31,7 @@ from usdbrdf.transport.lobe_radiance import specular_irradiance
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
 # the specular light, with so many again from where each of them ends.
 _DIFFUSE_RAYS = 64
-
 _SPECULAR_RAYS, _RAYS_OF_LOBE = 8, 4
-
 # Not the seed of the irradiance as traced: their errors must not add up.
 _SEED = 0x5EED
 

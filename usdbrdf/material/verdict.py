@@ -9,9 +9,7 @@ from usdbrdf import calibration
 from usdbrdf.material.lobe_posterior import NOTHING_KNOWN
 
 PRIOR_ERROR = calibration.number("prior.error")
-
 NEUTRAL = calibration.pair("prior.neutral")
-
 _OF_WORD = calibration.pairs("prior.classes")
 
 
@@ -38,14 +36,10 @@ def with_prior(
 
 MIN_EVIDENCE = calibration.number("verdict.min_evidence")
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
-
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
-
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
-
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
-
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
 

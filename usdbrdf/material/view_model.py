@@ -182,15 +182,11 @@ def _frame(
 
 _INDEPENDENT = calibration.number("errors.independent")
 _OF_SPECULAR = calibration.number("errors.of_specular")
-
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
-
 # With more shared errors than this, cells are made larger, up to the object.
 _MOST_EFFECTS = 2500
-
 _TAIL = calibration.number("errors.student_freedom")
-
 _LEAST_LEVEL = calibration.number("errors.least_diffuse")
 
 

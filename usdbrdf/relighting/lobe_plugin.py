@@ -7,7 +7,6 @@ from typing import Any
 from usdbrdf.transport.brdf import MIN_ALPHA, distribution, fresnel, masking, masking_width
 
 NAME = "usdbrdf_lobe"
-
 _registered: set[str] = set()
 
 

@@ -98,7 +98,6 @@ def _native(mi: Any, surface: Surface) -> dict[str, Any]:
 
 # A disc in the sky stands this many scene radii away: its direction then varies by a thousandth.
 _SKY_RADII = 1000.0
-
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 

@@ -32,7 +32,6 @@ from usdbrdf.relighting.render import mitsuba_variant, render_view
 from usdbrdf.transport.denoise import OIDN, chosen_filter, denoise_picture
 
 LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
-
 _LEVELS = 1 << 16  # pixels of a picture that the exposure is taken from
 
 

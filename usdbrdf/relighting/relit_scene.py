@@ -9,10 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.asset.readers.render_scene import (
-    RenderScene,
-    sky_of_picture,
-)
+from usdbrdf.asset.readers.render_scene import RenderScene, sky_of_picture
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
@@ -59,7 +56,6 @@ def _same_place(a: Surface, b: Surface) -> bool:
 
 
 USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
-
 SKY_SUFFIXES = frozenset({".exr", ".hdr"})
 
 

@@ -15,7 +15,6 @@ from usdbrdf.model.camera import Camera
 
 # Older ones abort the process while they compile Mitsuba's kernels.
 _MIN_LLVM = 17
-
 VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
 
 
@@ -43,7 +42,6 @@ def mitsuba_variant(variant: str | None = None) -> Any:
 # Paths of one pass: bounds the memory of the vectorised path tracer, some 200 bytes a path, and
 # gives the bar something to count.
 _PATHS_PER_PASS = 1 << 22
-
 _NEAR_M, _FAR_M = 1e-3, 1e6
 
 

@@ -10,7 +10,6 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.inpaint import inpaint
 
 NEUTRAL = calibration.number("albedo.unseen")
-
 _DARK = calibration.number("albedo.dark")
 _TINY = float(np.finfo(np.float32).tiny)
 

@@ -33,21 +33,13 @@ from usdbrdf.shading.lamp_evidence import (
 )
 
 MAX_ERROR = calibration.number("lamps.max_error")
-
 _LEAST_ERROR = calibration.number("lamps.least_error")
-
 _FEW_OBJECTS = calibration.count("lamps.few_objects")
-
 _STUDENT_FREEDOM = calibration.number("lamps.student_freedom")
-
 _ROUNDS = 6
-
 _STEPS = 30
-
 LAMP_PRIOR = calibration.pair("lamps.prior")
-
 _START = np.log(calibration.numbers("lamps.errors.start"))
-
 _LIMITS = np.log(calibration.numbers("lamps.errors.limits")).reshape(3, 2)
 
 

@@ -33,22 +33,15 @@ from usdbrdf.transport.textured_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
-
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
-
 _REACH = calibration.number("lamps.reach")
-
 _NEARLY = calibration.number("lamps.nearly_as_bright")
-
 _AROUND = calibration.number("lamps.around")
-
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
 _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
-
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
-
 _WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
@@ -116,13 +109,7 @@ def _connected(texels: Texels, candidates: Long) -> list[Long]:
     return [part for part in parts if len(part) >= _MIN_TEXELS]
 
 
-def _stands_out(
-    texels: Texels,
-    bright: Float,
-    part: Long,
-    measured: Long,
-    bound: float,
-) -> bool:
+def _stands_out(texels: Texels, bright: Float, part: Long, measured: Long, bound: float) -> bool:
     distance, _ = cKDTree(texels.position[part]).query(texels.position[measured])
     around = measured[distance < _AROUND]
     return not len(around) or float(np.median(bright[around])) < _NEARLY * bound

@@ -13,9 +13,7 @@ from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.texels import Texels
 
 EMITTER_RATIO = calibration.number("emitters.ratio")
-
 _WHOLE_LAMP = calibration.number("emitters.whole_lamp")
-
 _MIN_PATCH = calibration.count("emitters.min_texels")
 
 

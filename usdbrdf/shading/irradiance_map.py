@@ -22,11 +22,7 @@ _TILE = 1 << 15
 
 
 def trace_irradiance(
-    run: TaskRun,
-    surface: TexturedScene,
-    lit: Float,
-    environment: Environment,
-    sampling: Sampling,
+    run: TaskRun, surface: TexturedScene, lit: Float, environment: Environment, sampling: Sampling
 ) -> Irradiance:
     """S at all texels with the radiance ``lit`` (T, 3) as the light, from where a kill left it."""
     texels = surface.texels

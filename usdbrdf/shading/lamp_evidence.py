@@ -106,11 +106,9 @@ def restricted_cost(matrix: Double, residual: Double) -> float:
 
 
 _MIN_SEGMENT = calibration.count("lamps.min_segment")
-
 _AMBIENT = calibration.number("lamps.ambient")
 AMBIENT_SPREAD = calibration.number("lamps.ambient_spread")
 _AMBIENT_ERROR = calibration.number("lamps.ambient_error")
-
 _MOSTLY_AMBIENT = calibration.number("lamps.mostly_ambient")
 
 

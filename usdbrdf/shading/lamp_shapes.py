@@ -17,16 +17,12 @@ from usdbrdf.model.texels import Texels
 # carry this share of its power.
 _MAX_PARTS = 6
 _COVERED = calibration.number("lamp_shapes.covered")
-
 _SAME_DIRECTION = math.cos(math.radians(calibration.number("lamp_shapes.same_direction")))
 _FLAT = calibration.number("lamp_shapes.flat")
-
 _RECTANGLE_FILL = calibration.number("lamp_shapes.rectangle_fill")
 _DISK_FILL = calibration.number("lamp_shapes.disk_fill")
-
 _ROUND = calibration.number("lamp_shapes.round")
 _SPHERE_FILL = calibration.number("lamp_shapes.sphere_fill")
-
 # Lights lie this share of their size off the lamp's surface, which would shade them otherwise.
 _GAP = 1e-3
 

@@ -37,10 +37,7 @@ class Task:
     def provenance(self) -> Provenance:
         """What the task's layers say of how they came about."""
         return Provenance(
-            role=self.role,
-            version=code_version(),
-            parameters=self.parameters,
-            inputs=self.inputs,
+            role=self.role, version=code_version(), parameters=self.parameters, inputs=self.inputs
         )
 
     @property

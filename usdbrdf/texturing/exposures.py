@@ -23,21 +23,16 @@ from usdbrdf.model.capture import Frames
 
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
 _MOST_TEXELS, _MOST_SAMPLES = 4096, 1 << 21
-
 _CONTRADICTING = calibration.number("exposures.contradicting") * math.log(2)
 _STANDING_OUT = calibration.number("exposures.standing_out")
 _MOST = calibration.number("exposures.most")
 _OUTLYING = calibration.number("exposures.outlying")
-
 # Samples of texels that other frames show too, without which a frame is not judged.
 _FEWEST = 24
-
 # Steps of the reweighting.
 _STEPS = 8
-
 # Frames that are named.
 _LISTED = 6
-
 # What draws a gain to 0 that nothing else decides, in samples.
 _TIE = 1e-3
 

@@ -16,11 +16,9 @@ from usdbrdf.texturing.samples import Projection, project
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
 _RING = np.pi / 4 * np.arange(8)
-
 RINGS = np.where(np.arange(8) % 2, 0.829, 1.820)[:, None] * np.stack(
     [np.cos(_RING), np.sin(_RING)], axis=-1
 )
-
 # Variance of a texel's own area, in texels; and what a view along the surface counts as.
 _OF_TEXEL, _LARGEST = 1 / 12, 1e6
 
@@ -131,7 +129,6 @@ def _blur(
 
 
 SAMPLE_BLUR = calibration.number("refine.sample_blur")
-
 _NEIGHBOURHOOD = calibration.number("refine.neighbourhood")
 
 

@@ -11,7 +11,6 @@ from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Float
 
 Count = npt.NDArray[np.int64]
-
 _GLARING = calibration.number("glare.from")
 _REACH = calibration.count("glare.reach")
 

@@ -12,15 +12,11 @@ from usdbrdf.model.arrays import Bool, Float, Long
 from usdbrdf.model.texels import Texels
 
 _NEIGHBOURS = 8
-
 _NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
-
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
-
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18
-
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
 # is never far.
 _MOST_SOURCES = 1 << 18

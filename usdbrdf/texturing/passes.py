@@ -21,13 +21,10 @@ from usdbrdf.model.texels import Texels
 
 # Without --memory this share of the machine's.
 _SHARE = 0.75
-
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
-
 _PROCESS = GIB // 2
-
 # A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
 _SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
 

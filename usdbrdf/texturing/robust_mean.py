@@ -24,13 +24,10 @@ from usdbrdf.texturing.passes import by_parts
 
 # Samples that are added at a time.
 _BATCH = 5
-
 # Deviations from which a sample loses weight, and steps of the reweighting.
 _OUTLYING = calibration.number("robust_mean.outlying")
 _STEPS = 6
-
 _LEFT = calibration.number("robust_mean.left")
-
 # Texels whose mean is worked out at a time.
 _AT_A_TIME = 1 << 18
 

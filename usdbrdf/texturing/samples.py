@@ -25,12 +25,9 @@ from usdbrdf.texturing.glare import brightest_glare
 from usdbrdf.transport.rays import RayScene
 
 MIN_COSINE = calibration.number("samples.min_cosine")
-
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
-
 _GLARE_CONTRAST = calibration.number("samples.glare_contrast")
-
 NOTHING, SAMPLE, CLIPPED = 0, 1, 2
 
 

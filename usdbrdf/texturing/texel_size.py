@@ -14,9 +14,7 @@ from usdbrdf.model.scene import Scene
 from usdbrdf.transport.rays import RayScene
 
 _RAYS_PER_FRAME = 600
-
 _PACKING = calibration.number("texel_size.packing")
-
 _DIGITS = 2
 
 

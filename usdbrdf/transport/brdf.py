@@ -27,7 +27,6 @@ from usdbrdf.model.arrays import Double
 
 F0_OF_PSI = 0.08
 MIN_ALPHA = 0.001
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 

@@ -12,11 +12,8 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.model.arrays import Float
 
 AUTO: Final = "auto"
-
 NONE: Final = "none"
-
 OIDN: Final = "oidn"
-
 # Larger pictures than this suffices for are filtered in tiles.
 _MOST_MEGABYTES = 512
 

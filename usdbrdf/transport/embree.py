@@ -23,27 +23,21 @@ _TRIANGLES = 0  # RTC_GEOMETRY_TYPE_TRIANGLE
 _INDICES, _VERTICES = 0, 1  # RTC_BUFFER_TYPE_INDEX, _VERTEX
 _UINT3, _FLOAT3 = 0x5003, 0x9003  # RTC_FORMAT_UINT3, _FLOAT3
 _HIGH = 2  # RTC_BUILD_QUALITY_HIGH
-
 # Rays near an edge hit one of its triangles: without it one in 10,000 leaves a closed room that
 # lies 100 m from the origin of its coordinates.
 _ROBUST = 1 << 2  # RTC_SCENE_FLAG_ROBUST
-
 # Embree may read 16 bytes from any vertex, also the last.
 _FLOATS_BEHIND_VERTICES = 4
-
 # A ray and its hit, RTCRayHit: 21 words of 4 bytes, filled up to 24, aligned to 16 bytes; and eight
 # of them, RTCRayHit8: each word of a ray for all of them, aligned to 32 bytes.
 _WORDS, _ALIGNED, _LANES, _ALIGNED_PACKET = 24, 16, 8, 32
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 _U, _V, _FACE, _GEOMETRY, _INSTANCE = 15, 16, 17, 18, 19
 _COHERENT = 1 << 16  # RTC_RAY_QUERY_FLAG_COHERENT
-
 # The version in which they lie so, and RTC_DEVICE_PROPERTY_VERSION_MAJOR.
 _MAJOR_VERSION, _VERSION_MAJOR = 4, 1
-
 # Finite, so that what is computed with the distance of a ray that met nothing stays a number.
 _FARTHEST = np.float32(1e37)
-
 _pointer, _number, _size = ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t
 _FUNCTIONS: dict[str, tuple[object, list[object]]] = {
     "rtcNewDevice": (_pointer, [ctypes.c_char_p]),
@@ -144,11 +138,9 @@ class EmbreeScene:
 
 
 _intersect = types.ExternalFunction("rtcIntersect1", types.void(types.intp, types.intp, types.intp))
-
 _intersect_packet = types.ExternalFunction(
     "rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp)
 )
-
 _occluded = types.ExternalFunction("rtcOccluded1", types.void(types.intp, types.intp, types.intp))
 
 

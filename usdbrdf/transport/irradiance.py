@@ -50,7 +50,6 @@ from usdbrdf.transport.tile_draws import independent_tiles as independent_tiles
 
 # Samples of the first round, and blocks that sums are kept in.
 _FIRST_ROUND, _BLOCKS = 64, 4
-
 # Points that a thread takes at a time: near points' nearly parallel rays follow each other.
 _POINTS = 1 << 12
 

@@ -35,7 +35,6 @@ from usdbrdf.transport.warps import fractions, in_triangle
 
 # So many times AHEAD points' sums, and tables of lights, stay in the cache of a core together.
 _TOGETHER = 2
-
 # In the loops' own precision: with Python's constants the compiler would go over to doubles.
 _INVERSE_PI, _TINY, _NEARLY = (np.float32(c) for c in (1 / math.pi, 1e-18, 0.9999))
 

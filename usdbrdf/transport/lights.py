@@ -34,11 +34,9 @@ from usdbrdf.transport.surface_texture import unsigned
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
 _BRIGHTER_THAN = 3.0
-
 # Groups at most; steps of a tile's guide per group: picking then seldom has to look further; share
 # of the picks that follow power alone; and texels of a tile that its groups are weighed at.
 _GROUPS, _STEPS, _BY_POWER, _WEIGHED_AT = 512, 4, 0.1, 8
-
 # Columns of ``LightGroups.triangles``.
 _CORNER, _EDGE_U, _EDGE_V, _NORMAL, DENSITY, GROUP = 0, 3, 6, 9, 12, 13
 

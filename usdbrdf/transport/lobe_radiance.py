@@ -47,10 +47,8 @@ from usdbrdf.transport.warps import (
 Three: TypeAlias = tuple[float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 Basis: TypeAlias = Callable[[Sequence[float]], tuple[Float, Float]]
-
 # Widths that the lobes' samples are drawn with, for any roughness.
 LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
-
 # Roughnesses that vector instructions take at once, and rays of points that are traced at once:
 # what bounds the memory.
 _LANES, _RAYS_AT_ONCE = 8, 1 << 20

@@ -38,11 +38,9 @@ from usdbrdf.transport.brdf import (
 
 # Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
 _VIEWS, _SLOPES, _AZIMUTHS, _COSINES, _CANDIDATES = 24, 120, 32, 128, 400
-
 # The diffuse colour for which the sum of both terms is kept.
 _TYPICAL = 0.5
 _PHI = np.linspace(0, 1, 25) ** 2
-
 # Beyond psi = 1, for what an artist may choose: F0 up to 0.32, ior up to 3.6.
 _F0 = F0_OF_PSI * np.linspace(0, 2, 21) ** 2
 

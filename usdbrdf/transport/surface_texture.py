@@ -17,10 +17,8 @@ from usdbrdf.model.texels import Texels
 
 # Places to ask for before the first is read: few enough to be in the nearest cache then.
 AHEAD = 128
-
 # Pixels that are laid out at a time, and bytes of a line of the cache.
 _AT_A_TIME, _LINE = 1 << 16, 64
-
 # Of a prefetch: to be read, for long, data.
 _READ, _KEEP, _DATA = 0, 3, 1
 _ZERO, _ONE = np.float32(0), np.float32(1)

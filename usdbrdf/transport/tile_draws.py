@@ -32,7 +32,6 @@ from usdbrdf.transport.warps import hashed_uniform, sobol_bits
 # Texels of a tile and of a group; tiles of a run, and its groups.
 TEXELS, _GROUP, _RUN = 64, 8, 16
 _RUN_GROUPS = _RUN * TEXELS // _GROUP
-
 # Bits of a texel's and of a group's stratum in each of the two dimensions.
 _TEXEL_BITS, _GROUP_BITS = 3, 4
 

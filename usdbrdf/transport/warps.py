@@ -69,14 +69,7 @@ def tangent_frame(n: Float) -> tuple[float, float, float, float, float, float]:
     sign = 1.0 if n[2] >= 0 else -1.0
     a = -1.0 / (sign + n[2])
     b = n[0] * n[1] * a
-    return (
-        1.0 + sign * n[0] * n[0] * a,
-        sign * b,
-        -sign * n[0],
-        b,
-        sign + n[1] * n[1] * a,
-        -n[1],
-    )
+    return (1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0], b, sign + n[1] * n[1] * a, -n[1])
 
 
 @kernel

@@ -37,15 +37,12 @@ LIMITS = {
     "stage": Limits(4 * _GIB, 600.0, 64 * _GIB),  # all of its layers together
     "picture": Limits(2 * _GIB, 120.0, 24 * _GIB),
 }
-
 PLUGIN_SECONDS = 60.0  # for the import of another package's module, which may be a large one
-
 _CURES = {
     "mesh": "Name the mesh with --mesh, or put mesh.ply beside the poses.",
     "stage": "Check its name and permission.",
     "picture": "Check its name and permission.",
 }
-
 T = TypeVar("T")
 
 

@@ -23,19 +23,13 @@ from usdbrdf.model.material import Material, Surface, constant_map, preview_mate
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 
 SUFFIXES = (".ply", ".obj", ".glb")
-
 # The face property by which the objects of a segmented PLY are told apart.
 LABEL_PROPERTY = "object_id"
-
 _MAX_TRIANGLES = 50_000_000
-
 _MAX_COORDINATE = 1e6
-
 _MIN_DIAGONAL = 1e-4
-
 # Faces with broken corners below this share are removed; above it the file is not what it says.
 _MAX_BROKEN_SHARE = 0.01
-
 # UsdPreviewSurface's own, where a file has no material.
 _GREY, _ROUGHNESS, _IOR = 0.18, 0.5, 1.5
 
@@ -250,11 +244,7 @@ def _no_faces(vertices: int) -> FileMesh:
     )
 
 
-_READERS = {
-    ".ply": _mesh_from_ply,
-    ".obj": _mesh_from_obj,
-    ".glb": _mesh_from_glb,
-}
+_READERS = {".ply": _mesh_from_ply, ".obj": _mesh_from_obj, ".glb": _mesh_from_glb}
 
 
 def read_model_here(path: Path) -> tuple[Surface, ...]:

@@ -25,12 +25,9 @@ from usdbrdf.model.mesh import ScanMesh, Triangulation, triangulate
 from usdbrdf.untrusted.bounds import LIMITS, allowed_folders, read_in_child
 
 _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
-
 _MAX_LAYERS = 1000
-
 # What fills the sky or lies below an atom is no scan's unit.
 _MIN_UNIT, _MAX_UNIT = 1e-9, 1e9
-
 T = TypeVar("T")
 
 
@@ -135,8 +132,7 @@ def _meshes(stage: Usd.Stage, path: Path) -> UsdMeshes:
         mesh=ScanMesh(
             points=np.concatenate([points for points, _, _ in parts]),
             triangles=np.concatenate(
-                [triangles + firsts[i] for i, (_, triangles, _) in enumerate(parts)],
-                dtype=np.int32,
+                [triangles + firsts[i] for i, (_, triangles, _) in enumerate(parts)], dtype=np.int32
             ),
             corner_normals=np.concatenate([normals for _, _, normals in parts]),
             face_object=np.repeat(

@@ -13,11 +13,8 @@ from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 _TOLERANCE = 1e-3
-
 _UV_TOLERANCE = 1e-4
-
 _EXPOSURE = ("exposure", *(f"exposure:{n}" for n in ("time", "fStop", "iso", "responsivity")))
-
 _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
 
 

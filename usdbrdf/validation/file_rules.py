@@ -15,7 +15,6 @@ from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Severity, Site, rule
 
 _UDIM = "<UDIM>"
-
 # A letter before a colon is a drive.
 _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 

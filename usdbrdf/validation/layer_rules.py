@@ -35,8 +35,7 @@ def layer_missing(scene: AssetStage) -> Iterator[Fault]:
 
 
 @rule(
-    Severity.ERROR,
-    advice="Restore the order in the root layer; mute a layer instead of moving it.",
+    Severity.ERROR, advice="Restore the order in the root layer; mute a layer instead of moving it."
 )
 def layer_order(scene: AssetStage) -> Iterator[Fault]:
     """Strongest first the sublayers are edits.usda, material, shading, texturing, scan. In another

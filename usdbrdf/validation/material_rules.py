@@ -14,21 +14,14 @@ from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 
 Types = Sdf.ValueTypeNames
-
 _LINEAR_FORMATS = frozenset({".exr", ".hdr"})
-
 _SCOPES = ("materials", "looks")
-
 _BLACK = Gf.Vec3f(0.0)
-
 # Of numbers that a layer holds as 32-bit floats.
 _TOLERANCE = 1e-4
-
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
-
 _MAPPINGS = (_MEASURED, "matched")
-
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
 

@@ -93,10 +93,7 @@ def _facts_of_prim(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[Author
             yield AuthoredFact(attribute, facts.get(general if instance else name), instance)
 
 
-@rule(
-    Severity.ERROR,
-    advice="Run usdbrdf fit again; do not change the status by hand.",
-)
+@rule(Severity.ERROR, advice="Run usdbrdf fit again; do not change the status by hand.")
 def fit_status(scene: AssetStage) -> Iterator[Fault]:
     """An object whose status is measured states phi, psi, their errors and how far the photographs
     determine them; one whose status is prior states phi and psi. A number without its error must
@@ -135,8 +132,7 @@ def not_allowed(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterato
 
 
 @rule(
-    Severity.WARNING,
-    advice="Correct the name, or put values of your own into another namespace.",
+    Severity.WARNING, advice="Correct the name, or put values of your own into another namespace."
 )
 def undeclared_attribute(scene: AssetStage) -> Iterator[Fault]:
     """Attributes whose names begin with usdBrdf: are declared by the schemas. One that is not is

@@ -12,7 +12,6 @@ from pxr import Sdf, Usd
 from usdbrdf.validation.asset_stage import AssetStage
 
 Site: TypeAlias = "Usd.Prim | Usd.Property | Sdf.Layer"
-
 # Before the name of a rule of ours, where it stands among those of others.
 PREFIX = "usdbrdf"
 

@@ -12,16 +12,13 @@ from usdbrdf.asset.readers.compose import in_one_line, try_in_child
 from usdbrdf.validation.rule import Finding, Severity, Site, layer_in_words, site_in_words
 
 OPEN = "usd.Open"
-
 # The plug-ins of usd-core itself: others that are installed may need a network, or a licence.
 _BUILT_IN = frozenset(
     ["usdValidation", "usdPhysicsValidators"]
     + [f"usd{name}Validators" for name in ("Geom", "Lux", "Media", "Shade", "Skel", "Utils")]
 )
-
 # Ours tell textures from photographs, and where a missing file is named.
 _REPLACED = frozenset({"usdUtilsValidators:MissingReferenceValidator"})
-
 _SEVERITIES = {
     UsdValidation.ValidationErrorType.Warn: Severity.WARNING,
     UsdValidation.ValidationErrorType.Info: Severity.INFO,

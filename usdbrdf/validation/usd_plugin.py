@@ -17,9 +17,7 @@ from usdbrdf.validation.validate import RULES
 
 # USD imports the module of this name, and begins the names of its validators with it.
 PLUGIN = "usdbrdf.validation.usd_plugin"
-
 SUITE = "All"
-
 _KEYWORDS = ["usdBrdf"]
 
 
@@ -49,7 +47,6 @@ if __name__ == "__main__":
 
 # The first version that takes fixers from Python.
 _PYTHON_FIXERS = (0, 26, 11)
-
 _TYPES = {
     Severity.ERROR: UsdValidation.ValidationErrorType.Error,
     Severity.WARNING: UsdValidation.ValidationErrorType.Warn,

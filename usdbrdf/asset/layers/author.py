@@ -20,7 +20,6 @@ from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.files.atomic import temporary_beside
 
 Types = Sdf.ValueTypeNames
-
 # From plain values, which may be numpy's, to those that USD takes for attributes of a type.
 _USD_VALUE: dict[str, Callable[[Any], Any]] = {
     "asset": Sdf.AssetPath,

@@ -31,9 +31,7 @@ from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.untrusted.usd_files import is_deforming, is_moving
 
 Types = Sdf.ValueTypeNames
-
 BINDING = "material:binding"
-
 # Relationships to bind besides the mesh's own: path -> the collection it is about, or "".
 Competing = Mapping[str, str]
 

@@ -31,14 +31,10 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.light import LampShape
 
 Types = Sdf.ValueTypeNames
-
 VARIANT_SET = "lights"
-
 EMISSIVE, USDLUX = "emissive", "usdlux"
-
 # The texture node of the materials' emission, which has no scale of its own.
 EMISSION_TEXTURE = "EmissionTexture"
-
 _TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
 
 

@@ -19,20 +19,14 @@ from usdbrdf.asset.layers.preview_surface import Colour, unlit_colour, unlit_tex
 from usdbrdf.asset.properties import Aov, MeasuredObject
 
 VARIANT_SET = "look"
-
 SHADED, LIT = "shaded", "lit"
-
 # What has no value in a look is shown in a colour that no measurement has: unknown is not black.
 NO_DATA = "no_data"
-
 NO_DATA_COLOUR = (0.5, 0.0, 0.5)
-
 # A look: the material's path per object's prim path.
 Bindings = Mapping[str, str]
-
 # What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
 Shown = Aov | Colour | None
-
 Measured = TypeVar("Measured", bound=MeasuredObject)
 
 

@@ -17,13 +17,7 @@ from pxr import Sdf
 from usdbrdf.asset.header import Draft
 from usdbrdf.asset.layers.author import author_inputs, author_record, connect, export, over
 from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
-from usdbrdf.asset.layers.looks import (
-    SHADED,
-    Shown,
-    aov_looks,
-    author_look_materials,
-    author_looks,
-)
+from usdbrdf.asset.layers.looks import SHADED, Shown, aov_looks, author_look_materials, author_looks
 from usdbrdf.asset.layers.preview_surface import (
     SURFACE,
     colour_from_texture,
@@ -37,7 +31,6 @@ from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_fro
 from usdbrdf.asset.properties import FittedObject
 
 Types = Sdf.ValueTypeNames
-
 BASE_COLOR = "base_color"
 
 

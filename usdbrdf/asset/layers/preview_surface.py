@@ -11,9 +11,7 @@ from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE
 
 Types = Sdf.ValueTypeNames
-
 Colour = Sequence[float]
-
 SURFACE = "PreviewSurface"
 
 

@@ -40,7 +40,6 @@ from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
 
 Types = Sdf.ValueTypeNames
-
 LENS = (
     "focalLength",
     "horizontalAperture",
@@ -48,11 +47,8 @@ LENS = (
     "horizontalApertureOffset",
     "verticalApertureOffset",
 )
-
 APERTURE_MM = 36.0
-
 NEAR_M, FAR_M = 0.01, 1000.0
-
 _PLATE = "photograph"
 
 

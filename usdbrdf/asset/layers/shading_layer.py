@@ -11,14 +11,7 @@ from pathlib import Path
 from pxr import Sdf
 
 from usdbrdf.asset.header import Draft, Scopes
-from usdbrdf.asset.layers.author import (
-    attribute,
-    author_record,
-    define,
-    export,
-    over,
-    relationship,
-)
+from usdbrdf.asset.layers.author import attribute, author_record, define, export, over, relationship
 from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
 from usdbrdf.asset.layers.looks import SHADED, aov_looks, author_looks
 from usdbrdf.asset.layers.preview_surface import colour_from_texture, surface
@@ -26,11 +19,8 @@ from usdbrdf.asset.properties import ShadedObject
 from usdbrdf.errors import UsdBrdfError
 
 Types = Sdf.ValueTypeNames
-
 ALBEDO, EMISSION = "albedo", "emission"
-
 ALBEDO_TEXTURE = "AlbedoTexture"
-
 # What a renderer is asked for: name, type, source. Light path expressions say which paths count;
 # "raw" names a renderer's own output.
 _RENDER_VARS = (

@@ -16,10 +16,8 @@ from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.model.arrays import Float
 
 Types = Sdf.ValueTypeNames
-
 # Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
 _PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
-
 THUMBNAIL = "previews/lit.png"  # in the asset folder
 
 

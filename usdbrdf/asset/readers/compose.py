@@ -17,7 +17,6 @@ from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Array
 
 _MAX_LENGTH = 300
-
 _TIMEOUT_S = 600.0
 
 

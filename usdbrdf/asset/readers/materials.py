@@ -28,10 +28,8 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
     "useSpecularWorkflow": (0.0,),
     "opacity": (1.0,),
 }
-
 # "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
 _WRAP = {"repeat": "repeat", "mirror": "mirror"}
-
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
@@ -73,10 +71,7 @@ def fit_mappings(stage: Usd.Stage) -> dict[str, str]:
 
 
 def material_from_usd(
-    material: UsdShade.Material,
-    time: Usd.TimeCode,
-    warn: Callable[[str], None],
-    mapping: str,
+    material: UsdShade.Material, time: Usd.TimeCode, warn: Callable[[str], None], mapping: str
 ) -> BoundMaterial:
     """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks of
     UsdPreviewSurface with the mesh's display colour.

@@ -23,7 +23,6 @@ from usdbrdf.asset.readers.frames import asset_file
 from usdbrdf.asset.readers.scene import read_corner_uv, triangulation_of
 
 _TIME = Usd.TimeCode.Default()
-
 Record = TypeVar("Record")
 
 

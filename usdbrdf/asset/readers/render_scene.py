@@ -243,7 +243,6 @@ def _dome(source: _Source) -> SkyLight:
 
 
 _SHAPES = {"RectLight": "rectangle", "DiskLight": "disk", "SphereLight": "sphere"}
-
 _READERS: dict[str, Callable[[_Source], Light]] = {
     **dict.fromkeys(_SHAPES, _shape),
     **dict.fromkeys(("DomeLight", "DomeLight_1"), _dome),

@@ -11,11 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.readers.materials import (
-    BoundMaterial,
-    fit_mappings,
-    material_from_usd,
-)
+from usdbrdf.asset.readers.materials import BoundMaterial, fit_mappings, material_from_usd
 from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
@@ -25,10 +21,8 @@ from usdbrdf.model.mesh import Triangulation
 
 # Meshes that bring no normals are smooth where their faces meet at less than this.
 _CREASE_ANGLE_DEG = 40.0
-
 # Prims that a sentence names.
 _MAX_SHOWN = 5
-
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
@@ -42,10 +36,7 @@ class _Reading(NamedTuple):
 
 
 def surfaces_from_stage(
-    stage: Usd.Stage,
-    time: Usd.TimeCode,
-    warn: Callable[[str], None],
-    subject: Path | None = None,
+    stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None], subject: Path | None = None
 ) -> tuple[Surface, ...]:
     """All active, visible meshes, in metres in the stage's world, split where subsets of their
     faces are bound to other materials. Subdivision cages are taken as the surface.
@@ -132,9 +123,7 @@ def _tidy(part: Surface) -> Surface:
     """Without the points that its triangles do not use."""
     used, triangles = np.unique(part.triangles, return_inverse=True)
     return replace(
-        part,
-        points=part.points[used],
-        triangles=np.asarray(triangles, np.int32).reshape(-1, 3),
+        part, points=part.points[used], triangles=np.asarray(triangles, np.int32).reshape(-1, 3)
     )
 
 

@@ -69,11 +69,7 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
 
 
 def photographs_of_views(
-    source: Path,
-    asset: Asset,
-    stage: Usd.Stage,
-    scene: Scene,
-    allow_outside: tuple[Path, ...] = (),
+    source: Path, asset: Asset, stage: Usd.Stage, scene: Scene, allow_outside: tuple[Path, ...] = ()
 ) -> Views:
     """The photographs of a document, checked as those of a capture are.
 
