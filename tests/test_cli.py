@@ -121,7 +121,7 @@ def test_nothing_that_takes_time_is_loaded_for_help_and_lists(arguments):
     code = (
         "import sys, usdbrdf.cli; status = usdbrdf.cli.main(sys.argv[1:])\n"
         "heavy = {'numpy', 'numba', 'pxr', 'scipy', 'trimesh', 'rich', 'tqdm', 'OpenImageIO'}\n"
-        "sys.exit(status or ', '.join(heavy & {*sys.modules}))"
+        "sys.exit(status or ', '.join(heavy & {*sys.modules}) or None)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pxr import Sdf
 
-from usdbrdf.asset.layers.preview_surface import fit_from_preview_surface, preview_surface_from_fit
+from usdbrdf.asset.preview_lobe import fit_from_preview_surface, preview_surface_from_fit
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.asset.readers.render_scene import render_scene_from_file

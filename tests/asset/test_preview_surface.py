@@ -2,7 +2,7 @@
 
 import pytest
 
-from usdbrdf.asset.layers.preview_surface import preview_surface_from_fit
+from usdbrdf.asset.preview_lobe import preview_surface_from_fit
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import list_adapters, read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
-from usdbrdf.untrusted import plugins
+from usdbrdf.untrusted import bounds
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_a_broken_one_is_reported_listed_and_skipped(announce, tmp_path, capsys,
 
 
 def test_one_that_hangs_at_import_is_reported_and_skipped(announce, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(plugins, "PLUGIN_SECONDS", 5.0)
+    monkeypatch.setattr(bounds, "PLUGIN_SECONDS", 5.0)
     announce(theirs="while True: pass")
     capture = make_capture(tmp_path / "room")
     assert read_scan(capture.folder, IngestOptions()).adapter == "transforms"
@@ -105,10 +105,10 @@ def test_one_that_hangs_at_import_is_reported_and_skipped(announce, tmp_path, ca
 
 
 def test_a_capture_that_usd_cannot_name_is_refused(tmp_path):
-    folder = tmp_path / os.fsdecode(b"\xff")
-    capture = make_capture(folder)
+    folder = make_capture(tmp_path / "room").folder
+    folder = folder.rename(tmp_path / os.fsdecode(b"\xff"))
     with pytest.raises(InputRefused, match=r"not UTF-8.*\[paths\.name\]$"):
-        read_scan(capture.folder, IngestOptions())
+        read_scan(folder, IngestOptions())
 
 
 def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_path, capsys):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.findings import Findings
 from usdbrdf.capture.parts import geometry_from_usd
-from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.usd_files import layers_of_usd, meshes_from_usd, render_scene_of_usd
@@ -268,6 +268,24 @@ def test_every_reader_of_usd_is_stopped_at_the_limits(tmp_path, monkeypatch, rea
     expect(EnvironmentFailure, r"a\.usdc: .*\[child\.timeout\]$", seconds=0.01)
     expect(EnvironmentFailure, r"a\.usdc: .*memory.*\[environment\.memory\]$", memory_bytes=1 << 20)
     expect(InputRefused, r"the limit of a stage is 100.*\[stage\.size\]$", file_bytes=100)
+
+
+def test_what_a_file_makes_of_a_few_bytes_is_limited(tmp_path, monkeypatch):
+    """Sixty kilobytes that become a gigabyte, of which there is less."""
+    stage = _stage(tmp_path / "a.usdc")
+    _mesh(stage, "/scan/m", np.eye(3), [3], [0, 1, 2])
+    many = Vt.IntArray(60_000_000, 1)
+    UsdGeom.Mesh.Get(stage, "/scan/m").GetFaceVertexIndicesAttr().Set(many)
+    stage.Save()
+    assert (tmp_path / "a.usdc").stat().st_size < 1 << 20
+    with pytest.raises(InputRefused, match=r"60000000 corners.*\[mesh\.topology\]$"):
+        meshes_from_usd(tmp_path / "a.usdc")
+    monkeypatch.setitem(bounds.LIMITS, "stage", bounds.Limits(1 << 30, 600.0, 1300 << 20))
+    with pytest.raises(
+        UsdBrdfError, match=r"\[(stage\.input|child\.\w+|environment\.memory)\]$"
+    ) as found:
+        meshes_from_usd(tmp_path / "a.usdc")
+    assert found.value.exit_code in (3, 4)
 
 
 def test_a_file_and_folders_that_usd_cannot_name_are_refused(tmp_path):

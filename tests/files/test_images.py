@@ -419,7 +419,7 @@ def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compress
     refused = 0
     for _ in range(200):
         content = bytearray(whole)
-        for place in generator.integers(300, len(whole), 6):
+        for place in generator.integers(len(whole), size=6):
             content[place] = generator.integers(256)
         path.write_bytes(content)
         try:

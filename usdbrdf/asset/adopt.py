@@ -27,7 +27,7 @@ def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     """
     layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
     others = [path for path in edited if path.suffix not in _LAYER_SUFFIXES]
-    numbers = (n for n in itertools.count(1) if not _taken(asset, n))
+    numbers = (n for n in itertools.count(1) if not _is_taken(asset, n))
     copies: dict[Path, Path] = {}
     if others:
         folder = asset.folder / f"adopted-{next(numbers)}"
@@ -84,7 +84,7 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
         os.replace(written, target)
 
 
-def _taken(asset: Asset, number: int) -> bool:
+def _is_taken(asset: Asset, number: int) -> bool:
     stem = asset.folder / f"adopted-{number}"
     return os.path.lexists(stem) or os.path.lexists(stem.with_suffix(".usda"))
 

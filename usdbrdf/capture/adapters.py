@@ -17,7 +17,7 @@ from usdbrdf.capture.formats import DESCRIPTIONS, MODULES
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
-from usdbrdf.untrusted.plugins import problem_of_plugin
+from usdbrdf.untrusted.bounds import problem_of_plugin
 
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan

@@ -1,11 +1,11 @@
-"""JSON without its traps: finite numbers, no key twice, no half characters, bounded size, depth."""
+"""JSON without its traps: finite numbers, no key twice, bounded size and depth."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,6 @@ MAX_DEPTH = 64
 _INTEGER_LIMIT = 1 << 63
 
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
-
-
-_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 class _BadNumber(ValueError):
@@ -59,14 +56,13 @@ def read_json(
             if _any_nonfinite(document, nonfinite_below):
                 raise
     except _BadNumber as error:
-        line = next(line for line, token in _tokens(text) if _is_bad_number(token))
         raise InputRefused(
-            f"{path}:{line}: the number {_short(error)} is not a finite 64-bit number. Remove or "
-            "correct it. [document.nonfinite]"
+            f"{path}:{_line_of_fault(text, error)}: the number {_short(error)} is not a finite "
+            "64-bit number. Remove or correct it. [document.nonfinite]"
         ) from error
     except _KeyTwice as error:
         raise InputRefused(
-            f"{path}:{_line_of_key_twice(text)}: the key {_short(error)} occurs twice in one "
+            f"{path}:{_line_of_fault(text, error)}: the key {_short(error)} occurs twice in one "
             "object. Keep one of the two. [document.duplicate]"
         ) from error
     except json.JSONDecodeError as error:
@@ -76,12 +72,6 @@ def read_json(
         ) from error
     except RecursionError as error:
         raise _too_deep(path, max_depth) from error
-    except UnicodeEncodeError as error:
-        around = error.object[max(0, error.start - 20) : error.start + 1]
-        raise InputRefused(
-            f"{path}: {around!r} holds half of a surrogate pair, which is "
-            "no character. Correct it. [document.json]"
-        ) from error
     if _deeper_than(document, max_depth):
         raise _too_deep(path, max_depth)
     return document
@@ -124,16 +114,13 @@ def _read_text(path: Path, max_bytes: int) -> str:
 
 
 def _parsed(text: str, number: Callable[[str], float]) -> Any:
-    document = json.loads(
+    return json.loads(
         text,
         object_pairs_hook=_object_without_key_twice,
         parse_constant=number,
         parse_float=number,
         parse_int=_integer,
     )
-    if _SURROGATE.search(text):  # most are halves of good pairs
-        json.dumps(document, ensure_ascii=False).encode()
-    return document
 
 
 def _any_nonfinite(node: Any, exempt: Collection[str]) -> bool:
@@ -167,41 +154,30 @@ def _integer(token: str) -> int:
     return int(token)
 
 
-def _is_bad_number(token: str) -> bool:
-    if token in ("NaN", "Infinity", "-Infinity"):
-        return True
-    if token[0] not in "-0123456789":
-        return False
-    try:
-        (_integer if token.lstrip("-").isdigit() else _finite)(token)
-    except ValueError:
-        return True
-    return False
-
-
-def _tokens(text: str) -> Iterator[tuple[int, str]]:
-    line, position = 1, 0
+def _line_of_fault(text: str, error: _BadNumber | _KeyTwice) -> int:
+    """The line of the first number or key of the kind that was refused."""
+    keys: list[set[str]] = []
+    line, position, previous = 1, 0, ""
     for match in _TOKEN.finditer(text):
+        token = match.group()
         line += text.count("\n", position, match.start())
         position = match.start()
-        yield line, match.group()
-
-
-def _line_of_key_twice(text: str) -> int:
-    keys: list[set[str]] = []
-    previous = ""
-    for line, token in _tokens(text):
         if token in "{[":
             keys.append(set())
         elif token in "}]":
             keys.pop()
         elif token == ":":
             key = json.loads(previous, strict=False)
-            if key in keys[-1]:
-                return line
+            if isinstance(error, _KeyTwice) and key in keys[-1]:
+                break
             keys[-1].add(key)
+        elif isinstance(error, _BadNumber) and token[0] in "-0123456789NI":
+            try:
+                (_integer if token.lstrip("-").isdigit() else _finite)(token)
+            except ValueError:
+                break
         previous = token
-    return 1
+    return line
 
 
 def _deeper_than(document: Any, limit: int) -> bool:

@@ -31,7 +31,6 @@ def contained(root: Path, candidate: str) -> Path:
     try:
         home = root.resolve()
         path = (home / candidate).resolve()
-        candidate.encode()  # half of a surrogate pair names no file
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             path.stat()
     except (OSError, RuntimeError, ValueError) as error:  # too long a name, a loop of links

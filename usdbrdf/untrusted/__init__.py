@@ -9,7 +9,7 @@ folders that the user allows. A child is no sandbox: it has the rights of the us
     mesh_files  mesh_from_file, model_from_file                    PLY, OBJ, GLB
     usd_files   layers_of_usd, meshes_from_usd, render_scene_of_usd
     pictures    picture_from_file                                  environments
-    plugins     problem_of_plugin                                  modules of other packages
+    bounds      problem_of_plugin                                  modules of other packages
 
 The frames of a capture do not come through here. They are hundreds of large files that threads
 decode as fast as the disk gives them, again and again; a process for each, and a second copy of

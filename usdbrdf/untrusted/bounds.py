@@ -7,12 +7,13 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from importlib import import_module
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.job.child import run_child
 from usdbrdf.job.memory import machine_bytes
 from usdbrdf.model.arrays import Array
@@ -66,14 +67,14 @@ def read_in_child(
     parameters  JSON
     """
     refuse_large(kind, path)
-    limits = LIMITS[kind]
+    _, seconds, memory_bytes = LIMITS[kind]
     found = run_child(
         f"{__name__}:read_here",
         {},
-        {"reader": reader, "path": str(path.resolve()), "parameters": dict(parameters or {})},
-        limits.seconds,
+        {"reader": reader, "path": str(path.resolve()), "more": dict(parameters or {})},
+        seconds,
         f"{path}: reading this {kind}",
-        memory_limit_bytes=min(limits.memory_bytes, machine_bytes()),
+        memory_limit_bytes=min(memory_bytes, machine_bytes()),
     )
     value = unpacked(found, (returns, *parts))
     assert isinstance(value, returns)
@@ -84,7 +85,27 @@ def read_here(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dic
     """The child's part of ``read_in_child``."""
     module, _, name = parameters["reader"].partition(":")
     reader = getattr(import_module(module), name)
-    return packed(reader(Path(parameters["path"]), **parameters["parameters"]))
+    return packed(reader(Path(parameters["path"]), **parameters["more"]))
+
+
+def problem_of_plugin(point: EntryPoint) -> str:
+    """Why a module of another package cannot be imported, "" if it can. A child tries it first: it
+    may hang or crash, and then this process goes on without it."""
+    announced = {"name": point.name, "value": point.value, "group": point.group}
+    try:
+        run_child(f"{__name__}:import_here", {}, announced, PLUGIN_SECONDS, "its import")
+    except UsdBrdfError as error:
+        return str(error).rpartition(". [")[0]
+    return ""
+
+
+def import_here(arrays: Mapping[str, Array], announced: Mapping[str, str]) -> dict[str, Array]:
+    """The child's part of ``problem_of_plugin``."""
+    try:
+        EntryPoint(**announced).load()
+    except (Exception, SystemExit) as error:
+        raise InputRefused(f"{type(error).__name__}: {error}. [adapter.load]") from error
+    return {}
 
 
 def refuse_large(kind: str, path: Path) -> None:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
 
 from usdbrdf.errors import InputRefused
@@ -57,7 +57,7 @@ class UsdMeshes:
 def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
     """A USD file and every layer that it reaches; InputRefused if one lies elsewhere than beside
     it or in ``allow``."""
-    layers: tuple[str, ...] = _in_child("check_asset_paths", path, allow, tuple)
+    layers: tuple[str, ...] = _in_child("layers", path, allow, tuple)
     return tuple(Path(layer) for layer in layers)
 
 
@@ -66,7 +66,7 @@ def meshes_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> UsdMeshes:
 
     allow  folders outside the file's own that its asset paths may lead into
     """
-    return _in_child("read_meshes_here", path, allow, UsdMeshes, parts=(ScanMesh,))
+    return _in_child("meshes", path, allow, UsdMeshes, parts=(ScanMesh,))
 
 
 def render_scene_of_usd(
@@ -74,45 +74,48 @@ def render_scene_of_usd(
 ) -> tuple[Any, ...]:
     """What ``reader`` ("package.module:name") makes of the file, as f(path) in the child, once its
     asset paths and its units are known to be sound: a tuple in which may be ``parts``."""
-    return _in_child("read_scene_here", path, allow, tuple, parts=parts, reader=reader)
+    return _in_child(reader, path, allow, tuple, parts=parts)
 
 
 def _in_child(
-    name: str,
-    path: Path,
-    allow: Sequence[Path],
-    returns: type[T],
-    *,
-    parts: Sequence[type] = (),
-    **parameters: str,
+    reader: str, path: Path, allow: Sequence[Path], returns: type[T], *, parts: Sequence[type] = ()
 ) -> T:
-    """One of the functions below, as f(path, allowed=folders, **parameters) in a child."""
+    """``read_here`` in a child."""
     refuse_nameless(path)
-    allowed = allowed_folders(path, allow)
+    parameters = {"reader": reader, "allowed": allowed_folders(path, allow)}
     return read_in_child(
-        "stage",
-        f"{__name__}:{name}",
-        path,
-        returns,
-        parts=parts,
-        parameters={"allowed": allowed, **parameters},
+        "stage", f"{__name__}:read_here", path, returns, parts=parts, parameters=parameters
     )
 
 
-def read_scene_here(path: Path, allowed: Sequence[str], reader: str) -> tuple[Any, ...]:
-    """The child's part of ``render_scene_of_usd``."""
-    check_asset_paths(path, allowed)
-    _check_units(_opened(path), path)
-    module, _, name = reader.partition(":")
-    found: tuple[Any, ...] = getattr(import_module(module), name)(path)
-    return found
+def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
+    """The "layers", the "meshes", or what another ``reader`` makes of a file, in this process, a
+    child; nothing is composed before the asset paths are checked."""
+    with _usd_errors(path):
+        layers = check_asset_paths(path, allowed)
+        if reader == "layers":
+            return tuple(layers)
+        stage = _opened(path)
+        if reader == "meshes":
+            return _meshes(stage, path)
+        _check_units(stage, path)
+        module, _, name = reader.partition(":")
+        return getattr(import_module(module), name)(path)
 
 
-def read_meshes_here(path: Path, allowed: Sequence[str]) -> UsdMeshes:
-    """The child's part of ``meshes_from_usd``."""
-    check_asset_paths(path, allowed)
-    stage = _opened(path)
-    root = stage.GetDefaultPrim()  # valid only as long as the stage is held
+@contextmanager
+def _usd_errors(path: Path) -> Iterator[None]:
+    """USD's own errors become InputRefused."""
+    try:
+        yield
+    except Tf.ErrorException as error:
+        raise InputRefused(
+            f"{path}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
+        ) from error
+
+
+def _meshes(stage: Usd.Stage, path: Path) -> UsdMeshes:
+    root = stage.GetDefaultPrim()
     if not root:
         raise InputRefused(
             f"{path}: the stage has no default prim, so nothing can refer to it. Set defaultPrim "
@@ -178,12 +181,8 @@ def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
 
 
 def _references(layer: Path) -> list[str]:
-    try:
+    with _usd_errors(layer):
         found = UsdUtils.ExtractExternalReferences(str(layer))
-    except Tf.ErrorException as error:
-        raise InputRefused(
-            f"{layer}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
-        ) from error
     return sorted({reference for kind in found for reference in kind if reference})
 
 
@@ -218,13 +217,8 @@ def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
 
 def _opened(path: Path) -> Usd.Stage:
     """The composed stage."""
-    try:
-        stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
-        problems = stage.GetCompositionErrors()
-    except Tf.ErrorException as error:
-        raise InputRefused(
-            f"{path}: USD cannot open it ({_one_line(error)}). Export it again. [stage.input]"
-        ) from error
+    stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+    problems = stage.GetCompositionErrors()
     if problems:
         raise InputRefused(
             f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
@@ -407,12 +401,13 @@ def _authored_normals(
         values, interpolation = mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation()
     normals = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
     tokens = UsdGeom.Tokens
-    triangles_in: dict[str, tuple[int, npt.NDArray[Any]]] = {
-        tokens.constant: (1, np.zeros_like(fans.triangles)),
-        tokens.uniform: (num_faces, np.repeat(fans.polygon[:, None], 3, axis=1)),
-        tokens.vertex: (num_points, fans.triangles),
-        tokens.varying: (num_points, fans.triangles),
-        tokens.faceVarying: (num_corners, fans.corners),
+    expected = {
+        tokens.constant: 1,
+        tokens.uniform: num_faces,
+        tokens.vertex: num_points,
+        tokens.varying: num_points,
+        tokens.faceVarying: num_corners,
     }
-    expected, where = triangles_in.get(interpolation, (-1, fans.triangles))
-    return normals[where] if len(normals) == expected else None
+    if len(normals) != expected.get(interpolation, -1):
+        return None
+    return np.asarray(normals[fans.element_of_corner(interpolation)], np.float64)

@@ -18,7 +18,7 @@ from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 FACTS = facts_by_attribute()
 
 
-class Said(NamedTuple):
+class AuthoredFact(NamedTuple):
     """An authored attribute of ours; ``fact`` is None for one that the table does not have, and
     ``instance`` "" unless its schema is applied several times."""
 
@@ -67,7 +67,7 @@ def out_of_range(
     scene: AssetStage, about: Callable[[Fact], bool], facts: Mapping[str, Fact] = FACTS
 ) -> Iterator[Fault]:
     """Numbers that make no sense, among the facts that ``about`` chooses."""
-    for attribute, fact, _ in _said(scene, facts):
+    for attribute, fact, _ in _authored_facts(scene, facts):
         value = attribute.Get()
         if fact is None or not fact.is_bounded or not about(fact) or value is None:
             continue
@@ -77,12 +77,12 @@ def out_of_range(
             yield Fault(attribute, f"the value is {shown}, outside {limits}.")
 
 
-def _said(scene: AssetStage, facts: Mapping[str, Fact]) -> Iterator[Said]:
-    return (said for prim in scene.recorded for said in _said_of(prim, facts))
+def _authored_facts(scene: AssetStage, facts: Mapping[str, Fact]) -> Iterator[AuthoredFact]:
+    return (said for prim in scene.recorded for said in _facts_of_prim(prim, facts))
 
 
-def _said_of(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[Said]:
-    """What a prim says in our namespace."""
+def _facts_of_prim(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[AuthoredFact]:
+    """The attributes of a prim in our namespace, each with its row of the table."""
     for attribute in prim.GetAuthoredPropertiesInNamespace("usdBrdf"):
         if isinstance(attribute, Usd.Attribute) and attribute.HasAuthoredValue():
             name = attribute.GetName()
@@ -90,7 +90,7 @@ def _said_of(prim: Usd.Prim, facts: Mapping[str, Fact]) -> Iterator[Said]:
             parts = name.split(":")
             general = ":".join([*parts[:2], INSTANCE, *parts[3:]])
             instance = parts[2] if name not in facts and general in facts else ""
-            yield Said(attribute, facts.get(general if instance else name), instance)
+            yield AuthoredFact(attribute, facts.get(general if instance else name), instance)
 
 
 @rule(
@@ -127,7 +127,7 @@ def allowed_tokens(scene: AssetStage) -> Iterator[Fault]:
 
 def not_allowed(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
     """Words that are none of a fixed vocabulary."""
-    for attribute, fact, _ in _said(scene, facts):
+    for attribute, fact, _ in _authored_facts(scene, facts):
         value = attribute.Get()
         if fact and fact.tokens and value not in fact.tokens:
             message = f"{value!r} is none of {', '.join(fact.tokens)}."
@@ -146,7 +146,7 @@ def undeclared_attribute(scene: AssetStage) -> Iterator[Fault]:
 
 def undeclared(scene: AssetStage, facts: Mapping[str, Fact] = FACTS) -> Iterator[Fault]:
     """Attributes in our namespace that are not ours."""
-    for attribute, fact, _ in _said(scene, facts):
+    for attribute, fact, _ in _authored_facts(scene, facts):
         if fact is None:
             message = "no usdBrdf schema declares an attribute of this name: nothing reads it."
             yield Fault(attribute, message)
@@ -173,7 +173,9 @@ def _missing_schemas(prim: Usd.Prim) -> list[str]:
     # As authored: GetAppliedSchemas leaves out those that USD does not know.
     listed = prim.GetMetadata("apiSchemas")
     applied = listed.GetAddedOrExplicitItems() if listed else []
-    wanted = {fact.schema.applied(instance) for _, fact, instance in _said_of(prim, FACTS) if fact}
+    wanted = {
+        fact.schema.applied(instance) for _, fact, instance in _facts_of_prim(prim, FACTS) if fact
+    }
     return sorted(wanted.difference(applied))
 
 

@@ -25,17 +25,15 @@ from usdbrdf.asset.layers.looks import (
     author_looks,
 )
 from usdbrdf.asset.layers.preview_surface import (
-    NO_LOBE,
     SURFACE,
-    PreviewLobe,
     colour_from_texture,
     lobe,
     node,
-    preview_surface_from_fit,
     scale_texture,
 )
 from usdbrdf.asset.layers.shading_layer import ALBEDO_TEXTURE
 from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
 from usdbrdf.asset.properties import FittedObject
 
 Types = Sdf.ValueTypeNames

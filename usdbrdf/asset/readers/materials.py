@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Usd, UsdShade
 
-from usdbrdf.asset.layers.preview_surface import fit_from_preview_surface
+from usdbrdf.asset.preview_lobe import fit_from_preview_surface
 from usdbrdf.asset.readers.frames import asset_file
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, is_eight_bit, read_exr, read_radiance

@@ -1,0 +1,51 @@
+"""What UsdPreviewSurface is told of a fitted lobe, and the lobe that it was told."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from usdbrdf.transport.renderer_match import measured_lobe, shown_lobe
+
+
+class PreviewLobe(NamedTuple):
+    """Inputs of UsdPreviewSurface, and the factor that its diffuse colour has been given."""
+
+    roughness: float
+    ior: float
+    diffuse: float
+
+
+# Without a fitted lobe there is none: index of refraction 1 reflects nothing, and shading is
+# purely diffuse. Written out, because applications differ in what they assume.
+NO_LOBE = PreviewLobe(roughness=1.0, ior=1.0, diffuse=1.0)
+
+
+def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") -> PreviewLobe:
+    """UsdPreviewSurface's inputs for the paper's parameters.
+
+    alpha = max(0.001, phi) and USD squares its roughness: roughness = sqrt(alpha).
+    measured  F0 = 0.08 psi
+    matched   F0 and the diffuse colour as renderers need them to show that (``renderer_match``)
+    F0 = ((ior - 1) / (ior + 1))^2: ior = (1 + sqrt(F0)) / (1 - sqrt(F0)).
+    """
+    f0, diffuse = 0.08 * psi, 1.0
+    if mapping == "matched":
+        f0, diffuse = (float(value) for value in shown_lobe(phi, psi))
+    sqrt_f0 = math.sqrt(f0)
+    return PreviewLobe(math.sqrt(max(0.001, phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
+
+
+def fit_from_preview_surface(roughness: float, ior: float, mapping: str) -> PreviewLobe:
+    """The inverse, for whoever renders with the fitted lobe: the roughness, the ior that has the
+    F0 of the fit, and the factor that the diffuse colour was given.
+
+    Whatever was written over our values is understood as what renderers show of it; so an opinion
+    counts, and what nobody touched comes back as it was fitted.
+    """
+    if mapping != "matched":
+        return PreviewLobe(roughness, ior, 1.0)
+    shown = ((ior - 1) / (ior + 1)) ** 2
+    psi, diffuse = measured_lobe(roughness**2, shown)
+    sqrt_f0 = math.sqrt(0.08 * psi)
+    return PreviewLobe(roughness, (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
