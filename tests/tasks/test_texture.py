@@ -15,7 +15,7 @@ from tests.scenes import make_capture, ring_of_poses, write_ply
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.files.images import read_exr
+from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import SceneObject
@@ -115,3 +115,20 @@ def test_a_capture_near_the_end_of_half_floats_keeps_its_lit_map(tmp_path, capsy
     lit = read_exr(tmp_path / "asset" / "textures" / "box.lit.exr")
     assert lit.max() == pytest.approx(64_000)
     assert "[image.clamped]" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [[7], range(1, 12, 2)], ids=["one frame", "every second frame"])
+def test_exposures_that_contradict_each_other_are_noticed(tmp_path, capsys, wrong):
+    made = make_capture(tmp_path / "scan", noise=0.02, noise_floor_radiance=0)
+    for i in wrong:
+        write_exr(made.image(i), 4 * read_exr(made.image(i)))
+    if len(wrong) > 1:
+        with pytest.raises(
+            InputRefused, match=r"of 12 frames .*0001\.exr \(.*exposure\]$"
+        ) as caught:
+            _textured(tmp_path, made)
+        assert caught.value.exit_code == 3
+        return
+    found = _textured(tmp_path, made).summary["contradicting_frames"]
+    assert found == {"0007.exr": pytest.approx(4, rel=0.05)}
+    assert "0007.exr (" in capsys.readouterr().err

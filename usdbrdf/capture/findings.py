@@ -57,8 +57,6 @@ def frames_from_records(
     )
 
 
-# Characters of a frame's name that are shown.
-_LONGEST_NAME = 200
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
@@ -101,8 +99,7 @@ class Findings:
 
     def drop(self, name: str, reason: str, rule: str) -> None:
         """Leave a frame out; ``warn_of_dropped_frames`` tells the user."""
-        shown = name if len(name) <= _LONGEST_NAME else name[:_LONGEST_NAME] + "..."
-        self.dropped.append(DroppedFrame(shown, reason, rule))
+        self.dropped.append(DroppedFrame(name, reason, rule))
 
     def refuse_too_few_frames(self, source: Path, total: int) -> None:
         """InputRefused if, of ``total`` frames, too many are dropped or too few are left."""

@@ -167,7 +167,7 @@ def scan_from_parts(
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
-    _refuse_unusable_names(records, source)
+    _refuse_same_image_twice(records, source)
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
     rigid = at_image_size(rigid, findings, source)
     findings.refuse_too_few_frames(source, total)
@@ -237,17 +237,9 @@ def radiance_encoding(options: IngestOptions, *, photographs: bool) -> str:
     return encoding
 
 
-def _refuse_unusable_names(records: Sequence[FrameRecord], source: Path) -> None:
-    """USD names images in UTF-8, and each once."""
+def _refuse_same_image_twice(records: Sequence[FrameRecord], source: Path) -> None:
     known: set[Path] = set()
     for record in records:
-        try:
-            str(record.image_path).encode()
-        except UnicodeEncodeError:
-            raise InputRefused(
-                f"{source}: the path of the frame {record.name!r} is not UTF-8, which USD asks "
-                "for. Rename the file or its folder. [capture.name]"
-            ) from None
         if record.image_path in known:
             raise InputRefused(
                 f"{source}: the frame {record.name!r} is listed twice. Keep one entry. "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,6 +39,7 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
     """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
     for folder in options.allow_outside if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
+            candidate.encode()
             path = (root / candidate).resolve()
             if path.is_relative_to(folder.resolve()):
                 return path
@@ -180,7 +180,7 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
     stated = width is not None and height is not None
     needed = capture.images or not stated
     path = _image_path(capture, name) if needed else capture.source.parent / name
-    if needed and not os.path.isfile(path):  # Path.is_file() raises where a name is too long
+    if needed and not path.is_file():
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
     pose = _pose(frame.get("transform_matrix"))
@@ -213,9 +213,9 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
 
 def _image_path(capture: _Capture, name: str) -> Path:
     path = path_in_capture(capture.source.parent, name, capture.options)
-    if not path.suffix and not os.path.exists(path):
+    if not path.suffix and not path.exists():
         candidates = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-        return next((candidate for candidate in candidates if os.path.isfile(candidate)), path)
+        return next((candidate for candidate in candidates if candidate.is_file()), path)
     return path
 
 

@@ -58,9 +58,15 @@ def clean_mesh(
         points, triangles, origin = _repaired(points, triangles, found, label)
         face_object, repaired = face_object[origin], np.unique(found.damaged_sheets // 2)
     if decimate is not None and decimate < len(triangles):
-        points, triangles, face_object = _decimated(
-            points, triangles, face_object, repaired, decimate, label
+        given = {"points": points, "triangles": triangles, "face_object": face_object}
+        reduced = run_child(
+            function="usdbrdf.geometry.mesh_filters:decimate_objects",
+            arrays={**given, "joined": repaired},
+            parameters={"target": decimate},
+            timeout_s=60 + len(triangles) / 2000,
+            label=f"{label}: reduction to {decimate} triangles",
         )
+        points, triangles, face_object = (reduced[name] for name in given)
         num_given = len(points)
         counts["decimated_faces"] = num_before - len(triangles)
     used, compact = np.unique(triangles, return_inverse=True)
@@ -174,21 +180,3 @@ def _repaired(
     order = np.argsort(origin)
     both = np.concatenate([triangles[~damaged], number[result["triangles"]]])
     return np.concatenate([points, points[vertex[copied]]]), both[order], origin[order]
-
-
-def _decimated(
-    points: Float, triangles: Int, face_object: Int, repaired: Int, target: int, label: str
-) -> tuple[Float, Int, Int]:
-    reduced = run_child(
-        function="usdbrdf.geometry.mesh_filters:decimate_objects",
-        arrays={
-            "points": points,
-            "triangles": triangles,
-            "face_object": face_object,
-            "joined": repaired,
-        },
-        parameters={"target": target},
-        timeout_s=60 + len(triangles) / 2000,
-        label=f"{label}: reduction to {target} triangles",
-    )
-    return reduced["points"], reduced["triangles"], reduced["face_object"]

@@ -14,11 +14,9 @@ import psutil
 from usdbrdf.errors import EnvironmentFailure
 
 GIB = 1 << 30
-
 # What libraries take of addresses before any work, and each thread with its stack and arena. With
 # less they crash instead of raising a MemoryError.
 _ADDRESSES, _ADDRESSES_OF_CORE = 5 * GIB // 2, 150 << 20
-
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 

@@ -55,11 +55,10 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         usable = maps.coverage.measured & ~maps.emissive
         survey = survey_frames(run, lit, maps.texels, usable, maps.frames, options)
         found = fitted_objects(run, lit, maps.texels, maps.frames, survey, options)
-        observed = [
-            maps.coverage.observed[maps.texels.of_object(i)].any() for i in range(len(found))
+        objects = [
+            _record(obj, found[i], options, maps.is_observed(i))
+            for i, obj in enumerate(maps.scene.objects)
         ]
-        given = zip(maps.scene.objects, found, observed, strict=True)
-        objects = [_record(obj, fit, options, bool(some)) for obj, fit, some in given]
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":

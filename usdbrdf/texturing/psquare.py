@@ -56,7 +56,6 @@ def spread(state: QuantileState, p: float) -> Float:
     return _read(state, (1 + p) / 2, 3) - _read(state, p / 2, 1)
 
 
-@parallel_kernel
 def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
     """Add one sample to each of the listed texels, in place.
 
@@ -64,7 +63,13 @@ def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
     values  (M, 3) float32, finite
     p       the quantile, in (0, 1)
     """
-    heights, positions, count, mean = state
+    _update(*state, texel, values, p)
+
+
+@parallel_kernel
+def _update(
+    heights: Float, positions: Int, count: Int, mean: Float, texel: Int, values: Float, p: float
+) -> None:
     fractions = np.array([p / 2, p, (1 + p) / 2])
     for m in prange(len(texel)):
         t = texel[m]

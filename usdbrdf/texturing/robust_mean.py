@@ -80,7 +80,6 @@ class RobustMean(NamedTuple):
     footprint: Float
 
 
-@parallel_kernel
 def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
     """Add one sample to each of the listed texels, in place.
 
@@ -89,7 +88,14 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
     deviation  (M,) float32, standard deviation of their errors, between 1e-15 and 1e15
     footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
     """
-    waiting, samples, mean, weight, scatter, precision, covered = state
+    _update(*state, texel, values, deviation, footprint)
+
+
+@parallel_kernel
+def _update(
+    waiting: Float, samples: Int, mean: Float, weight: Float, scatter: Float, precision: Float,
+    covered: Float, texel: Int, values: Float, deviation: Float, footprint: Float,
+) -> None:  # fmt: skip
     for m in prange(len(texel)):
         t = texel[m]
         slot = samples[t] % _BATCH
@@ -121,7 +127,7 @@ def _means(state: MeanState) -> dict[str, Float]:
     whole = state._replace(
         mean=state.mean.copy(), weight=state.weight.copy(), scatter=state.scatter.copy()
     )
-    _add_rest(whole)
+    _add_rest(*whole[:5])
     # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
     pull, inlying = whole.scatter.T.astype(np.float64) / 3
     count = np.maximum(state.samples, 1)
@@ -134,11 +140,11 @@ def _means(state: MeanState) -> dict[str, Float]:
 
 
 @parallel_kernel
-def _add_rest(state: MeanState) -> None:
-    for t in prange(len(state.samples)):
-        rest = state.samples[t] % _BATCH
+def _add_rest(waiting: Float, samples: Int, mean: Float, weight: Float, scatter: Float) -> None:
+    for t in prange(len(samples)):
+        rest = samples[t] % _BATCH
         if rest:
-            _add(state.waiting[t, :rest], state.mean[t], state.weight[t], state.scatter[t])
+            _add(waiting[t, :rest], mean[t], weight[t], scatter[t])
 
 
 @kernel

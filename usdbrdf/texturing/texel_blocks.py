@@ -73,7 +73,7 @@ def blocks_of_texels(texels: Texels, part: slice) -> TexelBlocks:
         axis=np.zeros(vectors, np.float32),
         spread=np.zeros(scalars, np.float32),
     )
-    _bound(texels.position, texels.geometric_normal, blocks)
+    _bound(texels.position, texels.geometric_normal, *blocks)
     return blocks
 
 
@@ -86,8 +86,10 @@ def _longest_axis(normal: Float) -> Long:
 
 
 @parallel_kernel
-def _bound(position: Float, normal: Float, blocks: TexelBlocks) -> None:
-    order, first, centre, radius, axis, spread = blocks
+def _bound(
+    position: Float, normal: Float, order: Int, first: Long, centre: Float, radius: Float,
+    axis: Float, spread: Float,
+) -> None:  # fmt: skip
     for b in prange(len(first) - 1):
         low, high = position[order[first[b]]].copy(), position[order[first[b]]].copy()
         total = np.zeros(3)
