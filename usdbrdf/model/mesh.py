@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,6 +99,12 @@ def welded_ids(points: Float) -> Int:
     ids = np.zeros(len(points), np.int32)
     ids[order] = np.cumsum(differs, dtype=np.int32)
     return ids
+
+
+def welded(mesh: ScanMesh) -> ScanMesh:
+    """The same mesh, whose corners at one position share the first vertex there."""
+    _, first, number = np.unique(welded_ids(mesh.points), return_index=True, return_inverse=True)
+    return replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
 
 
 _AT_A_TIME = 1 << 18

@@ -39,7 +39,7 @@ def ingest(
         for key, value in asdict(options).items()
         if key not in ("mesh", "objects", "allow_outside")
     }
-    inputs = _inputs(capture, options, asset.folder)
+    inputs, places = _inputs(capture, options, asset)
     chosen = choose_adapter(capture, adapter, plugins=plugins)
     if chosen.package:
         # Our own adapters change with the version of the code, which every stamp holds.
@@ -48,11 +48,7 @@ def ingest(
         asset=asset,
         name="ingest",
         role="scan",
-        parameters={
-            "adapter": adapter or "recognised",
-            "places": _places(capture, options, asset),
-            **parameters,
-        },
+        parameters={"adapter": adapter or "recognised", "places": places, **parameters},
         inputs=inputs,
     )
 
@@ -82,28 +78,21 @@ def ingest(
     return task.run(work)
 
 
-def _places(capture: Path, options: IngestOptions, asset: Asset) -> dict[str, str]:
-    """Where the inputs lie, seen from scan.usdc, which names photographs and USD geometry by such
-    paths: what is moved must be read anew."""
-    layers = asset.layer("scan").parent
-    places = {"capture": capture, "mesh": options.mesh}
-    places |= {f"outside-{i}": folder for i, folder in enumerate(options.allow_outside)}
-    return {
-        name: relative_path(place.resolve(), layers)
-        for name, place in places.items()
-        if place is not None
-    }
-
-
-def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str]:
+def _inputs(
+    capture: Path, options: IngestOptions, asset: Asset
+) -> tuple[dict[str, str], dict[str, str]]:
     """Hashes of all that ingest may read: the capture's folder and those that its documents may
-    point into, without the asset if that lies in one, and files named by options."""
+    point into, without the asset if that lies in one, and files named by options. And where these
+    lie, seen from scan.usdc, which names photographs and USD geometry by such paths: what is moved
+    must be read anew."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
-    inputs = {"capture": _hash_of_folder(folder, asset)}
+    inputs = {"capture": _hash_of_folder(folder, asset.folder)}
+    places = {"capture": capture, "mesh": options.mesh}
     for i, outside in enumerate(options.allow_outside):
-        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset)
+        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset.folder)
+        places[f"outside-{i}"] = outside
     mesh, objects = options.mesh, options.objects
     if mesh is not None and mesh.is_file():
         # What a USD mesh refers to may lie beside it, out of the capture.
@@ -112,7 +101,9 @@ def _inputs(capture: Path, options: IngestOptions, asset: Path) -> dict[str, str
         inputs["mesh"] = hash_of_files(layers)
     if objects is not None and objects.is_file():
         inputs["objects"] = hash_of_files([objects])
-    return inputs
+    here = asset.layer("scan").parent
+    named = {name: place.resolve() for name, place in places.items() if place is not None}
+    return inputs, {name: relative_path(place, here) for name, place in named.items()}
 
 
 def _hash_of_folder(folder: Path, asset: Path) -> str:

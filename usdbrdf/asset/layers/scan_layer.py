@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,7 @@ from usdbrdf.asset.properties import LabelledObject, Photographs, known_facts
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Scan
-from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded_ids
+from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded
 
 Types = Sdf.ValueTypeNames
 LENS = (
@@ -55,6 +54,9 @@ _PLATE = "photograph"
 def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
     asset, folder = draft.asset, draft.asset.layer("scan").parent
+    labels = [_labelled(label) for label in scan.objects]
+    # Files split vertices at seams; ours has its normals per corner and needs no copies.
+    mesh = None if scan.usd_geometry else welded(scan.mesh)
     stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
@@ -76,9 +78,9 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
     if source and scan.usd_geometry:
         author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        _author_input_meshes(layer, scopes.root, source, meshes, scan)
-    else:
-        _author_meshes(layer, scopes, scan)
+        _author_input_meshes(layer, scopes.root, source, meshes, scan.mesh, labels)
+    elif mesh:
+        _author_meshes(layer, scopes, mesh, labels)
     define(layer, scopes.path("cameras"), "Scope")
     camera = define(layer, scopes.path("cameras", "capture"), "Camera")
     # The poses are in the world, whatever the default prim does.
@@ -91,15 +93,21 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     export(layer, path, folder=folder)
 
 
-def _author_label(prim: Sdf.PrimSpec, label: ObjectLabel) -> None:
-    """What makes a mesh one of our objects."""
-    text, class_name = readable_label(label.label), readable_label(label.class_name)
-    record = LabelledObject(label=text, class_name=class_name, identifier=label.identifier)
-    author_record(prim, record)
-    prim.SetInfo("displayName", text)
-    if class_name:
+def _labelled(label: ObjectLabel) -> LabelledObject:
+    """What makes a mesh one of our objects, as USD can hold it."""
+    return LabelledObject(
+        label=readable_label(label.label),
+        class_name=readable_label(label.class_name),
+        identifier=label.identifier,
+    )
+
+
+def _author_label(prim: Sdf.PrimSpec, label: LabelledObject) -> None:
+    author_record(prim, label)
+    prim.SetInfo("displayName", label.label)
+    if label.class_name:
         apply_schema(prim, "SemanticsLabelsAPI:class")
-        attribute(prim, "semantics:labels:class", Types.TokenArray, [class_name])
+        attribute(prim, "semantics:labels:class", Types.TokenArray, [label.class_name])
 
 
 def _author_root(root: Sdf.PrimSpec, asset: Asset, *, keep_kind: bool) -> None:
@@ -119,27 +127,29 @@ def _input_meshes(source: Usd.Prim, scan: Scan, root: str) -> dict[str, Usd.Prim
 
 
 def _author_input_meshes(
-    layer: Sdf.Layer, root: str, source: Usd.Prim, meshes: Mapping[str, Usd.Prim], scan: Scan
+    layer: Sdf.Layer,
+    root: str,
+    source: Usd.Prim,
+    meshes: Mapping[str, Usd.Prim],
+    soup: ScanMesh,
+    labels: Sequence[LabelledObject],
 ) -> None:
     """What the referenced meshes need to be our objects."""
     for i, (path, mesh) in enumerate(meshes.items()):
         weaken_bindings(layer, mesh, source, root)
-        normals = scan.mesh.corner_normals[scan.mesh.face_object == i]
-        author_overrides(layer, path, mesh, normals)
-        _author_label(over(layer, path), scan.objects[i])
+        author_overrides(layer, path, mesh, soup.corner_normals[soup.face_object == i])
+        _author_label(over(layer, path), labels[i])
 
 
-def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
+def _author_meshes(
+    layer: Sdf.Layer, scopes: Scopes, mesh: ScanMesh, labels: Sequence[LabelledObject]
+) -> None:
     geometry = define(layer, scopes.path("geometry"), "Scope")
     geometry.SetInfo("kind", "group")
-    mesh = scan.mesh
-    # Files split vertices at seams; ours has its normals per corner and needs no copies.
-    _, first, number = np.unique(welded_ids(mesh.points), return_index=True, return_inverse=True)
-    mesh = replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
     order = np.argsort(mesh.face_object, kind="stable")
-    objects = np.arange(len(scan.objects) + 1)
+    objects = np.arange(len(labels) + 1)
     bounds = np.searchsorted(mesh.face_object[order], objects)
-    for i, label in enumerate(scan.objects):
+    for i, label in enumerate(labels):
         faces = order[bounds[i] : bounds[i + 1]]
         if len(faces):
             prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
