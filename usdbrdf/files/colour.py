@@ -90,11 +90,8 @@ def _processor(source: str, target: str) -> Any:
 
 @cache
 def _config() -> Any:
-    return ocio.Config.CreateFromBuiltinConfig(_pick_config(_builtin_configs()))
-
-
-def _builtin_configs() -> list[str]:
-    return [entry[0] for entry in ocio.BuiltinConfigRegistry().getBuiltinConfigs()]
+    built_in = ocio.BuiltinConfigRegistry().getBuiltinConfigs()
+    return ocio.Config.CreateFromBuiltinConfig(_pick_config([entry[0] for entry in built_in]))
 
 
 def _pick_config(available: list[str]) -> str:

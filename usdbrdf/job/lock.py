@@ -55,7 +55,10 @@ def folder_lock(
                 _wait_or_refuse(path, deadline, signed or "another run that has not signed yet")
             if not os.path.samestat(os.fstat(descriptor), path.stat()):
                 raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
-            _sign(descriptor)
+            since = datetime.now(timezone.utc).isoformat(timespec="seconds")
+            signature = f"pid {os.getpid()} on {socket.gethostname()} since {since}"
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, signature.encode("utf-8", "replace"), 0)
             try:
                 yield
             finally:
@@ -86,13 +89,6 @@ def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
                 "--without-lock, or name a folder on another disk. [lock.none]"
             ) from error
     return True
-
-
-def _sign(descriptor: int) -> None:
-    since = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    holder = f"pid {os.getpid()} on {socket.gethostname()} since {since}"
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, holder.encode("utf-8", "replace"), 0)
 
 
 def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:

@@ -58,15 +58,11 @@ def _limits() -> Iterator[int]:
     with suppress(OSError):
         for line in _OWN_CGROUPS.read_text().splitlines():
             _, controllers, group = line.split(":", 2)
-            if controllers == "":
-                top, file = _CGROUPS, "memory.max"
-            elif "memory" in controllers.split(","):
-                top, file = _CGROUPS / "memory", "memory.limit_in_bytes"
-            else:
+            if controllers and "memory" not in controllers.split(","):
                 continue
-            place = top / group.strip("/")
-            for folder in (place, *place.parents):
+            top = _CGROUPS / "memory" if controllers else _CGROUPS
+            file = "memory.limit_in_bytes" if controllers else "memory.max"
+            own = top / group.strip("/")
+            for folder in (own, *own.parents[: len(own.parts) - len(top.parts)]):
                 with suppress(OSError, ValueError):  # no such file, or "max"
                     yield int((folder / file).read_text())
-                if folder == top:
-                    break

@@ -168,7 +168,7 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     """Replace the outputs, delete those that are no longer made, write the stamp, clean up; every
     step can be repeated."""
     staged = folder / "staged"
-    for _, outputs in groupby(sorted(journal.outputs, key=_place_in_order), key=_rank):
+    for _, outputs in groupby(sorted(sorted(journal.outputs), key=_rank), key=_rank):
         # The asset itself, too: its folders may be new.
         for changed in {asset, *(_moved_into(asset, staged, relative) for relative in outputs)}:
             flush_folder(changed)
@@ -201,7 +201,3 @@ def _retire(asset: Path, journal: Stamp) -> None:
 
 def _rank(relative: str) -> int:
     return _RANK.get(Path(relative).suffix, 0)
-
-
-def _place_in_order(relative: str) -> tuple[int, str]:
-    return _rank(relative), relative
