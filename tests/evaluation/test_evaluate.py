@@ -140,7 +140,7 @@ def test_with_it_there_is_a_plot(found):
     ("options", "said"),
     [
         ({"samples_per_pixel": 5}, "not a square"),
-        ({"samples_per_pixel": 0}, "not a square"),
+        ({"samples_per_pixel": 0}, "whole number of at least 1"),
         ({"rays": 8}, "at least 8 for each"),
         ({"mesh": Path("m.ply")}, "--truth"),
     ],

@@ -92,5 +92,5 @@ def test_where_specular_light_was_taken_out_the_full_model_starts_from_the_rest(
 
 
 def in_the_dark(lit):
-    dark = replace(lit.radiance, pixels=np.zeros_like(lit.radiance.pixels))
+    dark = lit.radiance._replace(pixels=np.zeros_like(lit.radiance.pixels))
     return replace(lit, radiance=dark)

@@ -21,6 +21,7 @@ from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.frames import read_frames
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import checkpoints
 from usdbrdf.job.progress import set_quiet
@@ -360,8 +361,11 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     starts = []
     through_all = refine.samples_from_frames
 
+    def read(frames, order):
+        starts.append(NUM_FRAMES - len(order))
+        return read_frames(frames, order)
+
     def interrupted(*arguments, **options):
-        starts.append(NUM_FRAMES - len(arguments[4]))
         for done, samples in enumerate(through_all(*arguments, **options)):
             yield samples
             if len(starts) == 1 and done == INTERRUPTED:
@@ -369,6 +373,7 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
 
     monkeypatch.setattr(checkpoints, "_SAVE_AFTER", 0.0)
     monkeypatch.setattr(checkpoints, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(refine, "read_frames", read)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())

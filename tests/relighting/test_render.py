@@ -14,7 +14,7 @@ from tests.relighting.scenes import cube, looking, material, photograph, plate
 from usdbrdf.model.light import DistantLight, ShapeLight, SkyLight
 from usdbrdf.model.material import constant_map
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
-from usdbrdf.transport.environment import environment_at
+from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.renderer_match import matching_factor
 
 
@@ -116,12 +116,13 @@ def test_the_sky_is_where_the_shading_step_has_it(scalar: Any) -> None:
     turned = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     for z_up in (True, False):
         sky = SkyLight(image=image, world_from_here=turned if z_up else np.eye(3))
+        environment = Environment(image, z_up)
         for direction in ((0.5, 0.4, 0.6), (-0.7, 0.2, -0.3), (0.1, -0.8, 0.5)):
             way = np.array(direction) / np.linalg.norm(direction)
             ground = plate(material(), half=0.01, z=-9)
             view = looking((0, 0, 0), way, fov=1e-3)
             seen = photograph(scalar, [ground], view, lights=[sky], samples=4).mean(axis=(0, 1))
-            expected = [environment_at(image, z_up, *way, channel) for channel in range(3)]
+            expected = [environment_at(environment, *way, channel) for channel in range(3)]
             assert seen == pytest.approx(expected, abs=1e-3)
 
 

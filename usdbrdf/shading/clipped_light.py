@@ -28,9 +28,8 @@ from usdbrdf.shading.clipped_emitters import (
 )
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import irradiance_at
+from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
 from usdbrdf.transport.textured_scene import TexturedScene
-from usdbrdf.transport.tile_draws import independent_tiles
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
 # More lamps are not told apart; the faintest keep their bounds.

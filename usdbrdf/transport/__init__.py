@@ -11,6 +11,8 @@ Its face, which is all that the rest of the package calls:
                      specular_irradiance that they bring to other surfaces
     renderer_match   what to write for renderers with another lobe
     brdf             the lobe's equations
+    textured_scene   TexturedScene: the geometry to trace with its charts; makes textures and lights
+    denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things
 
 Behind it are Embree (embree), random numbers (tile_draws) and the estimators' loops
