@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -288,8 +289,11 @@ def test_foreign_folder(capture, tmp_path, capsys):
 
 
 def test_busy_folder(asset, capsys):
-    with folder_lock(asset / ".usdbrdf"):
+    held = folder_lock(asset / ".usdbrdf")
+    with ThreadPoolExecutor(1) as another:
+        another.submit(held.__enter__).result()
         assert refused(capsys, "fit", asset)[0] == 5
+        another.submit(held.__exit__, None, None, None).result()
 
 
 # What is said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -68,8 +69,9 @@ def capture(tmp_path_factory):
 def test_a_step_that_is_called_alone_has_its_folder_to_itself(capture, tmp_path):
     asset = Asset.at(tmp_path / "room")
     assert usdbrdf.ingest(capture, asset, usdbrdf.IngestOptions()).reran
-    with folder_lock(asset.folder / ".usdbrdf"), pytest.raises(FolderBusy):
-        usdbrdf.ingest(capture, asset, usdbrdf.IngestOptions())
+    with folder_lock(asset.folder / ".usdbrdf"), ThreadPoolExecutor(1) as another:
+        ingesting = another.submit(usdbrdf.ingest, capture, asset, usdbrdf.IngestOptions())
+        assert isinstance(ingesting.exception(), FolderBusy)
     with (asset.folder / "layers/scan.usdc").open("ab") as layer:
         layer.write(b"by hand")
     with pytest.raises(OwnershipConflict):

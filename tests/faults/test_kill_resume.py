@@ -17,9 +17,10 @@ from pathlib import Path
 
 import pytest
 
+import usdbrdf.geometry.unwrap
 import usdbrdf.material.fit_objects
 import usdbrdf.shading.irradiance_map
-import usdbrdf.tasks.texture
+import usdbrdf.texturing.lit_texture
 from tests.fault_injection import VARIABLE, inject
 from tests.scenes import make_capture
 from usdbrdf.cli import main
@@ -166,14 +167,14 @@ def calls(monkeypatch):
 
         def counting(*arguments, **options):
             counted[name] += 1
-            if name == "radiance_from_frames":
-                counted["first frame"] = arguments[-1]
+            if name == "read_frames":
+                counted["first frame"] = arguments[-1][0]
             return function(*arguments, **options)
 
         monkeypatch.setattr(module, name, counting)
 
-    count(usdbrdf.tasks.texture, "unwrap")
-    count(usdbrdf.tasks.texture, "radiance_from_frames")
+    count(usdbrdf.geometry.unwrap, "unwrap")
+    count(usdbrdf.texturing.lit_texture, "read_frames")
     count(usdbrdf.shading.irradiance_map, "irradiance_at")
     count(usdbrdf.material.fit_objects, "choose_target_frames")
     count(usdbrdf.material.fit_objects, "fit_object")
@@ -198,7 +199,7 @@ def resumed(base, undisturbed, case, calls):
 
 def test_texturing_goes_on_after_the_last_saved_frame(resumed):
     found = resumed("texture", "checkpoint:2")  # the first are the charts; then the first frame
-    assert found == {"radiance_from_frames": 1, "first frame": 1}
+    assert found == {"read_frames": 1, "first frame": 1}
 
 
 def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resumed):

@@ -17,7 +17,6 @@ from usdbrdf.capture.formats import DESCRIPTIONS, MODULES
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
-from usdbrdf.untrusted.bounds import problem_of_plugin
 
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan
@@ -124,6 +123,9 @@ def _loaded(point: EntryPoint) -> Adapter:
 
 def _imported(point: EntryPoint) -> tuple[Any, str]:
     """Another package's module and "", or None and why it cannot be used."""
+    # The list of adapters, where there are no others, is not to wait for numpy.
+    from usdbrdf.untrusted.bounds import problem_of_plugin
+
     if problem := problem_of_plugin(point):
         return None, problem
     try:

@@ -20,6 +20,7 @@ from usdbrdf.files.atomic import write_text_atomic
 MAX_BYTES = 256 << 20
 MAX_DEPTH = 64
 _INTEGER_LIMIT = 1 << 63
+_HALF_A_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # or half of a whole one
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
 
 
@@ -71,6 +72,14 @@ def read_json(
         raise _too_deep(path, max_depth) from error
     if _deeper_than(document, max_depth):
         raise _too_deep(path, max_depth)
+    if _HALF_A_PAIR.search(text):
+        try:
+            json.dumps(document, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise InputRefused(
+                f"{path}: a string holds half of a surrogate pair, which no text has. Correct it. "
+                "[document.json]"
+            ) from error
     return document
 
 
