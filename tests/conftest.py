@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -35,11 +36,32 @@ SLOW = (
     "test_identity.py",
 )
 
+# Sweeps whose cases take seconds each: every third runs for each change, the others at night.
+SWEEPS = (
+    "faults/test_kill_resume.py::test_killed_step_resumes_to_the_same_bytes",
+    "job/test_kill_resume.py::test_killed_run_resumes_to_the_same_bytes",
+    "job/test_kill_resume.py::test_full_disk_keeps_the_previous_asset_and_resumes",
+    "material/test_fit_lobe.py::test_noise_of_the_rays_does_not_draw_psi_anywhere",
+    "material/test_fit_lobe.py::test_rays_too_few_for_a_lobe_are_not_taken_for_enough",
+    "material/test_fit_lobe.py::test_the_lobe_comes_back_within_its_errors",
+    "material/test_fit_lobe.py::test_what_the_rays_do_is_foretold",
+    "nondestruction/test_damage.py::test_a_damaged_binary_layer_is_made_again",
+    "nondestruction/test_edits.py::test_edits_hold_after_a_run_with_other_options",
+    "nondestruction/test_edits.py::"
+    "test_edits_that_cannot_be_read_change_nothing_of_what_is_measured",
+)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow."""
+    """Mark what is slow, and what is for the night."""
     here = Path(__file__).parent
+    cases: Counter[str] = Counter()
     for item in items:
+        name = f"{item.path.relative_to(here).as_posix()}::{item.name.partition('[')[0]}"
+        if name in SWEEPS:
+            if cases[name] % 3:
+                item.add_marker(pytest.mark.nightly)
+            cases[name] += 1
         place = item.path.relative_to(here).as_posix()
         if any(place == slow or place.startswith(f"{slow}/") for slow in SLOW):
             item.add_marker(pytest.mark.slow)
