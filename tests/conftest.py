@@ -51,6 +51,18 @@ SWEEPS = (
     "test_edits_that_cannot_be_read_change_nothing_of_what_is_measured",
 )
 
+# Tests of ten seconds and more that watch what seldom changes.
+NIGHTLY = (
+    "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
+    "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",
+    "material/test_view_model.py::test_the_samples_tell_how_large_their_errors_are",
+    "physics/test_recovery.py::"
+    "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
+    "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
+    "test_identity.py::test_damaged_kernels_are_compiled_again",
+    "test_identity.py::test_processes_that_compile_at_once_agree",
+)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is slow, and what is for the night."""
@@ -62,6 +74,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if cases[name] % 3:
                 item.add_marker(pytest.mark.nightly)
             cases[name] += 1
+        if name in NIGHTLY:
+            item.add_marker(pytest.mark.nightly)
         place = item.path.relative_to(here).as_posix()
         if any(place == slow or place.startswith(f"{slow}/") for slow in SLOW):
             item.add_marker(pytest.mark.slow)
