@@ -15,7 +15,7 @@ import numpy as np
 from measure import Lit, timed
 
 from usdbrdf.options import Sampling
-from usdbrdf.shading.irradiance_map import denoised_irradiance
+from usdbrdf.shading.shaded import denoised_irradiance
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.denoise import OIDN, chosen_filter
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels

@@ -39,7 +39,7 @@ from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.exposures import Probes
-from usdbrdf.texturing.observe import Observation, samples_from_frames
+from usdbrdf.texturing.observe import Observation, blocks_of_texels, samples_from_frames
 from usdbrdf.texturing.samples import (
     MIN_COSINE,
     SAMPLE,
@@ -47,8 +47,7 @@ from usdbrdf.texturing.samples import (
     first_surfaces,
     samples_from_frame,
 )
-from usdbrdf.texturing.texel_blocks import blocks_of_texels
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.embree import RayScene
 
 QUANTILE = 0.5
 T = TypeVar("T")

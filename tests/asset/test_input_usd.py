@@ -11,7 +11,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.scene import scene_from_stage
-from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.delivery.flat_stage import flattened, stage_in_look
 from usdbrdf.options import IngestOptions

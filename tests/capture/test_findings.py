@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.checks import Findings
 from usdbrdf.errors import InputRefused
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from usdbrdf.capture.findings import FrameRecord, frames_from_records
+from usdbrdf.capture.checks import FrameRecord, frames_from_records
 from usdbrdf.files.frames import (
     PHOTOGRAPH_NOISE_FLOOR,
     PHOTOGRAPH_SATURATION,

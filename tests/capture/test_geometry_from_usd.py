@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.options import IngestOptions

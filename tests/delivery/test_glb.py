@@ -19,7 +19,7 @@ from usdbrdf.delivery.package import package
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.model.material import Surface, constant_map, preview_material
 from usdbrdf.options import PackageOptions
-from usdbrdf.relighting.inserted_models import surfaces_from_model
+from usdbrdf.relighting.insert import surfaces_from_model
 
 pytest.importorskip("PIL", reason="Pillow is not installed")
 

@@ -19,7 +19,7 @@ import pytest
 
 import usdbrdf.geometry.unwrap
 import usdbrdf.material.fit_objects
-import usdbrdf.shading.irradiance_map
+import usdbrdf.shading.shaded
 import usdbrdf.texturing.lit_texture
 from tests.fault_injection import VARIABLE, inject
 from tests.scenes import make_capture
@@ -30,8 +30,8 @@ from usdbrdf.job.ownership import edited_files
 TILE = 64  # texels
 PROGRAM = f"""
 import sys
-import usdbrdf.shading.irradiance_map
-usdbrdf.shading.irradiance_map._TILE = {TILE}
+import usdbrdf.shading.shaded
+usdbrdf.shading.shaded._TILE = {TILE}
 from usdbrdf.cli import main
 from tests.fault_injection import arm_from_environment
 arm_from_environment()
@@ -90,7 +90,7 @@ def undisturbed(base):
 
 @pytest.fixture
 def small_tiles(monkeypatch):
-    monkeypatch.setattr(usdbrdf.shading.irradiance_map, "_TILE", TILE)
+    monkeypatch.setattr(usdbrdf.shading.shaded, "_TILE", TILE)
 
 
 @pytest.fixture
@@ -175,7 +175,7 @@ def calls(monkeypatch):
 
     count(usdbrdf.geometry.unwrap, "unwrap")
     count(usdbrdf.texturing.lit_texture, "read_frames")
-    count(usdbrdf.shading.irradiance_map, "irradiance_at")
+    count(usdbrdf.shading.shaded, "irradiance_at")
     count(usdbrdf.material.fit_objects, "choose_target_frames")
     count(usdbrdf.material.fit_objects, "fit_object")
     return counted

@@ -27,14 +27,13 @@ from usdbrdf.job import checkpoints
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
-from usdbrdf.material.refine import Refined, refined_light
-from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
+from usdbrdf.material.refine import Lobes, Refined, refined_irradiance, refined_light
 from usdbrdf.model.capture import Frames
-from usdbrdf.shading import irradiance_map
+from usdbrdf.shading import shaded
+from usdbrdf.transport.embree import lift_from_surface
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
-from usdbrdf.transport.rays import lift_from_surface
 
 Float = npt.NDArray[np.float32]
 
@@ -278,7 +277,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
 
 def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):
     whole = _refined(room, tmp_path / "whole")
-    monkeypatch.setattr(irradiance_map, "_TILE", 300)
+    monkeypatch.setattr(shaded, "_TILE", 300)
     np.testing.assert_array_equal(_refined(room, tmp_path / "tiles"), whole)
 
 

@@ -14,7 +14,7 @@ from tests.scenes import ROOM
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_weaker
 from usdbrdf.asset.readers.scene import scene_from_stage
-from usdbrdf.capture.findings import Findings
+from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.cli import main
 from usdbrdf.options import IngestOptions

@@ -20,7 +20,7 @@ from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import Surface
 from usdbrdf.options import Insert
-from usdbrdf.relighting.inserted_models import surfaces_from_model
+from usdbrdf.relighting.insert import surfaces_from_model
 from usdbrdf.relighting.relit_scene import relit_scene
 from usdbrdf.relighting.render import mitsuba_variant
 from usdbrdf.untrusted import bounds

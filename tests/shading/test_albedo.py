@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.shading.albedo import albedo_from_irradiance
+from usdbrdf.shading.shaded import albedo_from_irradiance
 
 
 def test_the_albedo_of_a_lambertian_surface():

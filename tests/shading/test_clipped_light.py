@@ -14,7 +14,7 @@ from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
-from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.tile_draws import independent_tiles
 
 ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]

@@ -15,7 +15,7 @@ from tests.physics.surfaces import World, box, quad, room, world_of
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import give_back_freed, resident_bytes
 from usdbrdf.options import Sampling
-from usdbrdf.shading.irradiance_map import denoised_irradiance
+from usdbrdf.shading.shaded import denoised_irradiance
 from usdbrdf.transport.denoise import chosen_filter, denoise_lightmaps, denoise_picture
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels

@@ -17,9 +17,9 @@ from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.exposures import Probes
+from usdbrdf.texturing.footprints import texel_size_from_frames
 from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
-from usdbrdf.texturing.texel_size import texel_size_from_frames
 
 SATURATION = 4.0
 WIDTH, HEIGHT = 48, 36

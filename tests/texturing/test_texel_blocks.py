@@ -7,7 +7,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
-from usdbrdf.texturing.texel_blocks import blocks_of_texels
+from usdbrdf.texturing.observe import blocks_of_texels
 
 LENS, SIZE, MIN_COSINE = np.array([80.0, 80.0, 40.0, 30.0]), np.array([80, 60], np.int32), 0.1
 

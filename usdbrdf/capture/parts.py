@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.checks import (
+    Findings,
+    FrameRecord,
     at_image_size,
     check_frames,
+    frames_from_records,
     refuse_rays_that_miss,
     refuse_without_parallax,
     rigid_records,
 )
-from usdbrdf.capture.findings import Findings, FrameRecord, frames_from_records
 from usdbrdf.capture.labels import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import known_encodings

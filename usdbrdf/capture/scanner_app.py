@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.capture.checks import clause_of
-from usdbrdf.capture.findings import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,

@@ -13,12 +13,13 @@ import numpy as np
 
 from usdbrdf.capture.checks import (
     LARGEST_OF_POSE,
+    Findings,
+    FrameRecord,
     at_image_size,
     clause_of,
     is_camera_matrix,
     refuse_photographs,
 )
-from usdbrdf.capture.findings import Findings, FrameRecord
 from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,

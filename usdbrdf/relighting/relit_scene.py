@@ -15,8 +15,12 @@ from usdbrdf.job.progress import warn
 from usdbrdf.model.light import Light, RelitScene
 from usdbrdf.model.material import Surface, turned_up
 from usdbrdf.options import Insert
-from usdbrdf.relighting.insert import placed, with_material
-from usdbrdf.relighting.inserted_models import render_scene_of_others, surfaces_from_model
+from usdbrdf.relighting.insert import (
+    placed,
+    render_scene_of_others,
+    surfaces_from_model,
+    with_material,
+)
 from usdbrdf.untrusted.pictures import picture_from_file
 
 # Two bounding boxes are of one object if their corners differ by less than this share of their

@@ -29,7 +29,7 @@ from usdbrdf.shading.clipped_emitters import (
 from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
-from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.lit_scene import TexturedScene
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
 # More lamps are not told apart; the faintest keep their bounds.

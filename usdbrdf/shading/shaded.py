@@ -5,22 +5,113 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from usdbrdf import calibration
+from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Float
+from usdbrdf.model.arrays import Array, Bool, Float
 from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
-from usdbrdf.shading.albedo import albedo_map
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.emitters import Emitters, find_emitters
-from usdbrdf.shading.irradiance_map import denoised_irradiance, trace_irradiance
-from usdbrdf.transport.denoise import OIDN
+from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.irradiance import Irradiance
-from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
+from usdbrdf.transport.lit_scene import TexturedScene
+
+NEUTRAL = calibration.number("albedo.unseen")
+_DARK = calibration.number("albedo.dark")
+_TINY = float(np.finfo(np.float32).tiny)
+
+
+def albedo_from_irradiance(
+    diffuse_radiance: Float, irradiance: Float, floor: float
+) -> tuple[Float, Bool]:
+    """Lambertian albedo of each texel, rho = pi L_d / S (paper, section 3.3).
+
+    diffuse_radiance (T, 3) float32, L_d, scene-linear; irradiance (T, 3) float32, S, W/m^2;
+    floor: S below it is unknown, not dark. Returns rho (T, 3) float32, not clipped and 0 where
+    unknown, and known (T,) bool.
+    """
+    known: Bool = np.all(irradiance > floor, axis=1)
+    rho = np.where(known[:, None], np.pi * diffuse_radiance / np.maximum(irradiance, floor), 0)
+    return rho.astype(np.float32), known
+
+
+def albedo_map(
+    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool
+) -> tuple[Float, float]:
+    """(albedo (T, 3) in [0, 1], share of the known, non-emissive texels over 1).
+
+    radiance, irradiance (T, 3); known (T,): the texel's radiance is not filled in, and its albedo
+    need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
+    is known are NEUTRAL.
+    """
+    floor = _DARK * float(np.median(irradiance.mean(axis=1)))
+    albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))
+    reflects = known & ~emissive
+    over = (albedo > 1).any(axis=1) & reflects & lit_enough
+    albedo = inpaint(texels, np.clip(albedo, 0, 1), reflects & lit_enough)
+    for i in range(len(texels.resolution)):
+        own = texels.of_object(i)
+        if not known[own].any():
+            albedo[own] = NEUTRAL
+    albedo[emissive] = 0
+    return albedo, float(over.sum() / max(reflects.sum(), 1))
+
+
+# Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
+# bounds the memory of the ray buffers.
+_TILE = 1 << 15
+
+
+def trace_irradiance(
+    run: TaskRun, surface: TexturedScene, lit: Float, environment: Environment, sampling: Sampling
+) -> Irradiance:
+    """S at all texels with the radiance ``lit`` (T, 3) as the light, from where a kill left it."""
+    texels = surface.texels
+    radiance, lights = surface.texture(lit), surface.lights(lit)
+    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
+    # surfaces lit from outside the scan.
+    dark = np.pi * lit.mean(axis=1)
+    order, patch = tiles_of_texels(texels)
+    tiles = tiles_of_patches(patch)
+    say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
+
+    def tile(part: slice) -> dict[str, Array]:
+        index = order[part]
+        found = irradiance_at(
+            surface.rays, radiance, lights, environment, texels.position[index],
+            texels.normal[index], patch[part], sampling, surface.diagonal_m, dark[index],
+        )  # fmt: skip
+        return dict(vars(found))
+
+    parts: dict[str, list[Array]] = {}
+    for number, part in enumerate(progress(tiles, total=len(tiles), label="shade", unit="tiles")):
+        done = run.checkpoint(f"tile-{number}", partial(tile, part))
+        for name, values in done.items():
+            parts.setdefault(name, []).append(values)
+    back = np.argsort(order)
+    return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
+
+
+def tiles_of_patches(patch: Array) -> list[slice]:
+    """Ranges of about _TILE texels that do not cut a patch."""
+    return whole_tiles(patch, _TILE)
+
+
+def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
+    """Each object's S (T, 3) through the lightmap filter."""
+    pictures = (texels.image(i, irradiance) for i in range(len(texels.resolution)))
+    filtered = denoise_lightmaps(pictures)
+    return np.concatenate([texels.from_image(i, picture) for i, picture in enumerate(filtered)])
+
 
 # Shares that are worth a warning: of the known texels with an albedo over 1, of light's directions
 # that leave the scan.

@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.inputs import hashes_of_inputs, open_before
 from usdbrdf.asset.layers.material_layer import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import FittedObject, colour
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, judged, survey_frames
-from usdbrdf.material.refine import refined_light
-from usdbrdf.material.refined_irradiance import Lobes
+from usdbrdf.material.refine import Lobes, refined_light
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
-from usdbrdf.asset.inputs import hashes_of_inputs, open_before
 from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
 from usdbrdf.asset.previews import overview
 from usdbrdf.asset.properties import TexturedObject
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
@@ -18,10 +18,10 @@ from usdbrdf.job.progress import progress, say, warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
+from usdbrdf.texturing.footprints import texel_size_from_frames
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
-from usdbrdf.texturing.texel_size import texel_size_from_frames
-from usdbrdf.transport.rays import RayScene
-from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.lit_scene import TexturedScene
 
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:

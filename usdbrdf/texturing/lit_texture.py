@@ -19,7 +19,7 @@ from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
 from usdbrdf.texturing.passes import groups_of_texels, in_passes
-from usdbrdf.transport.textured_scene import TexturedScene
+from usdbrdf.transport.lit_scene import TexturedScene
 
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from usdbrdf.capture.checks import refuse_photographs
-from usdbrdf.capture.findings import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,

@@ -1,4 +1,4 @@
-"""Opening the stage as a given task of the pipeline may see it."""
+"""Opening the stage as a given task of the pipeline may see it, and the hashes of what it reads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Array
@@ -141,3 +144,46 @@ def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
     root = new_layer(header, Provenance(role="view", version="1"))
     root.subLayerPaths = [str(layer) for layer in reversed(layers)]
     return open_stage(root)
+
+
+def open_before(asset: Asset, role: str) -> Usd.Stage:
+    """The stage that tasks before that of ``role`` wrote; InputRefused where one has not run."""
+    for layer in _weaker_layers(asset, role):
+        if not layer.is_file():
+            raise InputRefused(
+                f"{asset.folder}: {layer.name} is missing, so an earlier step has not run here. "
+                "Run `usdbrdf convert`, or the steps ingest, texture, shade, fit in this order. "
+                "[asset.incomplete]"
+            )
+    return open_weaker(asset, role)
+
+
+def hashes_of_inputs(
+    asset: Asset,
+    role: str,
+    maps: AssetMaps,
+    *,
+    aovs: tuple[str, ...] = (),
+    photographs: bool = False,
+    environment: Path | None = None,
+) -> dict[str, str]:
+    """By label the SHA-256 of all that a task of ``role`` reads: the weaker layers and the USD
+    geometry that they refer to, the maps ``aovs``, the photographs, the picture of the sky."""
+    layers = _weaker_layers(asset, role)
+    files = {
+        "geometry": maps.layers_elsewhere(asset.folder),
+        "environment": [environment] if environment else [],
+        "maps": asset.textures(*aovs),
+        "frames": [*maps.frames.image_paths] if photographs else [],
+    }
+    if environment and not environment.is_file():
+        raise InputRefused(
+            f"{environment}: no such file. Check --environment. [shading.environment]"
+        )
+    by_label = {layer.name: sha256_of(layer) for layer in layers}
+    return by_label | {label: hash_of_files(some) for label, some in files.items() if some}
+
+
+def _weaker_layers(asset: Asset, role: str) -> list[Path]:
+    layers = [asset.layer(weaker) for weaker in ROLES[: ROLES.index(role)]]
+    return [*layers, asset.uv_layer] if role in ("shading", "material") else layers

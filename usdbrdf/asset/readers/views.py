@@ -17,12 +17,14 @@ from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.capture.checks import (
+    Findings,
+    FrameRecord,
     check_frames,
+    frames_from_records,
     refuse_photographs,
     refuse_rays_that_miss,
     rigid_records,
 )
-from usdbrdf.capture.findings import Findings, FrameRecord, frames_from_records
 from usdbrdf.capture.parts import frames_at
 from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
