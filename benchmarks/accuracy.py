@@ -40,10 +40,10 @@ from usdbrdf.evaluation.truth import (
 from usdbrdf.files.frames import read_frame
 from usdbrdf.options import Sampling
 from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
-from usdbrdf.transport.embree import RayScene
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
 REFERENCE_RAYS = 4096

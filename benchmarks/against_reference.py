@@ -37,7 +37,7 @@ from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.objects import aov_path
 from usdbrdf.files.arrays import load_arrays
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 MIN_SAMPLES = 3

@@ -26,7 +26,7 @@ from numba import prange
 from usdbrdf.files.images import write_exr
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.camera import Camera
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
 from study_camera import look_at

@@ -47,7 +47,7 @@ from usdbrdf.texturing.samples import (
     first_surfaces,
     samples_from_frame,
 )
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 QUANTILE = 0.5
 T = TypeVar("T")

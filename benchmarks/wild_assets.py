@@ -35,7 +35,7 @@ from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import triangulate
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.usd_files import UsdMeshes, meshes_from_usd
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import validate

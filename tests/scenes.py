@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.camera import Camera
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 Float = npt.NDArray[np.float32]
 Double = npt.NDArray[np.float64]

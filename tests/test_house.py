@@ -70,7 +70,7 @@ ARROWS: dict[str, set[str]] = {
 IMPORTERS: dict[str, set[str]] = {
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "drjit": {"relighting/"},
-    "embreex": {"transport/embree.py"},
+    "embreex": {"transport/rays.py"},
     "filelock": {"job/lock.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
     "llvmlite": {"kernel_cache.py", "transport/"},

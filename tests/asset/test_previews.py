@@ -17,7 +17,7 @@ from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.progress import set_quiet
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 PICTURES = ("lit", "albedo", "irradiance")
 

@@ -9,7 +9,7 @@ import pytest
 from tests.scenes import camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf.geometry import visible_faces as module
 from usdbrdf.geometry.visible_faces import visible_faces
-from usdbrdf.transport.embree import BOX_FACES, RayScene
+from usdbrdf.transport.rays import BOX_FACES, RayScene
 
 SIZE = (160, 120)
 LENS = np.array([90.0, 110.0, 77.3, 61.9])

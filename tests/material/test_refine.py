@@ -30,10 +30,10 @@ from usdbrdf.material import refine
 from usdbrdf.material.refine import Lobes, Refined, refined_irradiance, refined_light
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading import shaded
-from usdbrdf.transport.embree import lift_from_surface
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
+from usdbrdf.transport.rays import lift_from_surface
 
 Float = npt.NDArray[np.float32]
 

@@ -17,11 +17,11 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
-from usdbrdf.transport.embree import RayScene
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at
 from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 from usdbrdf.transport.tile_draws import independent_tiles
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.transport import embree
-from usdbrdf.transport.embree import EmbreeScene, closest_hits, empty_hits
+from usdbrdf.transport import rays
+from usdbrdf.transport.rays import EmbreeScene, closest_hits, empty_hits
 
 _TRIANGLE = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0]], np.float32)
 _DOWN = np.array([[0.5, 0.25, 3]], np.float32), np.array([[0, 0, -1]], np.float32)
@@ -22,23 +22,23 @@ def _face(scene: EmbreeScene) -> int:
 
 
 def test_a_library_that_lacks_a_function_is_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(embree._FUNCTIONS, "rtcDoesNotExist", (None, []))
-    embree._embree.cache_clear()
+    monkeypatch.setitem(rays._FUNCTIONS, "rtcDoesNotExist", (None, []))
+    rays._embree.cache_clear()
     try:
         with pytest.raises(EnvironmentFailure, match=r"rtcDoesNotExist.*install the wheel"):
             EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
     finally:
-        embree._embree.cache_clear()
+        rays._embree.cache_clear()
 
 
 def test_another_version_of_embree_is_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(embree, "_MAJOR_VERSION", 3)
-    embree._device.cache_clear()
+    monkeypatch.setattr(rays, "_MAJOR_VERSION", 3)
+    rays._device.cache_clear()
     try:
         with pytest.raises(EnvironmentFailure, match=r"reaches Embree 4.*install the wheel"):
             EmbreeScene(_TRIANGLE, np.array([[0, 1, 2]], np.int32))
     finally:
-        embree._device.cache_clear()
+        rays._device.cache_clear()
 
 
 def test_what_embree_reads_is_the_scenes_own_and_padded():
@@ -56,7 +56,7 @@ def test_what_embree_reads_is_the_scenes_own_and_padded():
 
 def test_a_scene_is_released_once_nobody_holds_it(monkeypatch: pytest.MonkeyPatch):
     released: list[int] = []
-    library = embree._embree()
+    library = rays._embree()
     release = library.rtcReleaseScene
 
     def counted(address: int) -> None:

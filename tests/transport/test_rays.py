@@ -7,8 +7,8 @@ import pytest
 
 from tests.physics.surfaces import World, box, quad, room, sphere, world_of
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.transport import embree
-from usdbrdf.transport.embree import (
+from usdbrdf.transport import rays
+from usdbrdf.transport.rays import (
     RayScene,
     closest_hits_of_groups,
     empty_hits,
@@ -88,7 +88,7 @@ def test_origins_are_taken_in_turns(triangle: RayScene, monkeypatch: pytest.Monk
     origins = _f32((0.5, 0.25, 3), (5, 5, 3), (0.5, 0.25, 1))
     down = np.tile(_f32((0, 0, -1)), (12, 1))
     for chunk in (1 << 16, 4):
-        monkeypatch.setattr(embree, "_CHUNK", chunk)
+        monkeypatch.setattr(rays, "_CHUNK", chunk)
         hits = triangle.closest(origins, down)
         np.testing.assert_array_equal(hits.face, [0, -1, 0] * 4)
         np.testing.assert_allclose(hits.distance[hits.face == 0], [3, 1] * 4, rtol=1e-6)

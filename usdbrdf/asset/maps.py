@@ -26,9 +26,9 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.embree import RayScene
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene
+from usdbrdf.transport.rays import RayScene
 
 # Pictures decoded or written at a time.
 _AT_A_TIME = min(4, os.cpu_count() or 1)

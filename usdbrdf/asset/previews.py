@@ -13,7 +13,7 @@ from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.embree import Hits, RayScene
+from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
 _MAX_WIDTH = 640

@@ -19,7 +19,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 
 @dataclass(frozen=True, kw_only=True)

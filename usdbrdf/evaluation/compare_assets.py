@@ -28,7 +28,7 @@ from usdbrdf.model.arrays import Bool, Byte, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.embree import Hits, RayScene
+from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
 DOCUMENT = "comparison.json"

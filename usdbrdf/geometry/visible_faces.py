@@ -16,7 +16,7 @@ from numba import prange
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.transport.embree import BOX_FACES, RayScene
+from usdbrdf.transport.rays import BOX_FACES, RayScene
 
 Vector = tuple[float, float, float]
 # Rays decide within this many pixels of an edge, and where two depths differ by less than this

@@ -13,7 +13,6 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.transport.embree import lift_from_surface
 from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
@@ -22,6 +21,7 @@ from usdbrdf.transport.lit_scene import (
     visible_points,
 )
 from usdbrdf.transport.lobe_radiance import lobe_basis
+from usdbrdf.transport.rays import lift_from_surface
 
 Basis = Callable[[float], tuple[Float, Float]]
 Projection = Callable[[Double], Double]

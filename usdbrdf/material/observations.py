@@ -16,8 +16,8 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
-from usdbrdf.transport.embree import lift_from_surface
 from usdbrdf.transport.lit_scene import LitScene, View, visible_points
+from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.warps import shifts_of
 
 # Side of the squares in texels, which are about as large as pixels.

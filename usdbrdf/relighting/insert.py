@@ -22,7 +22,7 @@ from usdbrdf.model.material import (
     preview_material,
 )
 from usdbrdf.options import Insert
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import model_from_file
 from usdbrdf.untrusted.usd_files import render_scene_of_usd
 

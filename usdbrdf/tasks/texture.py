@@ -20,8 +20,8 @@ from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.texturing.footprints import texel_size_from_frames
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
-from usdbrdf.transport.embree import RayScene
 from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.rays import RayScene
 
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:

@@ -19,7 +19,7 @@ from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import Projection, project
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
 _RING = np.pi / 4 * np.arange(8)

@@ -31,7 +31,7 @@ from usdbrdf.texturing.samples import (
     first_surfaces,
     samples_from_frame,
 )
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 # Texels to a side of a tile.
 _SIDE = 8

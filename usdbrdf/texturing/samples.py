@@ -22,7 +22,7 @@ from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.glare import brightest_glare
-from usdbrdf.transport.embree import RayScene
+from usdbrdf.transport.rays import RayScene
 
 MIN_COSINE = calibration.number("samples.min_cosine")
 # Sub-samples of a texel's footprint per side, at most.

@@ -2,8 +2,9 @@
 
 Its face, which is all that the rest of the package calls:
 
-    rays             RayScene.closest: first surfaces along rays; lift_from_surface
-    lit_scene        LitScene, the scene with its light; visible_points under a camera's pixels
+    rays             Embree: RayScene.closest: first surfaces along rays; lift_from_surface
+    lit_scene        TexturedScene: the geometry to trace with its charts, which makes textures and
+                     lights; LitScene, with its light; visible_points under a camera's pixels
     surface_texture  radiance on the surface, bilinear; environment: radiance from outside
     lights           lights_from_radiance: surface that rays are sent to on purpose
     irradiance       irradiance_at points, in tiles of texels
@@ -11,10 +12,9 @@ Its face, which is all that the rest of the package calls:
                      specular_irradiance that they bring to other surfaces
     renderer_match   what to write for renderers with another lobe
     brdf             the lobe's equations
-    textured_scene   TexturedScene: the geometry to trace with its charts; makes textures and lights
     denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things
 
-Behind it are Embree (embree), random numbers (tile_draws) and the estimators' loops
+Behind it are random numbers (tile_draws) and the estimators' loops
 (cosine_sampling, light_sampling), which hold occlusion as well.
 """

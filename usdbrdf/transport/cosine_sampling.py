@@ -9,10 +9,10 @@ import numpy as np
 
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
-from usdbrdf.transport.embree import Hits, closest_hits, closest_hits_of_groups, empty_hits
 from usdbrdf.transport.environment import environment_at
 from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, turns
 from usdbrdf.transport.lights import DENSITY, GROUP, facing
+from usdbrdf.transport.rays import Hits, closest_hits, closest_hits_of_groups, empty_hits
 from usdbrdf.transport.surface_texture import (
     AHEAD,
     add_looked_at,

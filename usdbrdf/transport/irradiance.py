@@ -31,10 +31,10 @@ from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
 from usdbrdf.transport.cosine_sampling import add_cosine_samples
-from usdbrdf.transport.embree import RayScene, lift_from_surface
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, add_light_samples
 from usdbrdf.transport.lights import LightGroups, Lights, TilePicks, weighed_groups
+from usdbrdf.transport.rays import RayScene, lift_from_surface
 from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.tile_draws import (
     STRATA_BY_PLACE,

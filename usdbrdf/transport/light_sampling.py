@@ -19,9 +19,9 @@ import numpy as np
 
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
-from usdbrdf.transport.embree import occlusion
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import DENSITY, LightGroups, TilePicks, facing, picked, way_to
+from usdbrdf.transport.rays import occlusion
 from usdbrdf.transport.surface_texture import (
     AHEAD,
     SurfaceTexture,

@@ -14,9 +14,9 @@ from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.embree import Hits, RayScene
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 

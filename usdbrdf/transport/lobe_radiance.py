@@ -30,10 +30,10 @@ from usdbrdf.transport.brdf import (
     sample_half_vector,
     stretched,
 )
-from usdbrdf.transport.embree import Hits, lift_from_surface
 from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.lights import DENSITY, LightGroups, facing, picked, way_to
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, points_of_rays
+from usdbrdf.transport.rays import Hits, lift_from_surface
 from usdbrdf.transport.warps import (
     cosine_direction,
     cosine_rays,
