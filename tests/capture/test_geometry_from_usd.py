@@ -7,11 +7,16 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from tests.scenes import edited, make_capture
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_weaker
+from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError, UsdBrdfError
+from usdbrdf.model.mesh import face_normals
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.ingest import ingest
 from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.usd_files import layers_of_usd, meshes_from_usd, render_scene_of_usd
 
@@ -297,3 +302,33 @@ def test_a_file_and_folders_that_usd_cannot_name_are_refused(tmp_path):
         file.write_text("#usda 1.0")
         with pytest.raises(InputRefused, match=r"not UTF-8.*\[paths\.name\]$"):
             meshes_from_usd(file)
+
+
+def test_faces_of_a_usd_mesh_that_look_away_are_turned_in_our_layer_alone(capture, tmp_path):
+    expected = read_scan(capture.folder, IngestOptions())
+    file = capture.folder / "room.usda"
+    stage = Usd.Stage.Open(str(file))
+    floor = UsdGeom.Mesh(stage.GetPrimAtPath("/scan/floor/surface"))
+    indices = np.array(floor.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    indices[::2] = indices[::2][:, [0, 2, 1]]
+    floor.GetFaceVertexIndicesAttr().Set(indices.ravel())
+    UsdGeom.Mesh(stage.GetPrimAtPath("/scan/box/surface")).GetOrientationAttr().Set("leftHanded")
+    stage.Save()
+    before = file.read_bytes()
+    scan = read_scan(capture.folder, IngestOptions())
+    turned = np.zeros(len(scan.mesh.triangles), np.bool_)
+    turned[np.flatnonzero(scan.mesh.face_object == capture.names.index("floor"))[::2]] = True
+    turned[scan.mesh.face_object == capture.names.index("box")] = True
+    np.testing.assert_array_equal(scan.turned_faces, turned)
+    result = ingest(capture.folder, Asset(tmp_path / "asset", "asset"), IngestOptions())
+    assert result.summary["counts"]["faces_turned"] == turned.sum()
+    scene = scene_from_stage(open_weaker(Asset(tmp_path / "asset", "asset"), "texturing"))
+    np.testing.assert_allclose(
+        face_normals(scene.points, scene.triangles),
+        face_normals(expected.mesh.points, expected.mesh.triangles),
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(
+        scene.corner_normals[:, 0], face_normals(scene.points, scene.triangles), atol=1e-5
+    )
+    assert file.read_bytes() == before

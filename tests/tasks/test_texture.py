@@ -31,11 +31,17 @@ def _textured(base, made):
         return usdbrdf.texture(asset, OPTIONS)
 
 
-def test_faces_wound_away_from_all_cameras_are_refused(tmp_path):
+def test_faces_wound_away_from_all_cameras_are_turned(tmp_path):
     made = make_capture(tmp_path / "scan", frames=8, subdivisions=1)
+    expected = _textured(tmp_path / "right", made).summary["measured_fraction"]
     inside_out = made.triangles[:, ::-1]
     write_ply(made.folder / "mesh.ply", made.points, inside_out, made.face_object)
-    with pytest.raises(InputRefused, match=r"front.*\[texturing.unseen\]") as caught:
+    assert _textured(tmp_path / "turned", made).summary["measured_fraction"] == expected
+
+
+def test_frames_too_small_to_show_any_texel_are_refused(tmp_path):
+    made = make_capture(tmp_path / "scan", frames=8, subdivisions=1, size=(2, 2), noise=0.1)
+    with pytest.raises(InputRefused, match=r"no frame sees.*\[texturing.unseen\]") as caught:
         _textured(tmp_path, made)
     assert caught.value.exit_code == 3
     assert not (tmp_path / "asset" / "textures").exists()

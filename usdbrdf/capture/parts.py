@@ -26,6 +26,8 @@ from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
+from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras
+from usdbrdf.model.arrays import Bool
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 from usdbrdf.options import IngestOptions
@@ -35,14 +37,16 @@ from usdbrdf.untrusted.usd_files import meshes_from_usd
 
 @dataclass(frozen=True, kw_only=True)
 class ScanGeometry:
-    """Mesh and objects as in ``Scan``.
+    """Mesh and objects as in ``Scan``, the faces wound as they came.
 
+    has_normals                    (F,) bool: the file gives the face's normals; None: it gives none
     usd_geometry, object_prims     set if the file is USD and is to be referenced, not copied
     meters_per_unit, up_axis       None where the file does not say
     """
 
     mesh: ScanMesh
     objects: tuple[ObjectLabel, ...]
+    has_normals: Bool | None = None
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
     meters_per_unit: float | None = None
@@ -76,6 +80,7 @@ def geometry_from_usd(
         )
     return ScanGeometry(
         mesh=mesh,
+        has_normals=~missing,
         objects=tuple(
             ObjectLabel(identifier=identifier, label=label)
             for identifier, label in zip(
@@ -183,20 +188,43 @@ def scan_from_parts(
     findings.refuse_too_few_frames(source, total)
     findings.warn_of_dropped_frames(source, total)
     findings.count("rays_hit_percent", round(100 * hit_share))
+    frames = frames_at(frames, usable)
+    sides = _sides(geometry, frames, findings)
     return Scan(
         name=name,
         adapter=adapter,
         source=source,
-        mesh=geometry.mesh,
+        mesh=turned_towards_cameras(
+            geometry.mesh, sides, geometry.has_normals, options.crease_angle_deg
+        ),
         objects=geometry.objects,
-        frames=frames_at(frames, usable),
+        frames=frames,
         meters_per_unit=options.meters_per_unit or geometry.meters_per_unit or meters_per_unit,
         up_axis=options.up_axis or geometry.up_axis or up_axis,
         usd_geometry=geometry.usd_geometry,
         object_prims=geometry.object_prims,
+        turned_faces=sides.turned,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )
+
+
+def _sides(geometry: ScanGeometry, frames: Frames, findings: Findings) -> Sides:
+    """Which faces have to be turned towards the cameras, and which show both sides."""
+    cameras = (frames.camera(i) for i in range(len(frames)))
+    sides = sides_from_cameras(geometry.mesh, cameras)
+    turned, both = int(sides.turned.sum()), int(sides.both.sum())
+    findings.count("faces_turned", turned)
+    findings.count("faces_of_two_sides", both)
+    if turned:
+        findings.warn(
+            f"{turned} of {len(sides.turned)} faces are wound away from the cameras and have been "
+            "turned in the asset; the mesh stays as it is. [mesh.winding]"
+        )
+    if both and geometry.usd_geometry is not None:
+        # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
+        return Sides(turned=sides.turned, both=np.zeros_like(sides.both))
+    return sides
 
 
 def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:

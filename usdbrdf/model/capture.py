@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.arrays import Bool, Double, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 
@@ -62,6 +62,8 @@ class Scan:
     usd_geometry   the USD file that holds the meshes, if the geometry came as USD; then
                    ``object_prims`` gives, per object, the mesh's path below that file's default
                    prim
+    turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
+                   ``mesh`` they are turned
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -76,5 +78,6 @@ class Scan:
     up_axis: str = "Z"
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
+    turned_faces: Bool | None = None
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

@@ -51,7 +51,7 @@ class LitTexture:
         if unmeasured > _MOSTLY:
             yield (
                 f"{100 * unmeasured:.1f} % of the texels were measured by no frame and are filled "
-                "in. Check the winding of the faces, the poses and the exposures. "
+                "in. Check the poses and the exposures. "
                 "[texturing.unseen]"
             )
 
@@ -99,9 +99,8 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
     clipped = ~measured & (found.clipped > 0)
     if not (measured | clipped).any():
         raise InputRefused(
-            "no frame sees any surface from its front: the faces are wound away from the cameras, "
-            "or the poses are wrong. Turn the mesh's faces or correct the poses. "
-            "[texturing.unseen]"
+            "no frame sees any surface well enough: too few pixels show it, or only at grazing "
+            "angles. Check the poses and the size of the images. [texturing.unseen]"
         )
     owner = texels.object_index()
     has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0

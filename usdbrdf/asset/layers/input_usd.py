@@ -26,7 +26,7 @@ from usdbrdf.asset.layout import Asset, relative_path
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
-from usdbrdf.model.arrays import Float
+from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.untrusted.usd_files import is_deforming, is_moving
 
@@ -67,10 +67,13 @@ def input_mesh(source: Usd.Prim, below: str) -> Usd.Prim:
     return prim
 
 
-def author_overrides(layer: Sdf.Layer, path: str, mesh: Usd.Prim, normals: Float) -> None:
+def author_overrides(
+    layer: Sdf.Layer, path: str, mesh: Usd.Prim, normals: Float, turned: Bool
+) -> None:
     """What our layer must say about one mesh of the input, which is at ``path`` in our stage.
 
     normals  (T, 3, 3), of its triangles' corners in the world, as they were read or made
+    turned   (T,) bool, triangles that the file has wound away from the cameras
     """
     target, prim, has_variants = Sdf.Path(path), mesh, False
     while target != Sdf.Path.absoluteRootPath:
@@ -88,8 +91,8 @@ def author_overrides(layer: Sdf.Layer, path: str, mesh: Usd.Prim, normals: Float
     fixed = has_variants or is_deforming(geometry)
     if fixed:
         _author_points(over(layer, path), geometry)
-    _author_triangles(layer, path, geometry, always=fixed)
-    if fixed or authored_normals(geometry, triangulation_of(geometry)) is None:
+    _author_triangles(layer, path, geometry, turned, always=fixed)
+    if fixed or turned.any() or authored_normals(geometry, triangulation_of(geometry)) is None:
         _author_normals(over(layer, path), geometry, normals)
 
 
@@ -128,17 +131,21 @@ def _author_normals(prim: Sdf.PrimSpec, mesh: UsdGeom.Mesh, in_world: Float) -> 
         blocked.default = Sdf.ValueBlock()
 
 
-def _author_triangles(layer: Sdf.Layer, path: str, mesh: UsdGeom.Mesh, *, always: bool) -> None:
+def _author_triangles(
+    layer: Sdf.Layer, path: str, mesh: UsdGeom.Mesh, turned: Bool, *, always: bool
+) -> None:
     """Replace polygons by triangles, and everything that is stored per polygon or corner; where
-    there are triangles only, do so if ``always``."""
+    there are triangles only, and none is ``turned``, do so if ``always``."""
     time = Usd.TimeCode.EarliestTime()
     counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(time), np.int32)
     holes = np.asarray(mesh.GetHoleIndicesAttr().Get(time) or [], np.int32)
-    if (counts == 3).all() and not len(holes) and not always:
+    if (counts == 3).all() and not len(holes) and not turned.any() and not always:
         return
     indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time), np.int32)
     # The winding stays as the file says: its orientation still applies.
     fans = triangulate(counts, indices, holes=holes)
+    for corners in (fans.triangles, fans.corners):
+        corners[turned] = corners[turned][:, [0, 2, 1]]
     prim = over(layer, path)
     attribute(prim, "faceVertexCounts", Types.IntArray, np.full(len(fans.triangles), 3, np.int32))
     attribute(prim, "faceVertexIndices", Types.IntArray, fans.triangles.reshape(-1))

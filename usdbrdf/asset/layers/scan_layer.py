@@ -78,7 +78,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
     if source and scan.usd_geometry:
         author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        _author_input_meshes(layer, scopes.root, source, meshes, scan.mesh, labels)
+        _author_input_meshes(layer, scopes.root, source, meshes, scan, labels)
     elif mesh:
         _author_meshes(layer, scopes, mesh, labels)
     define(layer, scopes.path("cameras"), "Scope")
@@ -131,13 +131,17 @@ def _author_input_meshes(
     root: str,
     source: Usd.Prim,
     meshes: Mapping[str, Usd.Prim],
-    soup: ScanMesh,
+    scan: Scan,
     labels: Sequence[LabelledObject],
 ) -> None:
     """What the referenced meshes need to be our objects."""
+    soup = scan.mesh
+    turned = np.zeros(len(soup.triangles), np.bool_)
+    turned = turned if scan.turned_faces is None else scan.turned_faces
     for i, (path, mesh) in enumerate(meshes.items()):
         weaken_bindings(layer, mesh, source, root)
-        author_overrides(layer, path, mesh, soup.corner_normals[soup.face_object == i])
+        own = soup.face_object == i
+        author_overrides(layer, path, mesh, soup.corner_normals[own], turned[own])
         _author_label(over(layer, path), labels[i])
 
 

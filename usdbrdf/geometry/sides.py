@@ -1,0 +1,229 @@
+"""Which side of each face is the surface: the one that the cameras see.
+
+Meshes from modelling programs and thin scanned sheets are wound as it happened. What counts is, in
+this order: from which side the frames see a face itself; which side they see of the faces that hang
+together with it; and, where no frame looked, on which side the surfaces lie that were seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from usdbrdf.geometry.normals import corner_normals
+from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.kernel import kernel
+from usdbrdf.model.arrays import Bool, Double, Int, Long
+from usdbrdf.model.camera import Camera
+from usdbrdf.model.mesh import ScanMesh, face_normals, welded_ids
+from usdbrdf.transport.rays import RayScene, lift_from_surface
+
+# Rays that graze a face may belong to its neighbour behind the edge: their side tells nothing.
+_GRAZING = 0.1
+# A side was seen if so many pixels show it; a face has two if so many frames show each of them.
+_PIXELS, _FRAMES_OF_EACH = 2, 2
+# Pixels of a frame's width that are looked at: more tell nothing new about a side.
+_MOST_ACROSS = 1024
+# Faces of an unseen part that look around, and in how many directions from either side.
+_LOOKING, _DIRECTIONS = 16, 16
+# The second skin lies so far behind the first, as a share of the scene's diagonal: further than
+# rays start above a surface.
+_BEHIND = 4e-5
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """How often frames show either side of F faces: pixels (F, 2) and frames (F, 2) int32, the
+    front, which the winding tells, first."""
+
+    pixels: Int
+    frames: Int
+
+    @property
+    def votes(self) -> Long:
+        """(F,): pixels that show the front less those that show the back."""
+        return self.pixels[:, 0].astype(np.int64) - self.pixels[:, 1]
+
+    @property
+    def both(self) -> Bool:
+        """(F,): either side is part of the capture."""
+        enough = (self.pixels >= _PIXELS) & (self.frames >= _FRAMES_OF_EACH)
+        return np.asarray(enough.all(axis=1), np.bool_)
+
+
+@dataclass(frozen=True)
+class Sides:
+    """turned, both (F,) bool: the winding shows the wrong side; frames see either side."""
+
+    turned: Bool
+    both: Bool
+
+
+def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
+    """The side of every face of a mesh that cameras, in its own frame and unit, looked at."""
+    rays = RayScene(mesh.points, mesh.triangles)
+    normals = face_normals(mesh.points, mesh.triangles)
+    seen = sightings(rays, normals, cameras)
+    votes = seen.votes
+    decided = np.abs(votes) >= _PIXELS
+    part, agrees = connected_windings(mesh)
+    of_part = np.bincount(part, np.where(agrees, votes, -votes), minlength=part.max() + 1)
+    facing = np.where(decided, votes, np.where(agrees, 1, -1) * of_part[part])
+    lost = facing == 0
+    if lost.any():
+        shown = np.where(decided, np.sign(votes), 0)
+        facing = np.where(
+            lost, _looking_around(mesh, rays, normals, lost, shown, part, agrees), facing
+        )
+    return Sides(turned=facing < 0, both=seen.both)
+
+
+def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sightings:
+    """Of each face with its unit normal (F, 3)."""
+    count = len(normals)
+    pixels, frames = np.zeros((2, count, 2), np.int32)
+    for camera in cameras:
+        small = camera.at_width(min(camera.width, _MOST_ACROSS))
+        face, point = visible_faces(rays, small)
+        face, point = face.reshape(-1), point.reshape(-1, 3)
+        way = small.eye - point
+        cosine = (way * normals[face]).sum(axis=1) / np.linalg.norm(way, axis=1)
+        for side, shown in enumerate((cosine > _GRAZING, cosine < -_GRAZING)):
+            number = np.bincount(face[shown & (face >= 0)], minlength=count)
+            pixels[:, side] += number
+            frames[:, side] += number > 0
+    return Sightings(pixels, frames)
+
+
+def connected_windings(mesh: ScanMesh) -> tuple[Long, Bool]:
+    """Parts of faces that hang together by edges which two faces of one object share.
+
+    Gives the part of each face, (F,) numbered from 0, and whether the face is wound as the part's
+    first one is, (F,): a part is wound alike once those that do not agree are turned.
+    """
+    corners = welded_ids(mesh.points)[mesh.triangles].astype(np.int64)
+    start, end = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    face = np.repeat(np.arange(len(corners)), 3)
+    key = np.stack([mesh.face_object[face], np.minimum(start, end), np.maximum(start, end)])
+    order = np.lexsort(key)
+    same = (np.diff(key[:, order], axis=1) == 0).all(axis=0)
+    first = np.flatnonzero(np.concatenate([[True], ~same]))
+    pairs = first[np.diff(first, append=len(order)) == 2]
+    one, other = order[pairs], order[pairs + 1]
+    root, agrees = _united(face[one], face[other], start[one] != start[other], len(corners))
+    return np.unique(root, return_inverse=True)[1].reshape(-1), agrees
+
+
+@kernel
+def _united(one: Long, other: Long, alike: Bool, count: int) -> tuple[Long, Bool]:
+    """Union-find that knows of each face whether it is wound as its root is."""
+    root, as_root = np.arange(count), np.ones(count, np.bool_)
+    for k in range(len(one)):
+        a, of_a = one[k], True
+        while root[a] != a:
+            # Halve the way: a's parent becomes its grandparent.
+            up = root[a]
+            as_root[a], root[a] = as_root[a] == as_root[up], root[up]
+            of_a = of_a == as_root[a]
+            a = root[a]
+        b, of_b = other[k], True
+        while root[b] != b:
+            up = root[b]
+            as_root[b], root[b] = as_root[b] == as_root[up], root[up]
+            of_b = of_b == as_root[b]
+            b = root[b]
+        if a != b:
+            root[b], as_root[b] = a, (of_a == of_b) == alike[k]
+    for f in range(count):
+        a, agrees = f, True
+        while root[a] != a:
+            agrees = agrees == as_root[a]
+            a = root[a]
+        root[f], as_root[f] = a, agrees
+    return root, as_root
+
+
+def _looking_around(
+    mesh: ScanMesh,
+    rays: RayScene,
+    normals: Double,
+    lost: Bool,
+    shown: Long,
+    part: Long,
+    agrees: Bool,
+) -> Long:
+    """(F,) of the parts that no frame shows (lost, (F,)): which side sees more of what frames show,
+    which is of each face its front (shown 1), its back (-1) or neither (0)."""
+    unseen = np.flatnonzero(lost)
+    corner = mesh.points.astype(np.float64)[mesh.triangles[unseen]]
+    area = np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    order = np.lexsort((-area, part[unseen]))
+    place = np.arange(len(order)) - np.searchsorted(part[unseen][order], part[unseen][order])
+    chosen = order[place < _LOOKING]
+    face, centre = unseen[chosen], corner[chosen].mean(axis=1)
+    side = np.where(agrees[face], 1.0, -1.0)[:, None] * normals[face]
+    balance = np.zeros(len(face))
+    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+    for direction in _even_directions(_DIRECTIONS):
+        for sign in (1.0, -1.0):
+            # From the front of a face, then from its back.
+            out = sign * side
+            way = direction * np.where((out @ direction)[:, None] < 0, -1.0, 1.0)
+            origin = lift_from_surface(centre.astype(np.float32), out.astype(np.float32), diagonal)
+            hit = rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
+            sees = (hit >= 0) & ((way * normals[hit]).sum(axis=1) * shown[hit] < 0)
+            balance += sign * sees
+    of_part = np.bincount(part[face], balance, minlength=part.max() + 1)
+    # Where that tells nothing either, the winding stays.
+    return np.where(of_part[part] == 0, 1, np.where(agrees, 1, -1) * of_part[part]).astype(np.int64)
+
+
+def _even_directions(count: int) -> Double:
+    """(count, 3) unit vectors spread over the sphere, on a spiral."""
+    z = (2 * np.arange(count) + 1) / count - 1
+    turn = np.pi * (1 + 5**0.5) * np.arange(count)
+    ring = np.sqrt(1 - z**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+def turned_towards_cameras(
+    mesh: ScanMesh, sides: Sides, has_normals: Bool | None, crease_angle_deg: float
+) -> ScanMesh:
+    """The mesh with its faces turned and, where frames see both sides, a second skin behind.
+
+    Shading normals that the file gave (has_normals (F,); None: it gave none) turn along, unless
+    they were right before; all others are made anew by the crease angle.
+    """
+    turned = mesh
+    if sides.turned.any():
+        triangles, normals = mesh.triangles.copy(), mesh.corner_normals.copy()
+        for corners in (triangles, normals):
+            corners[sides.turned] = corners[sides.turned][:, [0, 2, 1]]
+        made = slice(None) if has_normals is None else ~has_normals
+        normals[made] = corner_normals(mesh.points, triangles[made], crease_angle_deg)
+        front = face_normals(mesh.points, triangles)
+        normals[sides.turned & ((normals.sum(axis=1) * front).sum(axis=1) < 0)] *= -1
+        turned = replace(mesh, triangles=triangles, corner_normals=normals)
+    return _with_second_skin(turned, sides.both) if sides.both.any() else turned
+
+
+def _with_second_skin(mesh: ScanMesh, both: Bool) -> ScanMesh:
+    """The faces ``both`` once more, seen from behind and a little behind themselves."""
+    corner = mesh.points[mesh.triangles[both]]
+    normal = face_normals(mesh.points, mesh.triangles[both])
+    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+    behind = corner - (_BEHIND * diagonal) * normal[:, None].astype(np.float32)
+    number = len(mesh.points) + np.arange(3 * len(corner), dtype=np.int32).reshape(-1, 3)
+    return replace(
+        mesh,
+        points=np.concatenate([mesh.points, behind.reshape(-1, 3).astype(np.float32)]),
+        triangles=np.concatenate([mesh.triangles, number[:, [0, 2, 1]]]),
+        corner_normals=np.concatenate(
+            [mesh.corner_normals, -mesh.corner_normals[both][:, [0, 2, 1]]]
+        ),
+        face_object=np.concatenate([mesh.face_object, mesh.face_object[both]]),
+    )
