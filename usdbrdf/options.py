@@ -218,13 +218,15 @@ class TextureOptions(Options):
     """How frames become the lit diffuse texture L_d."""
 
     texel_size: float | None = option(
-        "--texel-size M", None, (1e-6, 1e3), unset="the frames' median pixel footprint"
+        "--texel-size M", None, (1e-6, 1e3), unset="what the frames' pixels cover of each chart"
     )
-    "side of a texel in metres"
+    "side of a texel in metres, everywhere"
     quantile: float = option("--quantile P", 0.5, (1e-6, 1 - 1e-6))
     "quantile of a texel's observations that becomes L_d, between 0 and 1"
-    max_texels: int = option("--max-texels N", 1_000_000, _COUNT)
-    "coarsen the default texel size so that the scene has at most N texels"
+    max_texels: int | None = option(
+        "--max-texels N", None, _COUNT, unset="as many as the memory holds"
+    )
+    "coarsen the default texel sizes so that the scene has about N texels at most"
     memory: float | None = _memory()
 
 

@@ -10,7 +10,8 @@ import pytest
 from tests.physics.surfaces import quad, sphere, world_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import PADDING, pack_triangles_singly, unwrap
+from usdbrdf.geometry.unwrap import PADDING, TexelSizes, pack_triangles_singly, unwrap
+from usdbrdf.model.scene import Scene, SceneObject
 
 
 def test_packed_triangles_have_cells_of_their_own():
@@ -50,7 +51,7 @@ def unwrapped():
     scene = world_of([
         sphere((0, 0, 0), 0.5, 16, 32, (8, 8)), quad((2, 0, 0), (1, 0, 0), (0, 0.5, 0))
     ]).scene  # fmt: skip
-    uv, resolution = unwrap(scene, 0.02)
+    uv, resolution = unwrap(scene, TexelSizes.even(scene, 0.02))
     return replace(scene, corner_uv=uv), resolution
 
 
@@ -91,4 +92,31 @@ def test_an_atlas_beyond_the_limit_is_refused_with_the_cure(monkeypatch):
     monkeypatch.setattr("usdbrdf.geometry.unwrap.MAX_SIDE", 64)
     scene = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0))]).scene
     with pytest.raises(InputRefused, match=r"limit 64.*larger --texel-size than 0.01 m"):
-        unwrap(scene, 0.01)
+        unwrap(scene, TexelSizes.even(scene, 0.01))
+
+
+def test_each_chart_has_the_density_that_its_pixels_ask_for():
+    # A cube whose top is seen finely, whose front coarsely, and the rest of it not at all.
+    points = np.float32([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.int32([[a, b, c] for a, b, c, d in sides for a, b, c in ((a, b, c), (a, c, d))])
+    box = SceneObject(
+        prim_path="/box", identifier="box", label="", class_name="", first_face=0, num_faces=12
+    )
+    scene = Scene(
+        objects=(box,),
+        points=points,
+        triangles=triangles,
+        corner_normals=np.zeros((12, 3, 3), np.float32),
+        face_object=np.zeros(12, np.int32),
+    )
+    side, pixels = np.full(12, 0.04, np.float32), np.zeros(12, np.float32)
+    side[10:], pixels[10:] = 0.01, 100
+    side[4:6], pixels[4:6] = 0.02, 100
+    uv, resolution = unwrap(scene, TexelSizes(side, pixels))
+    corner = uv * resolution[0]
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    texels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    np.testing.assert_allclose(np.sqrt(0.5 / texels), side, rtol=0.06)
+    assert uv.min() >= 0
+    assert uv.max() <= 1

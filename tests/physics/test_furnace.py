@@ -11,7 +11,7 @@ import pytest
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, estimates, quad, room, world_of
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import unwrap
+from usdbrdf.geometry.unwrap import TexelSizes, unwrap
 from usdbrdf.options import Sampling
 from usdbrdf.shading.shaded import albedo_from_irradiance
 from usdbrdf.transport.environment import black_environment
@@ -76,7 +76,7 @@ def test_no_ray_leaves_a_closed_room_with_real_charts():
         for part in room((0.123, 0.377, -1.01), (4.2, 3.3, 2.5))
     ]
     scene = world_of(walls).scene
-    uv, resolution = unwrap(scene, 0.07)
+    uv, resolution = unwrap(scene, TexelSizes.even(scene, 0.07))
     scene = replace(scene, corner_uv=uv)
     world = World(scene=scene, texels=texels_from_atlas(scene, resolution))
     order, tile = tiles_of_texels(world.texels)

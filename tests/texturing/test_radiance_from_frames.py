@@ -17,7 +17,7 @@ from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.exposures import Probes
-from usdbrdf.texturing.footprints import texel_size_from_frames
+from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
 
@@ -168,27 +168,32 @@ def test_the_texel_size_is_the_pixel_on_the_surface(room: Room):
         resolution=np.array([[80, 60]], np.int32),
     )
     x, y = np.meshgrid((np.arange(80) - 39.5) / 80, (np.arange(60) - 29.5) / 80)
-    expected = 2 / 80 * np.median((1 + x**2 + y**2) ** 0.75)
-    found = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels=10**9)
-    assert found == pytest.approx(expected, rel=0.03)
+    expected = 2 / 80 * np.exp(np.log((1 + x**2 + y**2) ** 0.75).mean())
+    found = texel_sizes_from_frames(floor.scene, floor.rays, frames, max_texels=10**9)
+    assert found.pixels.sum() == 80 * 60
+    assert found.of_objects(floor.scene)[0] == pytest.approx(expected, rel=1e-3)
     # 10^4 m^2 in at most 10^4 texels, of which an atlas uses 70 %: sqrt(1 / 0.7) m.
-    limited = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels=10**4)
-    assert limited == pytest.approx(np.sqrt(1 / 0.7), rel=0.05)
+    limited = texel_sizes_from_frames(floor.scene, floor.rays, frames, max_texels=10**4)
+    area = 100.0**2 / len(floor.scene.triangles)
+    assert (area / limited.side**2).sum() / 0.7 == pytest.approx(10**4, rel=1e-4)
 
 
-@pytest.mark.parametrize("max_texels", [10**4, 20_011, 77_777, 10**6, 123_456])
-def test_rounding_the_texel_size_keeps_the_texels_below_the_limit(room: Room, max_texels: int):
-    floor = world_of([quad((-50, -50, 0), (100, 0, 0), (0, 100, 0))])
+def test_what_no_frame_shows_gets_coarse_texels(room: Room):
+    # The second sheet lies behind the camera.
+    sheets = world_of(
+        [quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), quad((-1, -1, 4), (2, 0, 0), (0, 2, 0))]
+    )
     frames = replace(
         room.frames,
         image_paths=(Path("none"),),
         world_from_camera=look_at(np.array([0, -1e-6, 2.0]), np.zeros(3))[None],
-        intrinsics=np.array([[800.0, 800, 40, 30]]),
+        intrinsics=np.array([[80.0, 80, 40, 30]]),
         resolution=np.array([[80, 60]], np.int32),
     )
-    size = texel_size_from_frames(floor.scene, floor.rays, frames, max_texels)
-    assert 0.8 * max_texels < 100**2 / size**2 / 0.7 <= max_texels
-    assert float(f"{size:.2g}") == size
+    sizes = texel_sizes_from_frames(sheets.scene, sheets.rays, frames, max_texels=10**9)
+    seen, unseen = sizes.of_objects(sheets.scene)
+    assert seen == pytest.approx(2 / 80, rel=0.2)
+    assert unseen == pytest.approx(4 * seen, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 8, 54, 90, 400, 401])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -109,38 +109,74 @@ PADDING = 4
 MAX_SIDE = 16384
 
 
+class TexelSizes(NamedTuple):
+    """What F triangles ask of their textures: side of a texel in metres (F,), and how many pixels
+    of the frames ask for it (F,); where there are none the size is for what nobody sees. A chart
+    has one density: the size that its pixels agree on, else that of its area."""
+
+    side: Float
+    pixels: Float
+
+    @classmethod
+    def even(cls, scene: Scene, side: float) -> TexelSizes:
+        """One size everywhere."""
+        return cls(*np.full((2, len(scene.triangles)), side, np.float32))
+
+    def of_objects(self, scene: Scene) -> list[float]:
+        """Of each object: as its pixels, or else its triangles, agree on the average."""
+        if (self.side == self.side[0]).all():
+            return [float(self.side[0])] * len(scene.objects)
+        area = doubled_areas(scene.points, scene.triangles)
+        return [
+            float(_agreed(self.side[obj.faces], self.pixels[obj.faces], area[obj.faces]))
+            for obj in scene.objects
+        ]
+
+
+def _agreed(side: Float, pixels: Float, area: Double) -> float:
+    """The geometric mean over the pixels that show triangles, or over the area that none shows."""
+    weight = pixels if pixels.any() else area + 1e-30
+    return math.exp(np.average(np.log(side.astype(np.float64)), weights=weight))
+
+
 def charts_of_scene(
-    scene: Scene, given: Sequence[Float | None], texel_size: float
+    scene: Scene, given: Sequence[Float | None], sizes: TexelSizes
 ) -> dict[str, Array]:
     """New charts as ``unwrap`` makes them, but for objects that came with coordinates which are fit
     for it: corner_uv (F, 3, 2), resolution (num_objects, 2).
 
     given  per object (F_i, 3, 2), or None
     """
-    corner_uv, resolution = unwrap(scene, texel_size)
+    corner_uv, resolution = unwrap(scene, sizes)
+    of_objects = sizes.of_objects(scene)
     for i, (obj, uv) in enumerate(zip(scene.objects, given, strict=True)):
         corners = scene.points[scene.triangles[obj.faces]]
-        side = None if uv is None else atlas_side(uv, corners, texel_size)
+        side = None if uv is None else atlas_side(uv, corners, of_objects[i])
         if uv is not None and side is not None:
             corner_uv[obj.faces], resolution[i] = uv, side
             say(f"texture: {obj.identifier} keeps the texture coordinates that it came with")
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 
-def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
+def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """UVs of every object in its own atlas: corner_uv (F, 3, 2) in [0, 1], v up, and the atlas
     size in texels of each object, (num_objects, 2) int32 width, height.
 
-    texel_size is in metres: equal areas of surface get equal numbers of texels on all objects.
     Raises InputRefused when an atlas would be larger than 16,384 texels on a side.
     """
-    _refuse_huge(scene, texel_size)
+    _refuse_huge(scene, sizes.side)
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     result = run_child(
         "usdbrdf.geometry.unwrap:unwrap_objects",
-        {"points": scene.points, "triangles": scene.triangles, "first": first, "count": count},
-        {"texel_size": texel_size},
+        {
+            "points": scene.points,
+            "triangles": scene.triangles,
+            "first": first,
+            "count": count,
+            **sizes._asdict(),
+        },
+        {},
         timeout_s=120 + 2e-3 * len(scene.triangles),
         label="unwrapping the objects",
     )
@@ -148,21 +184,25 @@ def unwrap(scene: Scene, texel_size: float) -> tuple[Float, Int]:
         if max(width, height) > MAX_SIDE:
             raise InputRefused(
                 f"<{obj.prim_path}>: its texture would be {width} x {height} texels (limit "
-                f"{MAX_SIDE}). Choose a larger --texel-size than {texel_size:g} m. [texturing.size]"
+                f"{MAX_SIDE}). Choose a larger --texel-size than {sizes.side.min():g} m. "
+                "[texturing.size]"
             )
     return result["corner_uv"], result["resolution"]
 
 
-def _refuse_huge(scene: Scene, texel_size: float) -> None:
+def _refuse_huge(scene: Scene, side: Float) -> None:
     """Packing what cannot fit takes xatlas minutes; the area alone tells it at once."""
-    area = np.bincount(scene.face_object, doubled_areas(scene.points, scene.triangles) / 2)
-    for obj, square_metres in zip(scene.objects, area, strict=True):
-        side = int(np.ceil(np.sqrt(square_metres) / texel_size))
-        if side > MAX_SIDE:
+    area = doubled_areas(scene.points, scene.triangles) / 2
+    texels = np.bincount(scene.face_object, area / side.astype(np.float64) ** 2)
+    for obj, count, square_metres in zip(
+        scene.objects, texels, np.bincount(scene.face_object, area), strict=True
+    ):
+        across = math.ceil(math.sqrt(count))
+        if across > MAX_SIDE:
             raise InputRefused(
-                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need {side} x {side} texels "
-                f"(limit {MAX_SIDE}). Choose a larger --texel-size than {texel_size:g} m. "
-                "[texturing.size]"
+                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need {across} x {across} "
+                f"texels (limit {MAX_SIDE}). Choose a larger --texel-size than "
+                f"{side[obj.faces].min():g} m. [texturing.size]"
             )
 
 
@@ -176,37 +216,74 @@ def unwrap_objects(
     for i, (first, count) in enumerate(zip(arrays["first"], arrays["count"], strict=True)):
         faces = slice(int(first), int(first + count))
         used, local = np.unique(triangles[faces], return_inverse=True)
-        uv, size = _unwrap_one(
-            points[used], local.reshape(-1, 3).astype(np.uint32), parameters["texel_size"]
-        )
+        sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])
+        uv, size = _unwrap_one(points[used], local.reshape(-1, 3).astype(np.uint32), sizes)
         corner_uv[faces], resolution[i] = uv, size
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 
 def _unwrap_one(
-    points: Float, triangles: npt.NDArray[np.uint32], texel_size: float
+    points: Float, triangles: npt.NDArray[np.uint32], sizes: TexelSizes
 ) -> tuple[Float, tuple[int, int]]:
     import xatlas
 
     low, high = points.min(axis=0), points.max(axis=0)
     extent = float((high - low).max())
     unit = ((points - low) / max(extent, 1e-12)).astype(np.float32)
+    finest = float(sizes.side.min())
     atlas = xatlas.Atlas()
     atlas.add_mesh(unit, triangles)
     options = xatlas.PackOptions()
     options.padding = PADDING
-    options.texels_per_unit = extent / texel_size
+    options.texels_per_unit = extent / finest
     options.bilinear = True
     options.rotate_charts = True
     atlas.generate(xatlas.ChartOptions(), options)
     _, corners, uv = atlas[0]
+    if corners.shape == triangles.shape and (sizes.side != finest).any():
+        atlas, corners, uv = _at_own_densities(atlas, points, triangles, sizes, options)
     width, height = int(atlas.width), int(atlas.height)
     if corners.shape == triangles.shape and np.isfinite(uv).all() and min(width, height) > 0:
         corner_uv = uv[corners]
         corner_uv[..., 1] = 1 - corner_uv[..., 1]
         if corner_uv.min() >= 0 and corner_uv.max() <= 1:
             return corner_uv.astype(np.float32), (width, height)
-    return pack_triangles_singly(points[triangles.astype(np.int64)], texel_size)
+    return pack_triangles_singly(points[triangles.astype(np.int64)], finest)
+
+
+def _at_own_densities(
+    atlas: Any, points: Float, triangles: npt.NDArray[np.uint32], sizes: TexelSizes, options: Any
+) -> tuple[Any, npt.NDArray[np.uint32], Float]:
+    """The charts of an atlas packed again, each at the texel size that its triangles agree on:
+    atlas, corners and uv as xatlas gives them."""
+    import xatlas
+
+    _, corners, uv = atlas[0]
+    chart = np.zeros(len(triangles), np.int64)
+    area = doubled_areas(points, triangles.astype(np.int32))
+    count = atlas.get_mesh_chart_count(0)
+    scale = np.ones(count)
+    for k in range(count):
+        faces = np.asarray(atlas.get_mesh_chart(0, k).faces)
+        chart[faces] = k
+        scale[k] = sizes.side.min() / _agreed(sizes.side[faces], sizes.pixels[faces], area[faces])
+    of_vertex = np.zeros(len(uv), np.int64)
+    of_vertex[corners.reshape(-1)] = np.repeat(chart, 3)
+    texels = uv * np.array([atlas.width, atlas.height], np.float64)
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, of_vertex, texels)
+    np.maximum.at(high, of_vertex, texels)
+    # Side by side: xatlas tells charts apart by where they lie.
+    wide = (high - low)[:, 0] * scale + PADDING
+    start = np.cumsum(wide) - wide
+    placed = (texels - low[of_vertex]) * scale[of_vertex, None]
+    placed[:, 0] += start[of_vertex]
+    packed = xatlas.Atlas()
+    packed.add_uv_mesh(placed.astype(np.float32), corners)
+    options.texels_per_unit = 1.0
+    packed.generate(xatlas.ChartOptions(), options)
+    _, corners, uv = packed[0]
+    return packed, corners, uv
 
 
 def pack_triangles_singly(corners: Float, texel_size: float) -> tuple[Float, tuple[int, int]]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
+
+import numpy as np
 
 from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
 from usdbrdf.asset.layout import Asset
@@ -13,13 +16,14 @@ from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import charts_of_scene
+from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
 from usdbrdf.job.progress import progress, say, warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.texturing.footprints import texel_size_from_frames
+from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
+from usdbrdf.texturing.passes import most_texels
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
@@ -38,19 +42,25 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     def work(run: TaskRun) -> dict[str, Any]:
         scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
-        size = options.texel_size or texel_size_from_frames(scene, rays, frames, options.max_texels)
+        sizes = (
+            TexelSizes.even(scene, options.texel_size)
+            if options.texel_size
+            else texel_sizes_from_frames(
+                scene, rays, frames, options.max_texels or most_texels(options.memory)
+            )
+        )
         given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
-        charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, size))
+        charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, sizes))
         scene = replace(scene, corner_uv=charts["corner_uv"])
         surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)
-        say(
-            f"texture: {len(surface.texels):,} texels of {1000 * size:.3g} mm, {len(frames)} frames"
-        )
+        sides = sizes.of_objects(scene)
+        side = 1000 * float(np.median(sides))
+        say(f"texture: {len(surface.texels):,} texels of {side:.3g} mm, {len(frames)} frames")
         found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
         for doubt in found.doubts():
             warn(doubt)
         writer = MapWriter(run, asset, scene, surface.texels)
-        objects = _write_maps(writer, found, size, options.quantile)
+        objects = _write_maps(writer, found, sides, options.quantile)
         write_texturing_layer(
             run.output(f"layers/{asset.layer('texturing').name}"),
             run.output(f"layers/{asset.uv_layer.name}"),
@@ -61,7 +71,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
         view = overview(scene, rays, frames)
         view.write(run.output("previews/lit.png"), surface.texels, found.lit)
         return {
-            "texel_size": size,
+            "texel_size": float(np.median(sides)),
             "texels": len(surface.texels),
             "measured_fraction": float(found.coverage.measured.mean()),
             "clipped_fraction": float(found.coverage.clipped.mean()),
@@ -73,7 +83,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
 
 
 def _write_maps(
-    writer: MapWriter, found: LitTexture, texel_size: float, quantile: float
+    writer: MapWriter, found: LitTexture, sides: Sequence[float], quantile: float
 ) -> list[TexturedObject]:
     """Every object's pictures, and the record that names them."""
     maps = {
@@ -96,7 +106,7 @@ def _write_maps(
                 identifier=obj.identifier,
                 corner_uv=scene.corner_uv[obj.faces],
                 aovs=writer.write(i, maps),
-                texel_size=texel_size,
+                texel_size=sides[i],
                 seen_fraction=float(measured[own].mean()),
                 clipped_fraction=float(clipped[own].mean()),
                 resolution=(width, height),

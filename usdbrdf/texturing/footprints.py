@@ -3,7 +3,7 @@ pixels took restored, and the texel size that suits a capture."""
 
 from __future__ import annotations
 
-from decimal import ROUND_CEILING, Context
+import math
 
 import numpy as np
 from numba import prange
@@ -11,14 +11,16 @@ from scipy import ndimage
 
 from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.unwrap import TexelSizes
+from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import doubled_areas
+from usdbrdf.model.mesh import doubled_areas, face_normals
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.texturing.samples import Projection, project
+from usdbrdf.texturing.samples import MIN_COSINE, Projection, project
 from usdbrdf.transport.rays import RayScene
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
@@ -164,42 +166,48 @@ def restored(
     return np.where(surrounded[:, None], smooth + 2 * share[:, None] * detail, values)
 
 
-_RAYS_PER_FRAME = 600
 _PACKING = calibration.number("texel_size.packing")
-_DIGITS = 2
+_UNSEEN = calibration.number("texel_size.unseen")
+# Pixels of a frame's width that are looked at.
+_MOST_ACROSS = 1024
 
 
-def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_texels: int) -> float:
-    """Median pixel footprint in metres, sqrt(area that one pixel covers), over all frames; larger
-    if the surface would otherwise need more than ``max_texels``. Two significant digits, rounded
-    up where ``max_texels`` decides.
+def texel_sizes_from_frames(
+    scene: Scene, rays: RayScene, frames: Frames, max_texels: int
+) -> TexelSizes:
+    """What the frames show of each triangle: the mean side, by logarithms, of what their pixels
+    cover of it (sqrt of the area). What no frame shows gets coarse texels. All are larger where the
+    surface would need more than ``max_texels`` otherwise.
 
     Raises InputRefused if no camera ray meets the mesh.
     """
-    footprints = []
+    count = len(scene.triangles)
+    normals = face_normals(scene.points, scene.triangles)
+    logarithm, pixels = np.zeros(count), np.zeros(count)
     for i in range(len(frames)):
         camera = frames.camera(i)
-        stride = max(1, int(np.sqrt(camera.width * camera.height / _RAYS_PER_FRAME)))
-        origins, directions = camera.rays(camera.pixels(stride))
-        hits = rays.closest(origins, directions)
-        met = hits.face >= 0
-        corners = scene.points[scene.triangles[hits.face[met]]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        cosine = np.abs(np.einsum("rd,rd->r", normal, directions[met]))
-        pixel = hits.distance[met] / np.sqrt(frames.intrinsics[i, 0] * frames.intrinsics[i, 1])
-        footprints.append(pixel / np.sqrt(np.maximum(cosine, 0.1)))
-    footprint = np.concatenate(footprints)
-    if not len(footprint):
+        small = camera.at_width(min(camera.width, _MOST_ACROSS))
+        face, point = (found.reshape(-1, *found.shape[2:]) for found in visible_faces(rays, small))
+        way = (point - camera.eye)[face >= 0]
+        face = face[face >= 0]
+        distance = np.linalg.norm(way, axis=1)
+        cosine = np.abs((way * normals[face]).sum(axis=1)) / distance
+        size = distance / math.sqrt(camera.intrinsics[0] * camera.intrinsics[1])
+        size /= np.sqrt(np.maximum(cosine, MIN_COSINE))
+        logarithm += np.bincount(face, np.log(size), count)
+        pixels += np.bincount(face, minlength=count)
+    if not pixels.any():
         raise InputRefused(
             "no camera ray meets the mesh, so no texel size can be chosen. Check that poses and "
             "mesh share one frame of reference and unit. [texturing.texel-size]"
         )
-    area = doubled_areas(scene.points, scene.triangles).sum() / 2
-    size = float(f"{np.median(footprint):.{_DIGITS}g}")
-    least = float(np.sqrt(area / (_PACKING * max_texels)))
-    return size if size >= least else _rounded_up(least)
-
-
-def _rounded_up(size: float) -> float:
-    return float(Context(prec=_DIGITS, rounding=ROUND_CEILING).create_decimal_from_float(size))
+    of_object = [
+        np.bincount(scene.face_object, values, len(scene.objects)) for values in (logarithm, pixels)
+    ]
+    anywhere = logarithm.sum() / pixels.sum()
+    own = np.where(of_object[1] > 0, of_object[0] / np.maximum(of_object[1], 1), anywhere)
+    coarse = own[scene.face_object] + math.log(_UNSEEN)
+    side = np.exp(np.where(pixels > 0, logarithm / np.maximum(pixels, 1), coarse))
+    area = doubled_areas(scene.points, scene.triangles) / 2
+    side *= math.sqrt(max(1.0, float((area / side**2).sum()) / (_PACKING * max_texels)))
+    return TexelSizes(side.astype(np.float32), pixels.astype(np.float32))

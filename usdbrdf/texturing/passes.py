@@ -24,6 +24,8 @@ _SHARE = 0.75
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
+# Of a texel in the task that needs most: its place, its maps, and what these are made from.
+_PER_TEXEL = 800
 _PROCESS = GIB // 2
 # A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
 _SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
@@ -99,6 +101,13 @@ def groups_of_texels(
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
         )
     return _groups(len(texels), max(smallest, int((limit - held) / need.grouped), 1))
+
+
+def most_texels(memory: float | None) -> int:
+    """How many texels a scene may have, so that the tasks hold them in ``memory`` GiB (None: three
+    quarters of the machine's)."""
+    limit = memory * GIB if memory else _SHARE * machine_bytes()
+    return max(1, int((limit - _PROCESS) / _PER_TEXEL))
 
 
 def smallest_groups(texels: Texels) -> list[slice]:
