@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.surroundings import RESOLUTION, lat_long_uv
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.kernel import kernel
@@ -148,11 +149,15 @@ def charts_of_scene(
     given  per object (F_i, 3, 2), or None
     """
     corner_uv, resolution = unwrap(scene, sizes)
+    for far in np.flatnonzero(scene.is_far):
+        faces = scene.objects[far].faces
+        corner_uv[faces] = lat_long_uv(scene.points[scene.triangles[faces]])
+        resolution[far] = RESOLUTION
     of_objects = sizes.of_objects(scene)
     for i, (obj, uv) in enumerate(zip(scene.objects, given, strict=True)):
         corners = scene.points[scene.triangles[obj.faces]]
         side = None if uv is None else atlas_side(uv, corners, of_objects[i])
-        if uv is not None and side is not None:
+        if uv is not None and side is not None and not obj.far:
             corner_uv[obj.faces], resolution[i] = uv, side
             say(f"texture: {obj.identifier} keeps the texture coordinates that it came with")
     return {"corner_uv": corner_uv, "resolution": resolution}
@@ -166,7 +171,7 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """
     _refuse_huge(scene, sizes.side)
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
-    count = np.array([obj.num_faces for obj in scene.objects], np.int64)
+    count = np.array([obj.num_faces * (not obj.far) for obj in scene.objects], np.int64)
     result = run_child(
         "usdbrdf.geometry.unwrap:unwrap_objects",
         {
@@ -198,7 +203,7 @@ def _refuse_huge(scene: Scene, side: Float) -> None:
         scene.objects, texels, np.bincount(scene.face_object, area), strict=True
     ):
         across = math.ceil(math.sqrt(count))
-        if across > MAX_SIDE:
+        if across > MAX_SIDE and not obj.far:
             raise InputRefused(
                 f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need {across} x {across} "
                 f"texels (limit {MAX_SIDE}). Choose a larger --texel-size than "
@@ -214,6 +219,8 @@ def unwrap_objects(
     corner_uv = np.zeros((len(triangles), 3, 2), np.float32)
     resolution = np.zeros((len(arrays["first"]), 2), np.int32)
     for i, (first, count) in enumerate(zip(arrays["first"], arrays["count"], strict=True)):
+        if not count:
+            continue
         faces = slice(int(first), int(first + count))
         used, local = np.unique(triangles[faces], return_inverse=True)
         sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])

@@ -29,7 +29,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
-from usdbrdf.shading.shaded import albedo_map, denoised_irradiance, tiles_of_patches
+from usdbrdf.shading.shaded import albedo_map, at_texels, denoised_irradiance, tiles_of_patches
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
@@ -84,6 +84,8 @@ def _change(
     lights = lights_from_radiance(lit.scene, texels, np.abs(radiance))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED)
     order, patch = tiles_of_texels(texels)
+    near = ~lit.scene.is_far[texels.object_index()[order]]
+    order, patch = order[near], patch[near]
 
     def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
         index = order[part]
@@ -105,8 +107,7 @@ def _change(
             progress(tiles, total=len(tiles), label="fit: shade", unit="tiles")
         )
     ]
-    back = np.argsort(order)
-    return np.asarray(np.concatenate(changes)[back], np.float32)
+    return at_texels(order, np.concatenate(changes).astype(np.float32), len(texels))
 
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
@@ -178,6 +179,7 @@ def refined_light(
     """
     found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
     emissive, observed = before.emissive, before.coverage.observed
+    far = lit.scene.is_far[texels.object_index()]
     known = np.isfinite(found.mean[:, 0]) & ~emissive
     restored_light = _restored(texels, found, known, _level(before.lit))
     diffuse = np.where(emissive[:, None], before.emission, restored_light)
@@ -188,7 +190,7 @@ def refined_light(
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
         """Base colour, and L_d with what it reflects where nobody looked."""
-        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive)
+        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive, far)
         return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
 
     _, diffuse = reflected(diffuse, before.irradiance)
@@ -257,6 +259,7 @@ def _observed(
 ) -> MeanState:
     """Some texels in all frames, going on from the last saved state of an interrupted run."""
     owner, level, samples = texels.object_index(), _level(before.lit), before.samples
+    far = lit.scene.is_far[owner]
     name = f"refined-{part.start}-{part.stop}"
     saved = run.latest(name)
     start, observed = 0, MeanState.empty(part.stop - part.start)
@@ -269,6 +272,7 @@ def _observed(
     bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):
         taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
+        taken &= ~far[some.texel]
         texel, radiance = some.texel[taken], some.radiance[taken]
         camera = frames.camera(some.frame)
         specular = np.empty_like(radiance)

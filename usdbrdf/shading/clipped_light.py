@@ -159,7 +159,8 @@ def estimate_clipped_light(
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
+        measured = coverage.measured & ~surface.is_far
+        chosen, segment = _chosen(surface.texels, groups, measured, seed)
         if not len(chosen):
             return dict(vars(nothing_known(len(groups))))
         evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)

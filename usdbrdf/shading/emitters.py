@@ -36,19 +36,22 @@ def find_emitters(
     irradiance: Float,
     seen: Bool,
     clipped: Bool,
+    far: Bool,
     unknown_lamp: float = 0.0,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
-    seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound.
+    seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound; far (T,): it
+    shows the surroundings, which shine, seen or not.
     unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that. S is
     then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
     """
     light = radiance.mean(axis=1)
     shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
-    shines &= light > np.median(light)
+    shines &= light > np.median(light[~far])
     shines &= clipped | (light >= unknown_lamp)
+    shines |= far
     known = seen | clipped
     emissive = np.zeros(len(texels), np.bool_)
     num_objects = len(texels.resolution)

@@ -45,15 +45,15 @@ def albedo_from_irradiance(
 
 
 def albedo_map(
-    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool
+    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool, far: Bool
 ) -> tuple[Float, float]:
     """(albedo (T, 3) in [0, 1], share of the known, non-emissive texels over 1).
 
     radiance, irradiance (T, 3); known (T,): the texel's radiance is not filled in, and its albedo
-    need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
-    is known are NEUTRAL.
+    need not be; emissive (T,): it shines by itself, and its albedo is 0; far (T,): it shows the
+    surroundings. Objects of which nothing is known are NEUTRAL.
     """
-    floor = _DARK * float(np.median(irradiance.mean(axis=1)))
+    floor = _DARK * float(np.median(irradiance[~far].mean(axis=1)))
     albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))
     reflects = known & ~emissive
     over = (albedo > 1).any(axis=1) & reflects & lit_enough
@@ -81,6 +81,8 @@ def trace_irradiance(
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
     order, patch = tiles_of_texels(texels)
+    near = ~surface.is_far[order]
+    order, patch = order[near], patch[near]
     tiles = tiles_of_patches(patch)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
 
@@ -97,8 +99,19 @@ def trace_irradiance(
         done = run.checkpoint(f"tile-{number}", partial(tile, part))
         for name, values in done.items():
             parts.setdefault(name, []).append(values)
-    back = np.argsort(order)
-    return Irradiance(**{name: np.concatenate(values)[back] for name, values in parts.items()})
+    return Irradiance(
+        **{
+            name: at_texels(order, np.concatenate(found), len(texels))
+            for name, found in parts.items()
+        }
+    )
+
+
+def at_texels(order: Array, values: Array, count: int) -> Array:
+    """(count, ...): the values at the texels ``order``, zero elsewhere."""
+    everywhere = np.zeros((count, *values.shape[1:]), values.dtype)
+    everywhere[order] = values
+    return everywhere
 
 
 def tiles_of_patches(patch: Array) -> list[slice]:
@@ -231,10 +244,11 @@ def shade_surface(
         irradiance,
         coverage.measured,
         light.may_shine(coverage.clipped),
+        surface.is_far,
         light.least_of_lamps(),
     )
     albedo, over_one = albedo_map(
-        surface.texels, light.lit, irradiance, coverage.measured, emitters.emissive
+        surface.texels, light.lit, irradiance, coverage.measured, emitters.emissive, surface.is_far
     )
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / np.maximum(
         traced.mean.mean(axis=1), 1e-30

@@ -31,7 +31,12 @@ class TexturedScene:
     @cached_property
     def diagonal_m(self) -> float:
         """Of the scene's bounding box, metres."""
-        return float(np.linalg.norm(np.ptp(self.scene.points, axis=0)))
+        return self.scene.diagonal_m
+
+    @cached_property
+    def is_far(self) -> Bool:
+        """(T,): the texel shows the surroundings."""
+        return self.scene.is_far[self.texels.object_index()]
 
     def texture(self, values: Float) -> SurfaceTexture:
         """Per-texel values (T, 3) as a texture that rays can look up."""
