@@ -26,9 +26,9 @@ from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import to_display_srgb8
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.job.stamp import hash_of_files
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),

@@ -71,7 +71,7 @@ IMPORTERS: dict[str, set[str]] = {
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "drjit": {"relighting/"},
     "embreex": {"transport/rays.py"},
-    "filelock": {"job/lock.py"},
+    "filelock": {"job/ownership.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
     "llvmlite": {"kernel_cache.py", "transport/"},
     "matplotlib": {"evaluation/"},

@@ -24,8 +24,7 @@ from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.errors import OwnershipConflict
-from usdbrdf.job.lock import is_held
-from usdbrdf.job.ownership import edited_files, owned_folder
+from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult

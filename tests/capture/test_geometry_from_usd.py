@@ -85,7 +85,8 @@ def test_units_axis_and_options(tmp_path):
     stage.Save()
     found = meshes_from_usd(tmp_path / "a.usdc")
     assert (found.up_axis, found.meters_per_unit) == ("Y", 0.01)
-    assert (found.labels, found.object_prims, found.warnings) == (("m",), ("m",), ())
+    assert [each.label for each in found.objects] == ["m"]
+    assert (found.object_prims, found.warnings) == (("m",), ())
 
 
 def test_polygons_normals_and_handedness(tmp_path):
@@ -235,7 +236,8 @@ def test_a_reference_may_lead_into_the_capture_but_not_beyond(tmp_path):
     stage.Save()
     with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
         meshes_from_usd(tmp_path / "geo" / "a.usda")
-    assert meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,)).labels == ("seat",)
+    found = meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,))
+    assert [each.label for each in found.objects] == ["seat"]
 
 
 @pytest.mark.parametrize("content", [b"", b"#usda 1.0\ndef Xform {{{", b"PXR-USDC" + b"\xff" * 90])

@@ -23,7 +23,7 @@ from usdbrdf.asset.readers.objects import read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import read_frames
 from usdbrdf.files.images import read_exr, write_exr
-from usdbrdf.job import checkpoints
+from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
@@ -370,8 +370,8 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
             if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoints, "_SAVE_AFTER", 0.0)
-    monkeypatch.setattr(checkpoints, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
     monkeypatch.setattr(refine, "read_frames", read)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):

@@ -23,9 +23,8 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import Scene, SceneObject
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene
 from usdbrdf.transport.rays import RayScene

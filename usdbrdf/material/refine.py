@@ -26,8 +26,7 @@ from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.shaded import albedo_map, denoised_irradiance, tiles_of_patches
 from usdbrdf.texturing.footprints import footprints, restored, widest

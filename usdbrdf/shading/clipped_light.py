@@ -17,8 +17,7 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,

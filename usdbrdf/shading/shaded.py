@@ -14,8 +14,7 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.emitters import Emitters, find_emitters

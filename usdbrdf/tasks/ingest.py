@@ -13,9 +13,9 @@ from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn
+from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task

@@ -13,8 +13,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames

@@ -66,7 +66,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
             options,
             findings,
             capture_root=path,
-            meters_per_unit=options.meters_per_unit or 1.0,
         ),
         options,
         findings,

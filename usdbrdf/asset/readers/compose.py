@@ -14,9 +14,9 @@ from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
+from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.model.arrays import Array
 
 _MAX_LENGTH = 300
