@@ -32,7 +32,7 @@ from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
-from usdbrdf.untrusted.usd_files import meshes_from_usd
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
 _MAX_OBJECTS = 65_535
 
@@ -151,9 +151,6 @@ def objects_with_faces(
     return renumbered.astype(np.int32), objects
 
 
-USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
-
-
 def geometry_from_usd(
     path: Path, options: IngestOptions, findings: Findings, *, capture_root: Path
 ) -> ScanGeometry:
@@ -168,8 +165,7 @@ def geometry_from_usd(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
     found = meshes_from_usd(path, allow=(capture_root, *options.allow_outside))
-    for sentence in found.warnings:
-        findings.warn(sentence)
+    findings.warnings += found.warnings
     mesh = found.mesh
     missing = np.isnan(mesh.corner_normals[:, 0, 0])
     if missing.any():

@@ -1,11 +1,15 @@
-"""JSON without its traps: finite numbers, no key twice, bounded size and depth."""
+"""Records in files: JSON without its traps (finite numbers, no key twice, bounded size and depth),
+and named arrays as an uncompressed .npz without pickles and with fixed bytes.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
-from collections.abc import Callable, Collection
+import zipfile
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import write_text_atomic
+from usdbrdf.model.arrays import Array
 
 # Not msgspec: it keeps the last of two equal keys without a word, takes no NaN even where the
 # caller is to judge it, and names the byte of a fault, not its line.
@@ -186,3 +191,26 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} is not a JSON type")
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write arrays; object arrays raise ValueError. (np.savez would not take the key "file".)"""
+    with path.open("wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for key, array in arrays.items():
+            member = zipfile.ZipInfo(f"{key}.npy")  # its date is 1980, so equal arrays, equal bytes
+            with archive.open(member, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def load_arrays(path: Path) -> dict[str, Array]:
+    """Read all arrays of a file; a damaged one or one that holds pickles is refused."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise InputRefused(
+            f"{path}: not a readable array file ({error}); pickled data is refused. Write it "
+            "again. [arrays.damaged]"
+        ) from error

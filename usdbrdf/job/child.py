@@ -30,9 +30,8 @@ from typing import Any
 
 from usdbrdf import errors
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import environment_failures
-from usdbrdf.files.documents import json_text
+from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
 
 PREFIX = "usdbrdf-scratch-"
@@ -96,13 +95,12 @@ def run_child(
     *,
     memory_limit_bytes: int | None = None,
 ) -> dict[str, Array]:
-    """Call ``function`` ("package.module:name") as f(arrays, parameters) in a child process.
+    """The arrays that ``function`` ("package.module:name") returns, called as f(arrays, parameters)
+    in a child process; parameters must be JSON.
 
-    arrays, parameters   what it gets; parameters must be JSON
     timeout_s            wall time after which it is killed
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
-    returns              the dictionary of arrays that it returned
 
     A UsdBrdfError raised there is raised here with its class. Death by a signal is an
     InputRefused; running out of time or memory, SIGKILL and what cannot be imported there are

@@ -23,7 +23,6 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import (
     environment_failures,
     flush_folder,
@@ -32,7 +31,7 @@ from usdbrdf.files.atomic import (
     sha256_of,
     temporary_beside,
 )
-from usdbrdf.files.documents import json_text
+from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.files.paths import inside
 from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.stamp import (

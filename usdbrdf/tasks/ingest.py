@@ -11,7 +11,6 @@ from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pendi
 from usdbrdf.asset.layers.scan_layer import write_scan_layer
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn
@@ -19,7 +18,7 @@ from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.untrusted.usd_files import layers_of_usd
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
 def ingest(

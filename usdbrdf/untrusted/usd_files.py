@@ -31,7 +31,7 @@ from usdbrdf.model.mesh import (
 )
 from usdbrdf.untrusted.bounds import LIMITS, read_in_child
 
-_LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
+USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
 _MAX_LAYERS = 1000
 # What fills the sky or lies below an atom is no scan's unit.
 _MIN_UNIT, _MAX_UNIT = 1e-9, 1e9
@@ -171,7 +171,7 @@ def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
             found = UsdUtils.ExtractExternalReferences(str(layer))
         for reference in sorted({reference for kind in found for reference in kind if reference}):
             target = _target(layer, reference, allowed)
-            if target.suffix.lower() in _LAYER_SUFFIXES and target.is_file():
+            if target.suffix.lower() in USD_SUFFIXES and target.is_file():
                 waiting.append(target)
     return seen
 
@@ -349,14 +349,8 @@ def _authored_normals(
     else:
         values, interpolation = mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation()
     normals = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
-    tokens = UsdGeom.Tokens
-    expected = {
-        tokens.constant: 1,
-        tokens.uniform: num_faces,
-        tokens.vertex: num_points,
-        tokens.varying: num_points,
-        tokens.faceVarying: num_corners,
-    }
+    expected = {"constant": 1, "uniform": num_faces, "vertex": num_points, "varying": num_points}
+    expected["faceVarying"] = num_corners
     if len(normals) != expected.get(interpolation, -1):
         return None
     return np.asarray(normals[fans.element_of_corner(interpolation)], np.float64)
