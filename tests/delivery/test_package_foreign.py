@@ -17,7 +17,7 @@ from usdbrdf.delivery.package import package
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_exr, read_radiance
 from usdbrdf.options import PackageOptions
-from usdbrdf.validation.standard import standard_findings
+from usdbrdf.validation.validate import standard_findings
 
 LAMP = "/room/prop/lamp"
 TIME = Usd.TimeCode.EarliestTime()

@@ -19,7 +19,7 @@ from usdbrdf.delivery.package import package
 from usdbrdf.delivery.packaged_files import encoded_data, size_within, texture_uses
 from usdbrdf.files.images import image_size, write_exr
 from usdbrdf.options import PackageOptions
-from usdbrdf.validation.standard import standard_findings
+from usdbrdf.validation.validate import standard_findings
 
 ARKIT_CHECK = """
 import json, sys

@@ -10,8 +10,7 @@ from tests.fault_injection import inject
 from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
 from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.validation.cure_layer import write_cures
-from usdbrdf.validation.standard import open_or_finding
-from usdbrdf.validation.validate import own_findings
+from usdbrdf.validation.validate import open_or_finding, own_findings
 
 CURABLE = ("CameraExposure", "SpecularColor", "LobeMatchesFit", "LookSelection", "EmitterAlbedo")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,8 @@ from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Fault, Finding, Rule, finding_of
-from usdbrdf.validation.standard import open_or_finding
-from usdbrdf.validation.validate import RULES
+from usdbrdf.validation.rule import AssetStage, Cure, Finding, Site, finding_of
+from usdbrdf.validation.validate import RULES, open_or_finding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,18 +48,22 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
         stage.SetEditTarget(Usd.EditTarget(cures))
         # In words before any cure: it may change which layer's opinion wins.
-        before = [(rule, fault, finding_of(rule, fault)) for rule, fault in _curable(stage)]
-        applied = [
-            finding
-            for rule, fault, finding in before
-            if rule.cure is not None and rule.cure.apply(fault.site)
-        ]
-        after = {_complaint(finding_of(rule, fault)) for rule, fault in _curable(stage)}
-        cured = tuple(f for f in dict.fromkeys(applied) if _complaint(f) not in after)
+        before = list(_curable(stage))
+        applied = dict.fromkeys(found for cure, site, found in before if cure.apply(site))
+        after = {_complaint(found) for _, _, found in _curable(stage)}
+        cured = tuple(found for found in applied if _complaint(found) not in after)
         if cured:
             cures.Save()
             _publish(written, path)
     return Cured(layer=path, findings=cured)
+
+
+def _curable(stage: Usd.Stage) -> Iterator[tuple[Cure, Site, Finding]]:
+    scene = AssetStage(stage)
+    for rule in RULES:
+        if rule.cure:
+            for fault in rule.check(scene):
+                yield rule.cure, fault.site, finding_of(rule, fault)
 
 
 def _complaint(finding: Finding) -> tuple[str, str, str]:
@@ -102,8 +105,3 @@ def _taken(path: Path) -> UsageError:
         f"{path}: the file exists, and cures never go into a layer that somebody wrote. Name a "
         "new file. [fix.exists]"
     )
-
-
-def _curable(stage: Usd.Stage) -> list[tuple[Rule, Fault]]:
-    scene = AssetStage(stage)
-    return [(rule, fault) for rule in RULES if rule.cure for fault in rule.check(scene)]
