@@ -162,8 +162,8 @@ def missing_texture(scene: AssetStage) -> Iterator[Fault]:
     texture that does not.
 
     Run usdbrdf convert again, which makes missing textures anew; or restore the file."""
-    for file, sites in sorted(_missing(scene).items()):
-        if not any(_of_camera(scene, site) for site in sites):
+    for file, sites, cameras in _missing(scene):
+        if not cameras:
             more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
             yield Fault(sites[0], f"@{file}@ does not exist.{more}")
 
@@ -176,8 +176,7 @@ def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
     Put the capture back where it was; ignore it where the asset is only shown."""
     # Each file once, and one fault for all files that an attribute is the first to name.
     gone: dict[Site, list[Path]] = defaultdict(list)
-    for file, sites in sorted(_missing(scene).items()):
-        cameras = [site for site in sites if _of_camera(scene, site)]
+    for file, _, cameras in _missing(scene):
         if cameras:
             gone[cameras[0]].append(file)
     for site, files in gone.items():
@@ -185,12 +184,9 @@ def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
         yield Fault(site, f"@{files[0]}@ does not exist.{more}")
 
 
-def _of_camera(scene: AssetStage, site: Site) -> bool:
-    return isinstance(site, Usd.Attribute) and site.GetPrim() in scene.cameras
-
-
-def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
-    """Files that are not there, and where the composed stage, or a variant, names them."""
+def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site], list[Site]]]:
+    """Files that are not there, where the composed stage, or a variant, names them, and which of
+    these places are attributes of a capture camera."""
     missing: dict[Path, list[Site]] = defaultdict(list)
     for prim in scene.stage.Traverse() if scene.asset else ():
         for attribute in prim.GetAuthoredAttributes():
@@ -206,7 +202,9 @@ def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
         uncomposed = path.isEmpty or path.ContainsPrimVariantSelection()
         if uncomposed and not _URI.match(value) and file not in missing and not _is_there(file):
             missing[file].append(layer)
-    return missing
+    for file, sites in sorted(missing.items()):
+        named = [site for site in sites if isinstance(site, Usd.Attribute)]
+        yield file, sites, [site for site in named if site.GetPrim() in scene.cameras]
 
 
 def _is_there(file: Path) -> bool:

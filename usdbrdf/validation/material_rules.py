@@ -68,10 +68,9 @@ def specular_color(scene: AssetStage) -> Iterator[Fault]:
     reflectance is to be replaced."""
     for shader in _shaders(scene, "UsdPreviewSurface"):
         colour = shader.GetInput("specularColor")
-        authored_here = colour and (
-            colour.GetAttr().HasAuthoredValue() or colour.HasConnectedSource()
-        )
-        if authored_here and not _input_value(shader, "useSpecularWorkflow"):
+        if not colour or _input_value(shader, "useSpecularWorkflow"):
+            continue
+        if colour.GetAttr().HasAuthoredValue() or colour.HasConnectedSource():
             yield Fault(
                 colour.GetAttr(),
                 "specularColor is authored, but useSpecularWorkflow is 0: some "

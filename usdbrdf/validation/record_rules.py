@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -74,21 +73,19 @@ def camera_lens(scene: AssetStage) -> Iterator[Fault]:
             if pinhole is None or size is None or not all([*list(size), *pinhole[:2]]):
                 yield Fault(prim, "it states no pinhole, or no size of the pictures.")
                 break
-            if None in lens or not _same_view(lens, lens_from_pinhole(pinhole, size, metres)):
+            expected = lens_from_pinhole(pinhole, size, metres)
+            same = None not in lens and lens[1] and expected[1]
+            if same:
+                # Lengths mean nothing by themselves: only in widths of the aperture.
+                ratios = np.array(lens, float) / lens[1] - np.array(expected, float) / expected[1]
+                same = np.abs(ratios).max() < _TOLERANCE
+            if not same:
                 yield Fault(
                     prim,
                     f"focal length and apertures at time {time} are not those of "
                     "usdBrdf:capture:pinhole.",
                 )
                 break
-
-
-def _same_view(lens: Sequence[float], expected: Sequence[float]) -> bool:
-    """Lengths mean nothing by themselves: only in widths of the aperture."""
-    if not lens[1] or not expected[1]:
-        return False
-    ratios = np.array(lens, float) / lens[1] - np.array(expected, float) / expected[1]
-    return bool(np.abs(ratios).max() < _TOLERANCE)
 
 
 def _times(prim: Usd.Prim, names: Sequence[str]) -> list[Usd.TimeCode]:
@@ -125,15 +122,6 @@ def texture_coordinates(scene: AssetStage) -> Iterator[Fault]:
             yield Fault(item, f"primvars:st goes from {span}; the maps from 0 to 1.")
 
 
-class AuthoredFact(NamedTuple):
-    """An authored attribute of ours; ``fact`` is None for one that the table does not have, and
-    ``instance`` "" unless its schema is applied several times."""
-
-    attribute: Usd.Attribute
-    fact: Fact | None
-    instance: str
-
-
 @rule(Severity.ERROR)
 def fit_range(scene: AssetStage) -> Iterator[Fault]:
     """phi and psi lie between 0 and 1, and their errors are finite and not negative. Other values
@@ -168,8 +156,9 @@ def _out_of_range(scene: AssetStage, about: Callable[[Fact], bool]) -> Iterator[
             yield Fault(attribute, f"the value is {shown}, outside {limits}.")
 
 
-def _authored_facts(prims: Sequence[Usd.Prim]) -> Iterator[AuthoredFact]:
-    """The attributes of prims in our namespace, each with its row of the table."""
+def _authored_facts(prims: Sequence[Usd.Prim]) -> Iterator[tuple[Usd.Attribute, Fact | None, str]]:
+    """The attributes of prims in our namespace, each with its row of the table, or None; and with
+    the instance, "" unless its schema is applied several times."""
     ours = (prim.GetAuthoredPropertiesInNamespace("usdBrdf") for prim in prims)
     for found in chain.from_iterable(ours):
         if isinstance(found, Usd.Attribute) and found.HasAuthoredValue():
@@ -178,7 +167,7 @@ def _authored_facts(prims: Sequence[Usd.Prim]) -> Iterator[AuthoredFact]:
             parts = name.split(":")
             general = ":".join([*parts[:2], INSTANCE, *parts[3:]])
             instance = parts[2] if name not in FACTS and general in FACTS else ""
-            yield AuthoredFact(found, FACTS.get(general if instance else name), instance)
+            yield found, FACTS.get(general if instance else name), instance
 
 
 @rule(Severity.ERROR)

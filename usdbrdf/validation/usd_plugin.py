@@ -53,10 +53,10 @@ def register_validators() -> None:
     registry = UsdValidation.ValidationRegistry()
     names = [f"{PLUGIN}:{rule.name}" for rule in RULES]
     for name, rule in zip(names, RULES, strict=True):
-        fixers = [_fixer(rule.cure, rule.name)] if rule.cure else []
-        # Earlier versions of USD have no such argument.
-        taken = [fixers] if Usd.GetVersion() >= _PYTHON_FIXERS else []
-        registry.RegisterPluginStageValidator(name, _stage_task(rule), *taken)
+        fixers = []
+        if Usd.GetVersion() >= _PYTHON_FIXERS:
+            fixers.append([_fixer(rule.cure, rule.name)] if rule.cure else [])
+        registry.RegisterPluginStageValidator(name, _stage_task(rule), *fixers)
     validators = registry.GetOrLoadValidatorsByName(names)
     registry.RegisterPluginValidatorSuite(f"{PLUGIN}:{SUITE}", validators)
 
@@ -79,7 +79,11 @@ def _stage_task(rule: Rule) -> Any:
 def _fixer(cure: Cure, error_name: str) -> UsdValidation.ValidationFixer:
     def can_apply(error: Any, target: Usd.EditTarget, _time: Any) -> bool:
         sites = [site for site in error.GetSites() if site.IsPrim() or site.IsProperty()]
-        return bool(sites) and all(_is_free(target.GetLayer(), site.GetStage()) for site in sites)
+        # What the pipeline writes is lost with the next run, and the root layer, a stage's edit
+        # target unless one says otherwise, is to stay as it was made.
+        scenes = [AssetStage(site.GetStage()) for site in sites]
+        kept = [layer for scene in scenes for layer in (*scene.own_layers, scene.asset_root)]
+        return bool(sites) and target.GetLayer() not in kept
 
     def apply(error: Any, target: Usd.EditTarget, _time: Any) -> bool:
         if not can_apply(error, target, _time):
@@ -99,13 +103,6 @@ def _fixer(cure: Cure, error_name: str) -> UsdValidation.ValidationFixer:
         keywords=[],
         errorName=error_name,
     )
-
-
-def _is_free(layer: Sdf.Layer, stage: Usd.Stage) -> bool:
-    """Whether cures may go there: what the pipeline writes is lost with the next run, and the root
-    layer, a stage's edit target unless one says otherwise, is to stay as it was made."""
-    scene = AssetStage(stage)
-    return layer not in (*scene.own_layers, scene.asset_root)
 
 
 register_validators()

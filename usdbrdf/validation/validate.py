@@ -1,18 +1,34 @@
 """All rules of ours and the checks of OpenUSD itself: does a stage open and compose, what do both
-find, and what is looked for."""
+find, what is looked for; and cures of what they find, written as a new layer that an artist may
+add, or not."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
+from usdbrdf.asset.header import Provenance, new_layer, read_header
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.validation import file_rules, material_rules, record_rules, variant_rules
-from usdbrdf.validation.rule import PREFIX, AssetStage, Finding, Rule, Severity, Site, finding_of
+from usdbrdf.validation.rule import (
+    PREFIX,
+    AssetStage,
+    Cure,
+    Finding,
+    Rule,
+    Severity,
+    Site,
+    finding_of,
+)
 
 # In the order of the modules, and there in that of the text.
 RULES: tuple[Rule, ...] = tuple(
@@ -113,7 +129,16 @@ def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
             errors = context.Validate(stage)
     except Tf.ErrorException as failure:
         # A validator opened a layer itself, and the stage's own open had passed over it.
-        yield from _unreadable(stage) or [_not_opened(stage.GetRootLayer().realPath, failure)]
+        unreadable = {}
+        for layer in stage.GetUsedLayers():
+            for path in layer.GetCompositionAssetDependencies():
+                try:
+                    Sdf.Layer.FindOrOpenRelativeToLayer(layer, path)
+                except Tf.ErrorException as refusal:
+                    file = layer.ComputeAbsolutePath(path)
+                    unreadable[file] = _not_opened(file, refusal)
+        root = stage.GetRootLayer().realPath
+        yield from [unreadable[file] for file in sorted(unreadable)] or [_not_opened(root, failure)]
         return
     for error in errors:
         if not _is_materialx_unknown(error):
@@ -139,19 +164,6 @@ def _not_opened(file: str, error: Tf.ErrorException) -> Finding:
     return Finding(
         severity=Severity.ERROR, site="</>", layer=f"@{file}@", message=message, rule=OPEN
     )
-
-
-def _unreadable(stage: Usd.Stage) -> list[Finding]:
-    """The layers that those of the stage name, and that USD cannot read."""
-    found = {}
-    for layer in stage.GetUsedLayers():
-        for path in layer.GetCompositionAssetDependencies():
-            try:
-                Sdf.Layer.FindOrOpenRelativeToLayer(layer, path)
-            except Tf.ErrorException as error:
-                file = layer.ComputeAbsolutePath(path)
-                found[file] = _not_opened(file, error)
-    return [finding for _, finding in sorted(found.items())]
 
 
 def _built_in() -> list[UsdValidation.ValidatorMetadata]:
@@ -184,3 +196,83 @@ def _no_warnings() -> Iterator[None]:
         finally:
             if trap is not None:
                 trap.ClearWarnings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cured:
+    """Which findings the layer cures; it is written only if there are any."""
+
+    layer: Path
+    findings: tuple[Finding, ...]
+
+
+def write_cures(asset: Asset, layer: Path) -> Cured:
+    """Write ``layer``, a new .usda file, with what sets faults right beyond doubt.
+
+    No other file is touched: it takes effect where somebody makes it the first sublayer of
+    NAME.usda. Only those findings count as cured that are gone once it is.
+    """
+    path = layer.absolute()
+    taken = (
+        f"{path}: the file exists, and cures never go into a layer that somebody wrote. Name a "
+        "new file. [fix.exists]"
+    )
+    if path.suffix != ".usda":
+        raise UsageError(f"{path}: the cures are written as text; name a .usda file. [fix.suffix]")
+    if os.path.lexists(path):
+        raise UsageError(taken)
+    reserved = [asset.folder / name for name in ("layers", "textures", ".usdbrdf")]
+    if any(path.is_relative_to(folder) for folder in reserved):
+        raise UsageError(
+            f"{path}: the folder is the pipeline's own. Name a file beside "
+            f"{asset.root_layer.name}. [fix.place]"
+        )
+    stage = open_or_finding(asset.root_layer)
+    if isinstance(stage, Finding):
+        raise InputRefused(f"{stage.layer}: {stage.message} [{stage.rule}]")
+    with environment_failures(str(path)), temporary_beside(path) as written:
+        header = new_layer(read_header(asset.root_layer), Provenance(role="cures", version="1"))
+        header.documentation = (
+            "Cures by usdbrdf validate --fix. They take effect as the first sublayer of "
+            f"{asset.root_layer.name}."
+        )
+        header.Export(str(written))
+        cures = Sdf.Layer.FindOrOpen(str(written))
+        # Stronger than all other layers, in memory alone.
+        stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
+        stage.SetEditTarget(Usd.EditTarget(cures))
+        # In words before any cure: it may change which layer's opinion wins.
+        before = list(_curable(stage))
+        applied = dict.fromkeys(found for cure, site, found in before if cure.apply(site))
+        # The same complaint, whichever layer it is that has the opinion.
+        complaint = attrgetter("rule", "site", "message")
+        after = {complaint(found) for _, _, found in _curable(stage)}
+        cured = tuple(found for found in applied if complaint(found) not in after)
+        if cured:
+            cures.Save()
+            _publish_new(written, path, taken)
+    return Cured(layer=path, findings=cured)
+
+
+def _publish_new(written: Path, path: Path, taken: str) -> None:
+    """Never over a file that somebody wrote in the meantime: the name is taken before it is used.
+
+    A hard link would do both at once, but not every file system has them.
+    """
+    try:
+        path.open("xb").close()
+    except FileExistsError as error:
+        raise UsageError(taken) from error
+    try:
+        publish(written, path)
+    except BaseException:
+        path.unlink()
+        raise
+
+
+def _curable(stage: Usd.Stage) -> Iterator[tuple[Cure, Site, Finding]]:
+    scene = AssetStage(stage)
+    for rule in RULES:
+        if rule.cure:
+            for fault in rule.check(scene):
+                yield rule.cure, fault.site, finding_of(rule, fault)

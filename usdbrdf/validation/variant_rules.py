@@ -120,9 +120,8 @@ def lamp_twice(scene: AssetStage) -> Iterator[Fault]:
     Select emissive, or give the opinion inside its variant; or deactivate the lights of that lamp.
     """
     root = scene.root_prim
-    if not root or not scene.scopes or not scene.own_variants(LIGHTS):
-        return
-    if root.GetVariantSet(LIGHTS).GetVariantSelection() != USDLUX:
+    selected = root.GetVariantSet(LIGHTS).GetVariantSelection() if root else ""
+    if not scene.scopes or selected != USDLUX or not scene.own_variants(LIGHTS):
         return
     for item in scene.objects:
         path = scene.scopes.path("lights", str(authored(item, "usdBrdf:identifier")))
