@@ -105,9 +105,9 @@ OPENERS: dict[str, str] = {
     "calibration.py": "its own data",
     "identity.py": "hashes the sources",
     "kernel_cache.py": "compiled code",
-    "evaluation/truth.py": "truth comes as .npz",
+    "evaluation/metrics.py": "truth comes as .npz",
     "command_parser.py": "a matrix comes as a text file",
-    "validation/cure_layer.py": "the layer of cures is an artist's file",
+    "validation/validate.py": "the layer of cures is an artist's file",
 }
 _OPEN = {
     "open", "read_text", "write_text", "read_bytes", "write_bytes", "load", "loadtxt", "save",

@@ -234,8 +234,7 @@ class Validate(Command):
     def run(self) -> int:
         with loading():
             from usdbrdf.asset.layout import Asset
-            from usdbrdf.validation.cure_layer import write_cures
-            from usdbrdf.validation.validate import has_errors, validate
+            from usdbrdf.validation.validate import has_errors, validate, write_cures
         asset = Asset.made(self.asset)
         root = asset.root_layer
         findings = validate(root)

@@ -13,7 +13,7 @@ from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
-from usdbrdf.delivery.flat_stage import flattened, stage_in_look
+from usdbrdf.delivery.package import flattened, stage_in_look
 from usdbrdf.options import IngestOptions
 from usdbrdf.validation.validate import validate
 

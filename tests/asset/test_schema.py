@@ -29,8 +29,8 @@ from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.asset.readers.objects import read_record
 from usdbrdf.asset.schema import plugin_path, register, verify
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.record_rules import not_allowed, out_of_range, undeclared
+from usdbrdf.validation.record_rules import allowed_tokens, fit_range, undeclared_attribute
+from usdbrdf.validation.rule import AssetStage
 
 VARIABILITY = {True: Sdf.VariabilityUniform, False: Sdf.VariabilityVarying}
 SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
@@ -262,7 +262,7 @@ class GlossyFit(FittedObject):
     ] = "matt"
 
 
-def test_a_row_more_is_declared_written_read_back_and_checked(built, generate):
+def test_a_row_more_is_declared_written_read_back_and_checked(built, generate, monkeypatch):
     records = [*RECORDS[:-1], GlossyFit]
     declaration = "    uniform float usdBrdf:fit:gloss = 0.25 ("
     assert declaration in generate.schema_text(records).splitlines()
@@ -283,15 +283,12 @@ def test_a_row_more_is_declared_written_read_back_and_checked(built, generate):
     assert not wall.GetAttribute("usdBrdf:fit:gloss")
     assert math.isnan(read_record(GlossyFit, wall, **others).gloss)
 
-    facts, scene = facts_by_attribute(records), AssetStage(stage)
+    scene = AssetStage(stage)
+    assert len(list(undeclared_attribute.check(scene))) == 5
+    monkeypatch.setattr("usdbrdf.validation.record_rules.FACTS", facts_by_attribute(records))
     sites = [
         str(fault.site.GetPath())
-        for faults in (
-            out_of_range(scene, lambda fact: fact.schema == FIT, facts),
-            not_allowed(scene, facts),
-            undeclared(scene, facts),
-        )
-        for fault in faults
+        for rule in (fit_range, allowed_tokens, undeclared_attribute)
+        for fault in rule.check(scene)
     ]
     assert sites == [f"{built.prims[2]}.usdBrdf:fit:{name}" for name in ("gloss", "finish")]
-    assert len(list(undeclared(scene))) == 5
