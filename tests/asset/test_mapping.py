@@ -9,8 +9,8 @@ from pxr import Sdf
 
 from usdbrdf.asset.preview_lobe import fit_from_preview_surface, preview_surface_from_fit
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.objects import read_fit
 from usdbrdf.asset.readers.render_scene import render_scene_from_file
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.transport.renderer_match import shown_lobe
 
 CHAIR, LAMP = 0, 2
@@ -113,7 +113,7 @@ def test_the_inverse_of_what_is_written(mapping):
 
 
 def test_materialx_is_told_the_same(built):
-    from usdbrdf.asset.layers.material_layer import write_material_layer
+    from usdbrdf.asset.layers.task_layers import write_material_layer
 
     built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)
     write_material_layer(

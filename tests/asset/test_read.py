@@ -8,14 +8,14 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
-from usdbrdf.asset.readers.objects import (
+from usdbrdf.asset.readers.scene import (
     aov_path,
     read_aovs,
     read_fit,
     read_shading,
     read_texturing,
+    scene_from_stage,
 )
-from usdbrdf.asset.readers.scene import scene_from_stage
 from usdbrdf.errors import InputRefused
 
 

@@ -26,7 +26,7 @@ from usdbrdf.asset.properties import (
     facts_by_attribute,
 )
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.objects import read_record
+from usdbrdf.asset.readers.scene import read_record
 from usdbrdf.asset.schema import plugin_path, register, verify
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.validation.asset_stage import AssetStage

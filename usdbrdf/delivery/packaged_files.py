@@ -16,7 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdShade, UsdUtils
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import named_files
-from usdbrdf.asset.readers.materials import is_srgb, read_texture
+from usdbrdf.asset.readers.surfaces import is_srgb, read_texture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png

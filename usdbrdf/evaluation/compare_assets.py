@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.previews import camera_hits
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.maps import AssetMaps, camera_hits
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import MapError, map_error
 from usdbrdf.evaluation.report import FILES, Row, files_of, magma, output_folder, sheet, table_text

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import finite, map_error, nrmse
 from usdbrdf.files.documents import read_json

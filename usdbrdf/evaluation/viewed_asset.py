@@ -17,7 +17,7 @@ from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.camera import Camera

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.layers.material_layer import write_material_layer
+from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import FittedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.job.progress import say

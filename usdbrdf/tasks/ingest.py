@@ -7,8 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.header import Draft, StageHeader
-from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pending_layer, write_root
-from usdbrdf.asset.layers.scan_layer import write_scan_layer
+from usdbrdf.asset.layers.scan_layer import (
+    check_root,
+    write_edits,
+    write_pending_layer,
+    write_root,
+    write_scan_layer,
+)
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.parts import USD_SUFFIXES

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
-from usdbrdf.asset.layers.shading_layer import write_shading_layer
+from usdbrdf.asset.layers.task_layers import write_shading_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import Aov, ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.job.progress import warn

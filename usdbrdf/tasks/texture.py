@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
-from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
+from usdbrdf.asset.layers.task_layers import write_texturing_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.asset.readers.scene import given_corner_uv

@@ -8,7 +8,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.layers.scan_layer import LENS, lens_from_pinhole
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd
 
-from usdbrdf.asset.readers.frames import asset_file
+from usdbrdf.asset.readers.scene import asset_file
 from usdbrdf.validation.asset_stage import AssetStage, located, record_of
 from usdbrdf.validation.rule import Fault, Severity, Site, rule
 

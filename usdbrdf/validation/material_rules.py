@@ -9,7 +9,7 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.preview_lobe import PreviewLobe, preview_surface_from_fit
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 

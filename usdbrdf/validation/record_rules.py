@@ -10,7 +10,7 @@ from typing import NamedTuple
 from pxr import Sdf, Usd
 
 from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, Fact, facts_by_attribute
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 

@@ -1,8 +1,8 @@
-"""The variant set ``look``: the same objects lit, as measured maps, or with their materials.
+"""UsdPreviewSurface networks, and the variant set ``look``: the same objects
+lit, as measured maps, or with their materials.
 
 Bindings live inside the variants and nowhere else. A binding beside them would be a local opinion,
-and local opinions beat variants: every look would show the same material.
-"""
+and local opinions beat variants: every look would show the same material."""
 
 from __future__ import annotations
 
@@ -10,13 +10,121 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
 
-from pxr import Sdf
+from pxr import Gf, Sdf
 
 from usdbrdf.asset.header import Draft, Scopes
-from usdbrdf.asset.layers.author import apply_schema, define, over, relationship
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    author_inputs,
+    connect,
+    define,
+    over,
+    relationship,
+)
 from usdbrdf.asset.layers.input_usd import BINDING, recorded_bindings
-from usdbrdf.asset.layers.preview_surface import Colour, unlit_colour, unlit_texture
+from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.asset.preview_lobe import NO_LOBE
 from usdbrdf.asset.properties import Aov, MeasuredObject
+
+Types = Sdf.ValueTypeNames
+Colour = Sequence[float]
+SURFACE = "PreviewSurface"
+
+
+def surface(
+    layer: Sdf.Layer,
+    material: str,
+    *,
+    roughness: float = NO_LOBE.roughness,
+    ior: float = NO_LOBE.ior,
+) -> Sdf.PrimSpec:
+    """A material with one UsdPreviewSurface, black until a colour is given; returns the shader.
+
+    ``specularColor`` stays away: some applications multiply it onto the reflectance of ``ior``.
+    """
+    shader = f"{material}/{SURFACE}"
+    connect(
+        define(layer, material, "Material"),
+        "outputs:surface",
+        Types.Token,
+        f"{shader}.outputs:surface",
+    )
+    prim = node(layer, shader, "UsdPreviewSurface", "surface", Types.Token)
+    author_inputs(prim, Types.Int, useSpecularWorkflow=0)
+    author_inputs(prim, Types.Float, metallic=0.0)
+    author_inputs(prim, Types.Color3f, diffuseColor=Gf.Vec3f(0.0), emissiveColor=Gf.Vec3f(0.0))
+    lobe(layer, material, roughness, ior)
+    return prim
+
+
+def lobe(layer: Sdf.Layer, material: str, roughness: float, ior: float) -> None:
+    """The specular lobe of a material that this layer, or a weaker one, defines."""
+    author_inputs(over(layer, f"{material}/{SURFACE}"), Types.Float, roughness=roughness, ior=ior)
+
+
+def node(
+    layer: Sdf.Layer, path: str, identifier: str, output: str, output_type: Sdf.ValueTypeName
+) -> Sdf.PrimSpec:
+    """A shader of a network, by its ``info:id``, with one output."""
+    prim = define(layer, path, "Shader")
+    attribute(prim, "info:id", Types.Token, identifier, uniform=True)
+    attribute(prim, f"outputs:{output}", output_type)
+    return prim
+
+
+def colour_from_texture(
+    layer: Sdf.Layer,
+    material: str,
+    surface_input: str,
+    texture: str,
+    file: str,
+    *,
+    scale: float = 1.0,
+    fallback: Colour = (0.0, 0.0, 0.0),
+) -> None:
+    """Connect an input of the material's surface to a linear texture over ``primvars:st``.
+
+    texture   name of the texture's shader prim
+    file      path relative to the asset folder
+    fallback  linear colour where the file is missing
+    """
+    reader = node(layer, f"{material}/StReader", "UsdPrimvarReader_float2", "result", Types.Float2)
+    author_inputs(reader, Types.String, varname="st")
+    prim = node(layer, f"{material}/{texture}", "UsdUVTexture", "rgb", Types.Float3)
+    author_inputs(prim, Types.Asset, file=Sdf.AssetPath(path_in_layer(file)))
+    connect(prim, "inputs:st", Types.Float2, f"{material}/StReader.outputs:result")
+    # "auto" would decode float images as sRGB in some applications.
+    author_inputs(prim, Types.Token, sourceColorSpace="raw", wrapS="clamp", wrapT="clamp")
+    author_inputs(prim, Types.Float4, fallback=Gf.Vec4f(*map(float, fallback), 1.0))
+    if scale != 1.0:
+        scale_texture(layer, material, texture, scale)
+    shader = over(layer, f"{material}/{SURFACE}")
+    source = f"{material}/{texture}.outputs:rgb"
+    connected = connect(shader, f"inputs:{surface_input}", Types.Color3f, source)
+    connected.ClearDefaultValue()
+
+
+def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -> None:
+    """A factor on the colour of a texture that this layer, or a weaker one, defines."""
+    prim = over(layer, f"{material}/{texture}")
+    author_inputs(prim, Types.Float4, scale=Gf.Vec4f(scale, scale, scale, 1.0))
+
+
+def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> None:
+    """A material that glows with a map and reflects nothing, so that any viewer shows the map.
+
+    A map of one channel shows as grey: applications repeat it over red, green and blue.
+    """
+    surface(layer, material)
+    colour_from_texture(layer, material, "emissiveColor", "AovTexture", file, scale=scale)
+
+
+def unlit_colour(layer: Sdf.Layer, material: str, colour: Colour) -> None:
+    """A material that glows with one linear colour and reflects nothing."""
+    shader = surface(layer, material)
+    author_inputs(shader, Types.Color3f, emissiveColor=Gf.Vec3f(*map(float, colour)))
+
 
 VARIANT_SET = "look"
 SHADED, LIT = "shaded", "lit"

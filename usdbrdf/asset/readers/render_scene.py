@@ -18,9 +18,8 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
 
 from usdbrdf.asset.readers.compose import open_stage
-from usdbrdf.asset.readers.frames import asset_file, capture_camera, frames_from_stage
-from usdbrdf.asset.readers.materials import read_texture
-from usdbrdf.asset.readers.surfaces import metres_from_units, surfaces_from_stage
+from usdbrdf.asset.readers.scene import asset_file, capture_camera, frames_from_stage
+from usdbrdf.asset.readers.surfaces import metres_from_units, read_texture, surfaces_from_stage
 from usdbrdf.errors import UsageError
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera

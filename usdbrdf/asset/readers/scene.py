@@ -1,20 +1,91 @@
-"""The labelled meshes of a stage -> one triangle soup in metres."""
+"""A composed stage -> what capture and tasks said in it: photographs, the labelled meshes as one
+triangle soup in metres, and the records of the objects."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.properties import OBJECT, TEXTURING
+from usdbrdf.asset.properties import (
+    AOV,
+    FIT,
+    OBJECT,
+    SHADING,
+    TEXTURING,
+    Aov,
+    FittedObject,
+    Photographs,
+    Schema,
+    ShadedObject,
+    TexturedObject,
+    facts_of,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
+
+# The attribute of each field.
+_NAMES = {field: fact.attribute() for field, fact in facts_of(Photographs)}
+
+
+def frames_from_stage(stage: Usd.Stage) -> Frames:
+    """The photographs, with poses in metres and absolute image paths, in the order of time."""
+    camera = capture_camera(stage)
+    prim = camera.GetPrim()
+    image = prim.GetAttribute(_NAMES["image"])
+    times = image.GetTimeSamples()
+    # Row vectors in USD: transposed they are ours.
+    poses = np.array([camera.ComputeLocalToWorldTransform(time) for time in times])
+    poses = np.ascontiguousarray(poses.transpose(0, 2, 1))
+    poses[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
+
+    def per_frame(field: str) -> Double:
+        attribute = prim.GetAttribute(_NAMES[field])
+        return np.array([attribute.Get(time) for time in times], np.float64)
+
+    paths = [asset_file(image, time) for time in times]
+    return Frames(
+        image_paths=tuple(path for path in paths if path is not None),
+        world_from_camera=poses,
+        intrinsics=per_frame("intrinsics"),
+        resolution=per_frame("resolution").astype(np.int32),
+        exposure_time=per_frame("exposure_time"),
+        saturation_radiance=per_frame("saturation_radiance"),
+        noise_floor_radiance=per_frame("noise_floor_radiance"),
+        encoding=str(prim.GetAttribute(_NAMES["encoding"]).Get()),
+        radiometric=bool(prim.GetAttribute(_NAMES["radiometric"]).Get()),
+    )
+
+
+def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
+    """The camera that carries the photographs."""
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Camera) and prim.GetAttribute(_NAMES["image"]):
+            return UsdGeom.Camera(prim)
+    raise InputRefused(
+        f"{stage.GetRootLayer().identifier}: no camera of the stage has photographs "
+        "(usdBrdf:capture:image). Run ingest again. [stage.camera]"
+    )
+
+
+def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | None:
+    """Absolute path of the file that an attribute names, existing or not; None if empty."""
+    value = attribute.Get(time)
+    if not value or not value.path:
+        return None
+    # Relative to the layer that holds the opinion.
+    layer = attribute.GetPropertyStack(time)[0].layer
+    return Path(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
+
 
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
@@ -181,3 +252,83 @@ def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
             "Run `usdbrdf texture` again. [stage.st]"
         )
     return np.concatenate(present)
+
+
+Record = TypeVar("Record")
+
+
+def authored(prim: Usd.Prim, name: str) -> Any:
+    """The authored value of an attribute: a schema's fallback is no measurement. Else None."""
+    attribute = prim.GetAttribute(name)
+    return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+
+
+def aov_path(stage: Usd.Stage, prim_path: str, aov: str) -> Path | None:
+    """Absolute path of an object's map; None where the object has no such map."""
+    attribute = stage.GetPrimAtPath(prim_path).GetAttribute(AOV.attribute("file", aov))
+    return asset_file(attribute, Usd.TimeCode.Default()) if attribute else None
+
+
+def read_aovs(stage: Usd.Stage, prim_path: str) -> tuple[Aov, ...]:
+    """All maps of an object, by name; from whatever layers the stage is composed of."""
+    prim = stage.GetPrimAtPath(prim_path)
+    paths = (p.GetName() for p in prim.GetAuthoredPropertiesInNamespace("usdBrdf:aov"))
+    names = sorted(path.split(":")[2] for path in paths if path.endswith(":file"))
+    return tuple(read_record(Aov, prim, name, name=name) for name in names)
+
+
+def read_texturing(stage: Usd.Stage, prim_path: str) -> TexturedObject | None:
+    """None before the task texture; ``aovs`` hold the maps of all tasks so far."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+    if not is_measured(mesh.GetPrim(), TEXTURING):
+        return None
+    corner_uv = read_corner_uv(mesh, triangulation_of(mesh))
+    if corner_uv is None:
+        return None
+    aovs = read_aovs(stage, prim_path)
+    return _read_object(TexturedObject, mesh.GetPrim(), corner_uv=corner_uv, aovs=aovs)
+
+
+def read_shading(stage: Usd.Stage, prim_path: str) -> ShadedObject | None:
+    """None before the task shade; ``aovs`` hold the maps of all tasks so far."""
+    prim = stage.GetPrimAtPath(prim_path)
+    if not is_measured(prim, SHADING):
+        return None
+    return _read_object(ShadedObject, prim, aovs=read_aovs(stage, prim_path))
+
+
+def read_fit(stage: Usd.Stage, prim_path: str) -> FittedObject | None:
+    """None before the task fit."""
+    prim = stage.GetPrimAtPath(prim_path)
+    return _read_object(FittedObject, prim) if is_measured(prim, FIT) else None
+
+
+def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
+    """Whether anybody measured of a prim what the schema is about."""
+    return authored(prim, schema.attribute(schema.key)) is not None
+
+
+def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others: Any) -> Record:
+    """A record as ``author_record`` said it; ``others`` are its fields that are no facts."""
+    fields, row_type = dict(others), cast(type, kind)
+    rows = facts_of(row_type)
+    for field, fact in rows:
+        value = authored(prim, fact.attribute(instance))
+        if value is not None and field not in fields:
+            fields[field] = fact.read(_plain(value))
+        if fact.schema.flag:
+            fields[fact.schema.flag] = is_measured(prim, fact.schema)
+    unknown = {field: fact.unknown for field, fact in reversed(rows)}
+    return kind(**unknown | fields)
+
+
+def _read_object(kind: type[Record], prim: Usd.Prim, **others: Any) -> Record:
+    identifier = str(authored(prim, "usdBrdf:identifier"))
+    return read_record(kind, prim, prim_path=str(prim.GetPath()), identifier=identifier, **others)
+
+
+def _plain(value: Any) -> Any:
+    """A value of USD without its types: paths and words as text, vectors as tuples."""
+    if isinstance(value, Sdf.AssetPath):
+        return value.path
+    return tuple(value) if isinstance(value, (Gf.Vec2i, Gf.Vec3f, Gf.Vec4d)) else value

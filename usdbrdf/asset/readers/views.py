@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,

@@ -1,0 +1,273 @@
+"""What the tasks texture, shade and fit add to the scan, each in a layer of its own.
+
+Where it is asked for, the materials once more as OpenPBR networks of MaterialX, for renderers that
+take those rather than UsdPreviewSurface; they get the same numbers. materialx.usda is a sublayer of
+material.usda, weaker than it and listed there: so the root layer need not be written again, and a
+session that does not want it mutes one file. What glows keeps its UsdPreviewSurface alone, whose
+emission the variants of the lights switch off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, Vt
+
+from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    author_inputs,
+    author_record,
+    connect,
+    define,
+    export,
+    over,
+    relationship,
+)
+from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
+from usdbrdf.asset.layers.looks import (
+    LIT,
+    SHADED,
+    SURFACE,
+    Shown,
+    aov_looks,
+    author_look_materials,
+    author_looks,
+    colour_from_texture,
+    lobe,
+    node,
+    scale_texture,
+    surface,
+)
+from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
+from usdbrdf.asset.properties import FittedObject, ShadedObject, TexturedObject
+from usdbrdf.errors import UsdBrdfError
+from usdbrdf.model.arrays import Float
+
+Types = Sdf.ValueTypeNames
+# Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
+_PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
+THUMBNAIL = "previews/lit.png"  # in the asset folder
+
+
+def write_texturing_layer(
+    path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject], scanned: Usd.Stage
+) -> None:
+    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``.
+
+    scanned  the composed stage of the weaker layers
+    """
+    asset, scopes = draft.asset, draft.scopes
+    folder = asset.layer("texturing").parent
+    coordinates, layer = draft.new_layer(), draft.new_layer()
+    layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
+    with Sdf.ChangeBlock():
+        for item in objects:
+            declared = scanned.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
+            author_texture_coordinates(
+                over(coordinates, item.prim_path),
+                item.corner_uv,
+                declared.GetTypeName() if declared else Types.TexCoord2fArray,
+            )
+            author_record(over(layer, item.prim_path), item)
+    _author_thumbnail(layer.GetPrimAtPath(scopes.root))
+    author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=LIT)
+    export(coordinates, uv_path, folder=folder)
+    export(layer, path, folder=folder)
+
+
+def author_texture_coordinates(
+    prim: Sdf.PrimSpec, corner_uv: Float, declared: Sdf.ValueTypeName = Types.TexCoord2fArray
+) -> None:
+    """primvars:st, one value per triangle corner; equal values are stored once and indexed.
+
+    declared  the type that an input file gives its own, which ours must share: float2[] is usual
+    """
+    corners = np.ascontiguousarray(corner_uv, np.float32).reshape(-1, 2)
+    # Two floats as one integer: equal bits, much faster than rows.
+    _, first, index = np.unique(corners.view(np.uint64), return_index=True, return_inverse=True)
+    kind = declared if type(declared.defaultValue) in _PAIRS else Types.TexCoord2fArray
+    values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
+    attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
+    attribute(prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32))
+
+
+def _author_thumbnail(root: Sdf.PrimSpec) -> None:
+    """What browsers of assets show: the picture that the task texture writes beside the layer."""
+    apply_schema(root, "AssetPreviewsAPI")
+    picture = Sdf.AssetPath(path_in_layer(THUMBNAIL))
+    thumbnails = {"default": {"defaultImage": picture}}
+    root.SetInfo("assetInfo", {"previews": {"thumbnails": thumbnails}})
+
+
+ALBEDO, EMISSION = "albedo", "emission"
+ALBEDO_TEXTURE = "AlbedoTexture"
+# What a renderer is asked for: name, type, source. Light path expressions say which paths count;
+# "raw" names a renderer's own output.
+_RENDER_VARS = (
+    ("beauty", "color3f", "C.*", "lpe"),
+    ("diffuse", "color3f", "C<RD>.*", "lpe"),
+    ("specular", "color3f", "C<RG>.*", "lpe"),
+    ("emission", "color3f", "C[<L.>O]", "lpe"),
+    ("albedo", "color3f", "albedo", "raw"),
+    ("normal", "normal3f", "N", "raw"),
+    ("depth", "float", "depth", "raw"),
+)
+
+
+def write_shading_layer(path: Path, draft: Draft, objects: Sequence[ShadedObject]) -> None:
+    """Write shading.usda to ``path``; its sublayer is ``write_lights_layer``'s."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
+    define(layer, scopes.path("materials"), "Scope")
+    for item in objects:
+        author_record(over(layer, item.prim_path), item)
+        _author_material(layer, scopes, item)
+    # Emission is not a look: it is nothing on most objects, and the shaded look shows it.
+    looks = aov_looks(layer, scopes, objects, hidden=frozenset([EMISSION]))
+    looks[SHADED] = {item.prim_path: scopes.path("materials", item.identifier) for item in objects}
+    author_looks(layer, draft, looks, selected=SHADED)
+    _author_render_outputs(layer, scopes)
+    export(layer, path, folder=asset.layer("shading").parent)
+
+
+def _author_material(layer: Sdf.Layer, scopes: Scopes, item: ShadedObject) -> None:
+    """Diffuse only: the lobe is what the task fit adds, in a stronger layer."""
+    material = scopes.path("materials", item.identifier)
+    surface(layer, material)
+    files = {aov.name: aov.file for aov in item.aovs}
+    wanted = EMISSION if item.emitter else ALBEDO
+    if wanted not in files:
+        raise UsdBrdfError(
+            f"<{item.prim_path}>: the task shade delivered no {wanted} map. This is a defect of "
+            "usdbrdf; please report it. [stage.aov]"
+        )
+    # An emitter reflects nothing that could be measured; other objects may glow in places.
+    inputs = [("emissiveColor", EMISSION_TEXTURE, EMISSION, item.radiance)]
+    if not item.emitter:
+        inputs.append(("diffuseColor", ALBEDO_TEXTURE, ALBEDO, item.mean_albedo))
+    for name, texture, aov, mean in inputs:
+        if aov in files:
+            colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
+
+
+def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
+    """The product and its variables for the render settings that the scan layer defines."""
+    product, variables = scopes.path("render", "aovs"), scopes.path("render", "vars")
+    relationship(over(layer, scopes.path("render", "capture")), "products", product)
+    prim = define(layer, product, "RenderProduct")
+    attribute(prim, "productName", Types.Token, "aovs.####.exr")
+    relationship(prim, "camera", scopes.path("cameras", "capture"))
+    relationship(prim, "orderedVars", *(f"{variables}/{name}" for name, *_ in _RENDER_VARS))
+    define(layer, variables, "Scope")
+    for name, data_type, source, source_type in _RENDER_VARS:
+        prim = define(layer, f"{variables}/{name}", "RenderVar")
+        attribute(prim, "dataType", Types.Token, data_type, uniform=True)
+        attribute(prim, "sourceName", Types.String, source, uniform=True)
+        attribute(prim, "sourceType", Types.Token, source_type, uniform=True)
+
+
+BASE_COLOR = "base_color"
+
+
+def write_material_layer(
+    path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
+) -> None:
+    """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
+    networks = {}
+    for item in objects:
+        material = scopes.path("materials", item.identifier)
+        author_record(over(layer, item.prim_path), item)
+        shown = NO_LOBE
+        if item.is_known:
+            shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
+            _author_lobe(layer, material, shown)
+        texture = _author_colour(layer, material, item, shown.diffuse, shading)
+        if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
+            networks[material] = (shown, texture)
+    looks = {
+        **aov_looks(layer, scopes, objects),
+        "roughness": author_look_materials(
+            layer, scopes, "roughness", objects, lambda item: _grey(item, item.phi)
+        ),
+        "specular": author_look_materials(
+            layer, scopes, "specular", objects, lambda item: _grey(item, item.psi)
+        ),
+    }
+    author_looks(layer, draft, looks, selected=SHADED)
+    if materialx:
+        layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
+        _write_materialx(materialx, draft, networks)
+    export(layer, path, folder=asset.layer("material").parent)
+
+
+def _author_lobe(layer: Sdf.Layer, material: str, shown: PreviewLobe) -> None:
+    lobe(layer, material, shown.roughness, shown.ior)
+    shader = over(layer, f"{material}/{SURFACE}")
+    author_inputs(shader, Types.Float, metallic=0.0)
+    author_inputs(shader, Types.Int, useSpecularWorkflow=0)
+
+
+def _author_colour(
+    layer: Sdf.Layer, material: str, item: FittedObject, scale: float, shading: Sdf.Layer
+) -> str:
+    """The refined colour instead of the albedo, on what reflects; without one a factor on the
+    albedo. Returns the texture's path in layers; "" where there is none, as of an emitter."""
+    for aov in item.aovs:
+        if aov.name == BASE_COLOR and any(item.mean_color):
+            colour_from_texture(
+                layer, material, "diffuseColor", "BaseColorTexture", aov.file,
+                scale=scale, fallback=item.mean_color,
+            )  # fmt: skip
+            return path_in_layer(aov.file)
+    albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
+    if albedo is None:
+        return ""
+    if scale != 1:
+        scale_texture(layer, material, ALBEDO_TEXTURE, scale)
+    return str(albedo.default.path)
+
+
+def _grey(item: FittedObject, parameter: float) -> Shown:
+    return (parameter,) * 3 if item.is_known else None
+
+
+def _write_materialx(
+    path: Path, draft: Draft, materials: Mapping[str, tuple[PreviewLobe, str]]
+) -> None:
+    """Write materialx.usda to ``path``. materials, by prim path: what UsdPreviewSurface is told,
+    and the texture of its diffuse colour as layers spell its path; "" is black."""
+    layer = draft.new_layer()
+    for material, (shown, texture) in materials.items():
+        _author_network(layer, material, shown, texture)
+    export(layer, path, folder=draft.asset.materialx_layer.parent)
+
+
+def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
+    surface = f"{material}/OpenPBR"
+    connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
+    prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)
+    author_inputs(
+        prim, Types.Float,
+        base_weight=1.0, base_diffuse_roughness=0.0, base_metalness=0.0, specular_weight=1.0,
+        specular_roughness=shown.roughness, specular_ior=shown.ior,
+    )  # fmt: skip
+    if not file:
+        author_inputs(prim, Types.Color3f, base_color=(0.0, 0.0, 0.0))
+        return
+    st, image, scaled = (f"{material}/Mtlx{name}" for name in ("St", "BaseColor", "Scaled"))
+    prim_st = node(layer, st, "ND_geompropvalue_vector2", "out", Types.Float2)
+    author_inputs(prim_st, Types.String, geomprop="st")
+    texture = node(layer, image, "ND_image_color3", "out", Types.Color3f)
+    author_inputs(texture, Types.Asset, file=Sdf.AssetPath(file))
+    author_inputs(texture, Types.String, uaddressmode="clamp", vaddressmode="clamp")
+    connect(texture, "inputs:texcoord", Types.Float2, f"{st}.outputs:out")
+    product = node(layer, scaled, "ND_multiply_color3FA", "out", Types.Color3f)
+    author_inputs(product, Types.Float, in2=shown.diffuse)
+    connect(product, "inputs:in1", Types.Color3f, f"{image}.outputs:out")
+    connect(prim, "inputs:base_color", Types.Color3f, f"{scaled}.outputs:out")
