@@ -3,9 +3,9 @@ triangle soup in metres, and the records of the objects."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from usdbrdf.asset.properties import (
     AOV,
+    CAPTURE,
     FIT,
     OBJECT,
     SHADING,
@@ -22,54 +23,48 @@ from usdbrdf.asset.properties import (
     Photographs,
     Schema,
     ShadedObject,
-    TexturedObject,
     facts_of,
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.arrays import Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
 
-# The attribute of each field.
-_NAMES = {field: fact.attribute() for field, fact in facts_of(Photographs)}
+_IMAGE = CAPTURE.attribute(CAPTURE.key)
 
 
 def frames_from_stage(stage: Usd.Stage) -> Frames:
     """The photographs, with poses in metres and absolute image paths, in the order of time."""
     camera = capture_camera(stage)
-    prim = camera.GetPrim()
-    image = prim.GetAttribute(_NAMES["image"])
+    image = camera.GetPrim().GetAttribute(_IMAGE)
     times = image.GetTimeSamples()
     # Row vectors in USD: transposed they are ours.
     poses = np.array([camera.ComputeLocalToWorldTransform(time) for time in times])
     poses = np.ascontiguousarray(poses.transpose(0, 2, 1))
     poses[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
-
-    def per_frame(field: str) -> Double:
-        attribute = prim.GetAttribute(_NAMES[field])
-        return np.array([attribute.Get(time) for time in times], np.float64)
-
+    read: dict[str, Any] = {}
+    for field, fact in facts_of(Photographs):
+        attribute = camera.GetPrim().GetAttribute(fact.attribute())
+        if fact.samples and field != "image":
+            read[field] = np.array([attribute.Get(time) for time in times], np.float64)
+        elif field != "image":
+            read[field] = attribute.Get()
+    read["resolution"] = read["resolution"].astype(np.int32)
     paths = [asset_file(image, time) for time in times]
     return Frames(
         image_paths=tuple(path for path in paths if path is not None),
         world_from_camera=poses,
-        intrinsics=per_frame("intrinsics"),
-        resolution=per_frame("resolution").astype(np.int32),
-        exposure_time=per_frame("exposure_time"),
-        saturation_radiance=per_frame("saturation_radiance"),
-        noise_floor_radiance=per_frame("noise_floor_radiance"),
-        encoding=str(prim.GetAttribute(_NAMES["encoding"]).Get()),
-        radiometric=bool(prim.GetAttribute(_NAMES["radiometric"]).Get()),
+        **read,
     )
 
 
 def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
     """The camera that carries the photographs."""
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Camera) and prim.GetAttribute(_NAMES["image"]):
+        if prim.IsA(UsdGeom.Camera) and prim.GetAttribute(_IMAGE):
             return UsdGeom.Camera(prim)
     raise InputRefused(
         f"{stage.GetRootLayer().identifier}: no camera of the stage has photographs "
@@ -90,8 +85,7 @@ def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | N
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Mesh:
+class _Mesh(NamedTuple):
     points: Float
     triangles: Int
     corner_normals: Float
@@ -103,14 +97,16 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
 
     Meshes without normals of their own get them by the crease angle that ingest was given.
     """
-    prims = [prim for prim in stage.Traverse() if is_object(prim)]
+    prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh) and is_measured(p, OBJECT)]
     if not prims:
         raise InputRefused(
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
-    crease_angle_deg = _crease_angle_deg(stage)
-    meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
+    records = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetLayerStack()]
+    angles = (record.get("parameters", {}).get("crease_angle_deg") for record in records)
+    angle = next((a for a in angles if a is not None), IngestOptions().crease_angle_deg)
+    meshes = [_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims]
     num_faces = [len(mesh.triangles) for mesh in meshes]
     first_face = np.cumsum([0, *num_faces])
     first_point = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
@@ -125,6 +121,13 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
         )
         for i, prim in enumerate(prims)
     )
+    uvs = [mesh.corner_uv for mesh in meshes if mesh.corner_uv is not None]
+    if 0 < len(uvs) < len(meshes):
+        missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
+        raise InputRefused(
+            f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
+            "Run `usdbrdf texture` again. [stage.st]"
+        )
     shifted = [mesh.triangles + first_point[i] for i, mesh in enumerate(meshes)]
     return Scene(
         objects=objects,
@@ -132,27 +135,33 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
         triangles=np.concatenate(shifted).astype(np.int32),
         corner_normals=np.concatenate([mesh.corner_normals for mesh in meshes]),
         face_object=np.repeat(np.arange(len(meshes), dtype=np.int32), num_faces),
-        corner_uv=_joined_uv(prims, meshes),
+        corner_uv=np.concatenate(uvs) if uvs else None,
     )
 
 
-def is_object(prim: Usd.Prim) -> bool:
-    """True for a mesh that ingest labelled."""
-    label = prim.GetAttribute(OBJECT.attribute(OBJECT.key))
-    return bool(label and label.HasAuthoredValue() and prim.IsA(UsdGeom.Mesh))
-
-
-def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
-    """(T, 3, 2) texture coordinates that the task texture authored; None before it.
-
-    An input file's own primvars:st does not count: only ours go with our textures.
-    """
-    ours = mesh.GetPrim().GetAttribute(TEXTURING.attribute(TEXTURING.key))
+def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
+    fans = triangulation_of(mesh)
+    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
+    meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
+    local = np.asarray(mesh.GetPointsAttr().Get(_TIME), np.float64).reshape(-1, 3)
+    world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
+    points = np.ascontiguousarray(world, np.float32)
+    triangles, normals, uv = fans.triangles, authored_normals(mesh, fans), None
+    # An input file's own primvars:st does not count: only ours go with our textures.
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-    if not (ours and ours.HasAuthoredValue() and primvar):
-        return None
-    values = np.asarray(primvar.ComputeFlattened(_TIME), np.float32)
-    return np.ascontiguousarray(values[fans.corners])
+    if is_measured(mesh.GetPrim(), TEXTURING) and primvar:
+        uv = np.asarray(primvar.ComputeFlattened(_TIME), np.float32)[fans.corners]
+    if _is_mirrored(mesh):
+        triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
+        uv = None if uv is None else uv[:, [0, 2, 1]]
+        normals = None if normals is None else normals[:, [0, 2, 1]]
+    if normals is None:
+        in_world = corner_normals(points, triangles, crease_angle_deg)
+    else:
+        turned = normals @ np.linalg.inv(world_from_local[:3, :3])
+        unit = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        in_world = np.ascontiguousarray(unit, np.float32)
+    return _Mesh(points, triangles, in_world, uv)
 
 
 def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
@@ -182,35 +191,6 @@ def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
     )
 
 
-def _crease_angle_deg(stage: Usd.Stage) -> float:
-    """As the scan's layer records it; the default of ingest where no layer does."""
-    for layer in stage.GetLayerStack():
-        parameters = layer.customLayerData.get("usdbrdf", {}).get("parameters", {})
-        if "crease_angle_deg" in parameters:
-            return float(parameters["crease_angle_deg"])
-    return IngestOptions().crease_angle_deg
-
-
-def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
-    fans = triangulation_of(mesh)
-    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
-    meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
-    local = np.asarray(mesh.GetPointsAttr().Get(_TIME), np.float64).reshape(-1, 3)
-    world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
-    points = np.ascontiguousarray(world, np.float32)
-    triangles, uv = fans.triangles, read_corner_uv(mesh, fans)
-    normals = authored_normals(mesh, fans)
-    if _is_mirrored(mesh):
-        triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
-        uv = None if uv is None else np.ascontiguousarray(uv[:, [0, 2, 1]])
-        normals = None if normals is None else normals[:, [0, 2, 1]]
-    if normals is None:
-        in_world = corner_normals(points, triangles, crease_angle_deg)
-    else:
-        in_world = _unit(normals @ np.linalg.inv(world_from_local[:3, :3]))
-    return _Mesh(points=points, triangles=triangles, corner_normals=in_world, corner_uv=uv)
-
-
 def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
     return bool(np.linalg.det(np.array(mesh.ComputeLocalToWorldTransform(_TIME))[:3, :3]) < 0)
 
@@ -229,29 +209,11 @@ def authored_normals(
         return None
     normals = np.asarray(values, np.float64).reshape(-1, 3)
     element_of_corner = fans.element_of_corner(interpolation)
-    if element_of_corner.size and element_of_corner.max() >= len(normals):
+    if element_of_corner.max(initial=-1) >= len(normals):
         return None  # too few of them: the file is wrong about its normals, not about its shape
     chosen = normals[element_of_corner]
     usable = np.isfinite(chosen).all() and (np.linalg.norm(chosen, axis=-1) > 1e-12).all()
     return chosen if usable else None
-
-
-def _unit(vectors: npt.NDArray[np.float64]) -> Float:
-    unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.ascontiguousarray(unit, np.float32)
-
-
-def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
-    present = [mesh.corner_uv for mesh in meshes if mesh.corner_uv is not None]
-    if not present:
-        return None
-    if len(present) < len(meshes):
-        missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
-        raise InputRefused(
-            f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
-            "Run `usdbrdf texture` again. [stage.st]"
-        )
-    return np.concatenate(present)
 
 
 Record = TypeVar("Record")
@@ -261,6 +223,11 @@ def authored(prim: Usd.Prim, name: str) -> Any:
     """The authored value of an attribute: a schema's fallback is no measurement. Else None."""
     attribute = prim.GetAttribute(name)
     return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+
+
+def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
+    """Whether anybody measured of a prim what the schema is about."""
+    return authored(prim, schema.attribute(schema.key)) is not None
 
 
 def aov_path(stage: Usd.Stage, prim_path: str, aov: str) -> Path | None:
@@ -277,35 +244,19 @@ def read_aovs(stage: Usd.Stage, prim_path: str) -> tuple[Aov, ...]:
     return tuple(read_record(Aov, prim, name, name=name) for name in names)
 
 
-def read_texturing(stage: Usd.Stage, prim_path: str) -> TexturedObject | None:
-    """None before the task texture; ``aovs`` hold the maps of all tasks so far."""
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
-    if not is_measured(mesh.GetPrim(), TEXTURING):
-        return None
-    corner_uv = read_corner_uv(mesh, triangulation_of(mesh))
-    if corner_uv is None:
-        return None
-    aovs = read_aovs(stage, prim_path)
-    return _read_object(TexturedObject, mesh.GetPrim(), corner_uv=corner_uv, aovs=aovs)
-
-
-def read_shading(stage: Usd.Stage, prim_path: str) -> ShadedObject | None:
-    """None before the task shade; ``aovs`` hold the maps of all tasks so far."""
+def read_object(
+    kind: type[Record], schema: Schema, stage: Usd.Stage, prim_path: str, **others: Any
+) -> Record | None:
+    """What the task of a schema said of an object, its maps apart; None before that task."""
     prim = stage.GetPrimAtPath(prim_path)
-    if not is_measured(prim, SHADING):
+    if not is_measured(prim, schema):
         return None
-    return _read_object(ShadedObject, prim, aovs=read_aovs(stage, prim_path))
+    identifier = str(authored(prim, "usdBrdf:identifier"))
+    return read_record(kind, prim, prim_path=prim_path, identifier=identifier, **others)
 
 
-def read_fit(stage: Usd.Stage, prim_path: str) -> FittedObject | None:
-    """None before the task fit."""
-    prim = stage.GetPrimAtPath(prim_path)
-    return _read_object(FittedObject, prim) if is_measured(prim, FIT) else None
-
-
-def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
-    """Whether anybody measured of a prim what the schema is about."""
-    return authored(prim, schema.attribute(schema.key)) is not None
+read_shading = partial(read_object, ShadedObject, SHADING)
+read_fit = partial(read_object, FittedObject, FIT)
 
 
 def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others: Any) -> Record:
@@ -315,20 +266,12 @@ def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others
     for field, fact in rows:
         value = authored(prim, fact.attribute(instance))
         if value is not None and field not in fields:
-            fields[field] = fact.read(_plain(value))
+            if isinstance(value, Sdf.AssetPath):
+                value = value.path
+            elif isinstance(value, (Gf.Vec2i, Gf.Vec3f, Gf.Vec4d)):
+                value = tuple(value)
+            fields[field] = fact.read(value)
         if fact.schema.flag:
             fields[fact.schema.flag] = is_measured(prim, fact.schema)
     unknown = {field: fact.unknown for field, fact in reversed(rows)}
     return kind(**unknown | fields)
-
-
-def _read_object(kind: type[Record], prim: Usd.Prim, **others: Any) -> Record:
-    identifier = str(authored(prim, "usdBrdf:identifier"))
-    return read_record(kind, prim, prim_path=str(prim.GetPath()), identifier=identifier, **others)
-
-
-def _plain(value: Any) -> Any:
-    """A value of USD without its types: paths and words as text, vectors as tuples."""
-    if isinstance(value, Sdf.AssetPath):
-        return value.path
-    return tuple(value) if isinstance(value, (Gf.Vec2i, Gf.Vec3f, Gf.Vec4d)) else value
