@@ -3,7 +3,7 @@ UsdPreviewSurface networks, as they compose, into maps and numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from usdbrdf.asset.preview_lobe import fit_from_preview_surface
-from usdbrdf.asset.readers.scene import asset_file, authored_normals, triangulation_of
+from usdbrdf.asset.readers.scene import asset_file, authored, authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, is_eight_bit, read_exr, read_radiance
@@ -38,104 +38,13 @@ _WRAP = {"repeat": "repeat", "mirror": "mirror"}
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
-@dataclass(frozen=True, kw_only=True)
-class BoundMaterial:
-    """A material, and which primvars of a mesh it reads ("" for none).
+@dataclass(kw_only=True)
+class _MaterialReader:
+    """Reads the surface of a material, and gathers which primvars of a mesh that leads to ("" for
+    none).
 
     uv_from_st  (3, 3) of column vectors, a UsdTransform2d; None is the identity
     """
-
-    material: Material
-    uv_primvar: str = ""
-    colour_primvar: str = ""
-    uv_from_st: Float | None = None
-
-    @property
-    def without_diffuse(self) -> Material:
-        """With white in place of the diffuse colour, which the mesh brings per corner."""
-        return replace(self.material, diffuse=constant_map(1.0), base=None, metallic=None)
-
-    def transformed(self, st: Float) -> Float:
-        if self.uv_from_st is None:
-            return st
-        moved = st @ self.uv_from_st[:2, :2].T + self.uv_from_st[:2, 2]
-        return np.asarray(moved, np.float32)
-
-
-def fit_mappings(stage: Usd.Stage) -> dict[str, str]:
-    """What a fit recorded of the materials that its objects are bound to (usdBrdf:fit:mapping), by
-    material path; others are not in there."""
-    found = {}
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        mapping = prim.GetAttribute("usdBrdf:fit:mapping")
-        if mapping and mapping.HasAuthoredValue():
-            bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-            if bound:
-                found[str(bound.GetPath())] = str(mapping.Get())
-    return found
-
-
-def material_from_usd(
-    material: UsdShade.Material, time: Usd.TimeCode, warn: Callable[[str], None], mapping: str
-) -> BoundMaterial:
-    """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks of
-    UsdPreviewSurface with the mesh's display colour.
-
-    mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
-             comes back is the lobe that was meant
-    """
-    shader = material.ComputeSurfaceSource()[0] if material else None
-    if not shader or shader.GetShaderId() != "UsdPreviewSurface":
-        if material:
-            warn(f"<{material.GetPath()}>: no UsdPreviewSurface; shown in its display colour.")
-        return BoundMaterial(material=_material_of({}), colour_primvar="displayColor")
-    reader = _Reader(time=time, warn=warn)
-    inputs = {name: reader.read(shader.GetInput(name), value) for name, value in _FALLBACKS.items()}
-    if inputs.pop("opacity").min() < 1:
-        warn(f"<{material.GetPath()}>: opacity is not rendered; the surface is taken as opaque.")
-    if mapping == "matched":
-        inputs |= _as_fitted(inputs)
-    return BoundMaterial(
-        material=replace(_material_of(inputs), wrap=reader.wrap or "clamp"),
-        uv_primvar=reader.uv_primvar,
-        colour_primvar=reader.colour_primvar,
-        uv_from_st=reader.uv_from_st,
-    )
-
-
-def _as_fitted(inputs: dict[str, Float]) -> dict[str, Float]:
-    """ior and diffuse colour of the fitted lobe that is shown by what the surface is told.
-
-    A map of roughness counts by its mean. Metals and the specular workflow are never ours: those
-    stay as they are.
-    """
-    if inputs["metallic"].any() or inputs["useSpecularWorkflow"].any():
-        return {}
-    roughness, ior = float(inputs["roughness"].mean()), float(inputs["ior"].flat[0])
-    fitted = fit_from_preview_surface(roughness, ior, "matched")
-    return {
-        "ior": np.array([[[fitted.ior]]]),
-        "diffuseColor": np.asarray(inputs["diffuseColor"] / fitted.diffuse, np.float32),
-    }
-
-
-def _material_of(inputs: dict[str, Float]) -> Material:
-    known = {name: np.array(value, np.float32)[None, None] for name, value in _FALLBACKS.items()}
-    known |= inputs
-    specular_workflow = bool(known["useSpecularWorkflow"].flat[0])
-    return preview_material(
-        diffuse=known["diffuseColor"],
-        metallic=known["metallic"],
-        roughness=known["roughness"],
-        emission=known["emissiveColor"],
-        ior=float(known["ior"].flat[0]),
-        specular=known["specularColor"] if specular_workflow else None,
-    )
-
-
-@dataclass(kw_only=True)
-class _Reader:
-    """Reads the inputs of one surface and gathers which primvars they lead to."""
 
     time: Usd.TimeCode
     warn: Callable[[str], None]
@@ -144,7 +53,42 @@ class _Reader:
     uv_from_st: Float | None = None
     wrap: str = ""
 
-    def read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
+    def material(self, bound: UsdShade.Material, mapping: str) -> Material:
+        """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks
+        of UsdPreviewSurface with the mesh's display colour.
+
+        mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
+                 comes back is the lobe that was meant. A map of roughness counts by its mean.
+                 Metals and the specular workflow are never ours: those stay as they are
+        """
+        shader = bound.ComputeSurfaceSource()[0] if bound else None
+        path = bound.GetPath() if bound else ""
+        if not shader or shader.GetShaderId() != "UsdPreviewSurface":
+            if bound:
+                self.warn(f"<{path}>: no UsdPreviewSurface; shown in its display colour.")
+            shader, mapping, self.colour_primvar = None, "", "displayColor"
+        known = {
+            name: self._read(shader.GetInput(name) if shader else None, fallback)
+            for name, fallback in _FALLBACKS.items()
+        }
+        if known["opacity"].min() < 1:
+            self.warn(f"<{path}>: opacity is not rendered; the surface is taken as opaque.")
+        ior, never_ours = float(known["ior"].flat[0]), ("metallic", "useSpecularWorkflow")
+        if mapping == "matched" and not any(known[name].any() for name in never_ours):
+            fitted = fit_from_preview_surface(float(known["roughness"].mean()), ior, "matched")
+            known["diffuseColor"] = np.asarray(known["diffuseColor"] / fitted.diffuse, np.float32)
+            ior = fitted.ior
+        material = preview_material(
+            diffuse=known["diffuseColor"],
+            metallic=known["metallic"],
+            roughness=known["roughness"],
+            emission=known["emissiveColor"],
+            ior=ior,
+            specular=known["specularColor"] if known["useSpecularWorkflow"].flat[0] else None,
+        )
+        return replace(material, wrap=self.wrap or "clamp")
+
+    def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""
         plain = np.array(fallback, np.float32)[None, None]
         source = _source(wanted)
@@ -153,16 +97,15 @@ class _Reader:
         shader, output = source
         kind = shader.GetShaderId()
         if kind == "UsdUVTexture":
-            return self._texture(shader, output, plain)
+            return self._texture(shader, output, len(fallback))
         if kind == "UsdPrimvarReader_float3" and len(fallback) == 3:
             self.colour_primvar = str(_value(shader.GetInput("varname"), self.time) or "")
             return plain
         self.warn(f"<{shader.GetPath()}>: {kind or 'a node'} is not rendered; its input is.")
         return plain
 
-    def _texture(self, shader: UsdShade.Shader, output: str, plain: Float) -> Float:
+    def _texture(self, shader: UsdShade.Shader, output: str, channels: int) -> Float:
         self._uv(shader)
-        channels = plain.shape[2]
         self._wrap(shader)
         unread = self._numbers(shader.GetInput("fallback"), (0, 0, 0, 1))
         named = shader.GetInput("file")
@@ -182,19 +125,16 @@ class _Reader:
     def _uv(self, texture: UsdShade.Shader) -> None:
         source = _source(texture.GetInput("st"))
         if source is not None and source[0].GetShaderId() == "UsdTransform2d":
-            self.uv_from_st = self._transform_2d(source[0])
-            source = _source(source[0].GetInput("in"))
+            # Scale, then rotate counter-clockwise, then translate.
+            node = source[0]
+            turn = np.radians(self._numbers(node.GetInput("rotation"), (0,))[0])
+            scale = self._numbers(node.GetInput("scale"), (1, 1))
+            matrix = np.eye(3, dtype=np.float32)
+            matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
+            matrix[:2, 2] = self._numbers(node.GetInput("translation"), (0, 0))
+            self.uv_from_st, source = matrix, _source(node.GetInput("in"))
         if source is not None:
             self.uv_primvar = str(_value(source[0].GetInput("varname"), self.time) or "st")
-
-    def _transform_2d(self, shader: UsdShade.Shader) -> Float:
-        """(3, 3) of UsdTransform2d: scale, then rotate counter-clockwise, then translate."""
-        turn = np.radians(self._numbers(shader.GetInput("rotation"), (0,))[0])
-        scale = self._numbers(shader.GetInput("scale"), (1, 1))
-        matrix = np.eye(3, dtype=np.float32)
-        matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
-        matrix[:2, 2] = self._numbers(shader.GetInput("translation"), (0, 0))
-        return matrix
 
     def _wrap(self, texture: UsdShade.Shader) -> None:
         modes = [str(_value(texture.GetInput(name), self.time)) for name in ("wrapS", "wrapT")]
@@ -209,9 +149,8 @@ class _Reader:
     def _numbers(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(N,) float32 of a plain value; the fallback where it has another type or is not
         finite."""
-        value = _value(wanted, self.time)
-        usable = np.array(fallback, np.float32)
-        if value is None:
+        value, usable = _value(wanted, self.time), np.array(fallback, np.float32)
+        if wanted is None or value is None:
             return usable
         try:
             numbers = np.array(value, np.float32).ravel()
@@ -219,7 +158,6 @@ class _Reader:
             numbers = np.empty(0, np.float32)
         if numbers.size == usable.size and np.isfinite(numbers).all():
             return numbers
-        assert wanted is not None
         self.warn(
             f"<{wanted.GetAttr().GetPath()}>: {value!r} is not {usable.size} finite number(s); "
             "its fallback is shown."
@@ -234,9 +172,7 @@ def read_texture(file: Path, space: str) -> Float:
     else:
         texels = np.repeat(read_exr(file)[..., :1], 3, axis=2)
     texels = np.nan_to_num(texels, nan=0.0, posinf=0.0, neginf=0.0)
-    if is_srgb(file, space):
-        return to_working_space(texels, "srgb_rec709_scene")
-    return texels
+    return to_working_space(texels, "srgb_rec709_scene") if is_srgb(file, space) else texels
 
 
 def is_srgb(file: Path, space: str) -> bool:
@@ -278,8 +214,8 @@ _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
 class _Reading(NamedTuple):
-    """When the stage is looked at, how its fits were mapped to materials, and who is told what is
-    left out."""
+    """When the stage is looked at; what a fit recorded of the materials that its objects are bound
+    to (usdBrdf:fit:mapping), by material path; and who is told what is left out."""
 
     time: Usd.TimeCode
     mappings: Mapping[str, str]
@@ -296,10 +232,16 @@ def surfaces_from_stage(
     subject  what these sentences are about; None: the stage's root layer
     """
     surfaces: list[Surface] = []
-    transforms = UsdGeom.XformCache(time)
     left_out: list[Usd.Prim] = []
-    reading = _Reading(time, fit_mappings(stage), warn)
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
+    prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    mappings = {
+        str(bound.GetPath()): str(mapping)
+        for prim in prims
+        if (mapping := authored(prim, "usdBrdf:fit:mapping")) is not None
+        if (bound := UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0])
+    }
+    reading, transforms = _Reading(time, mappings, warn), UsdGeom.XformCache(time)
+    for prim in prims:
         if not prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.PointInstancer):
             continue
         imageable = UsdGeom.Imageable(prim)
@@ -345,71 +287,56 @@ def _surfaces_of_mesh(
             f"<{mesh.GetPath()}>: the mesh has points that are not finite. Repair or deactivate "
             "it. [relight.mesh]"
         )
-    normals = _normals(mesh, fans, time)
-    if normals is None:
+    given = authored_normals(mesh, fans, time)
+    if given is None:
         normals = corner_normals(np.asarray(points, np.float32), fans.triangles, _CREASE_ANGLE_DEG)
-    parts = []
-    for faces, material in _faces_by_material(mesh, fans, reading):
-        colour = _primvar(mesh, material.colour_primvar, 3, fans, time)
-        uv = _primvar(mesh, material.uv_primvar, 2, fans, time)
-        if uv is None and material.uv_primvar:
-            warn(f"<{mesh.GetPath()}>: no primvars:{material.uv_primvar} for its textures.")
-        parts.append(
-            Surface(
-                name=str(mesh.GetPath()),
-                points=points,
-                triangles=fans.triangles[faces],
-                corner_normals=normals[faces],
-                corner_uv=None if uv is None else material.transformed(uv[faces]),
-                corner_colour=None if colour is None else colour[faces],
-                material=material.material if colour is None else material.without_diffuse,
-                two_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
-            )
-        )
+    else:
+        normals = np.asarray(given, np.float32)
+        normals = np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True), np.float32)
     metres = metres_from_units(mesh.GetPrim().GetStage())
-    return [_tidy(part).moved(metres @ world_from_local) for part in parts]
-
-
-def _tidy(part: Surface) -> Surface:
-    """Without the points that its triangles do not use."""
-    used, triangles = np.unique(part.triangles, return_inverse=True)
-    return replace(
-        part, points=part.points[used], triangles=np.asarray(triangles, np.int32).reshape(-1, 3)
-    )
+    surfaces = []
+    for faces, bound in _faces_by_material(mesh, fans, time):
+        reader = _MaterialReader(time=time, warn=warn)
+        mapping = reading.mappings.get(str(bound.GetPath()), "") if bound else ""
+        material = reader.material(bound, mapping)
+        colour = _primvar(mesh, reader.colour_primvar, 3, fans, time)
+        if colour is not None:
+            material = replace(material, diffuse=constant_map(1.0), base=None, metallic=None)
+        uv = _primvar(mesh, reader.uv_primvar, 2, fans, time)
+        if uv is None and reader.uv_primvar:
+            warn(f"<{mesh.GetPath()}>: no primvars:{reader.uv_primvar} for its textures.")
+        elif uv is not None and (moved := reader.uv_from_st) is not None:
+            uv = np.asarray(uv @ moved[:2, :2].T + moved[:2, 2], np.float32)
+        used, triangles = np.unique(fans.triangles[faces], return_inverse=True)
+        surface = Surface(
+            name=str(mesh.GetPath()),
+            points=points[used],
+            triangles=np.asarray(triangles, np.int32).reshape(-1, 3),
+            corner_normals=normals[faces],
+            corner_uv=None if uv is None else uv[faces],
+            corner_colour=None if colour is None else colour[faces],
+            material=material,
+            two_sided=bool(mesh.GetDoubleSidedAttr().Get(time)),
+        )
+        surfaces.append(surface.moved(metres @ world_from_local))
+    return surfaces
 
 
 def _faces_by_material(
-    mesh: UsdGeom.Mesh, fans: Triangulation, reading: _Reading
-) -> list[tuple[npt.NDArray[np.intp], BoundMaterial]]:
+    mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode
+) -> Iterator[tuple[npt.NDArray[np.intp], UsdShade.Material]]:
     """Triangles of each bound material; what no subset claims has the mesh's own."""
     own = UsdShade.MaterialBindingAPI(mesh.GetPrim())
     rest = np.ones(len(fans.triangles), np.bool_)
-    found = []
     for subset in own.GetMaterialBindSubsets():
-        polygons = np.asarray(subset.GetIndicesAttr().Get(reading.time) or [], np.int32)
+        polygons = np.asarray(subset.GetIndicesAttr().Get(time) or [], np.int32)
         chosen = np.isin(fans.polygon, polygons) & rest
         rest &= ~chosen
         if chosen.any():
             bound = UsdShade.MaterialBindingAPI(subset.GetPrim())
-            found.append((np.flatnonzero(chosen), _bound(bound, reading)))
+            yield np.flatnonzero(chosen), bound.ComputeBoundMaterial()[0]
     if rest.any():
-        found.append((np.flatnonzero(rest), _bound(own, reading)))
-    return found
-
-
-def _bound(binding: UsdShade.MaterialBindingAPI, reading: _Reading) -> BoundMaterial:
-    material, _ = binding.ComputeBoundMaterial()
-    mapping = reading.mappings.get(str(material.GetPath()), "") if material else ""
-    return material_from_usd(material, reading.time, reading.warn, mapping)
-
-
-def _normals(mesh: UsdGeom.Mesh, fans: Triangulation, time: Usd.TimeCode) -> Float | None:
-    """(T, 3, 3) authored unit normals; None where there are none to use."""
-    authored = authored_normals(mesh, fans, time)
-    if authored is None:
-        return None
-    normals = np.asarray(authored, np.float32)
-    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True), np.float32)
+        yield np.flatnonzero(rest), own.ComputeBoundMaterial()[0]
 
 
 def _primvar(
