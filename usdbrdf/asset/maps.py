@@ -3,6 +3,7 @@ pictures for people: a map on the surface, as one of the capture's cameras would
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -60,26 +61,28 @@ class Overview:
 def overview(scene: Scene, rays: RayScene, frames: Frames) -> Overview:
     """The view of the frame that sees the most objects, at most 640 pixels wide."""
     chosen = overview_frame(scene, rays, frames)
-    width, height = (int(n) for n in frames.resolution[chosen])
-    scale = min(1.0, _MAX_WIDTH / width)
-    size = max(1, round(scale * width)), max(1, round(scale * height))
-    return Overview(
-        scene=scene, hits=camera_hits(rays, frames, chosen, *size), width=size[0], height=size[1]
-    )
+    width, height = _reduced(frames, chosen, _MAX_WIDTH / int(frames.resolution[chosen, 0]))
+    hits = camera_hits(rays, frames, chosen, width, height)
+    return Overview(scene=scene, hits=hits, width=width, height=height)
 
 
 def overview_frame(scene: Scene, rays: RayScene, frames: Frames) -> int:
     """The frame with the most objects in view, the first of equals."""
     count = min(len(frames), _CANDIDATES)
-    candidates = np.linspace(0, len(frames) - 1, count).round().astype(int)
-    return int(max(candidates, key=lambda i: _objects_in_view(scene, rays, frames, int(i))))
+    candidates = np.linspace(0, len(frames) - 1, count).round().astype(int).tolist()
+
+    def objects_in_view(i: int) -> int:
+        scale = float(np.sqrt(_RAYS / math.prod(frames.resolution[i].tolist())))
+        hits = camera_hits(rays, frames, i, *_reduced(frames, i, scale))
+        return len(np.unique(scene.face_object[hits.face[hits.face >= 0]]))
+
+    return int(max(candidates, key=objects_in_view))
 
 
-def _objects_in_view(scene: Scene, rays: RayScene, frames: Frames, i: int) -> int:
-    width, height = (int(n) for n in frames.resolution[i])
-    scale = min(1.0, float(np.sqrt(_RAYS / (width * height))))
-    hits = camera_hits(rays, frames, i, max(1, round(scale * width)), max(1, round(scale * height)))
-    return len(np.unique(scene.face_object[hits.face[hits.face >= 0]]))
+def _reduced(frames: Frames, i: int, scale: float) -> tuple[int, int]:
+    """Width and height of a frame times ``scale``, which enlarges nothing."""
+    width, height = (max(1, round(min(1.0, scale) * n)) for n in frames.resolution[i].tolist())
+    return width, height
 
 
 def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int) -> Hits:

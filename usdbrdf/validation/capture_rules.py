@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from usdbrdf.asset.layers.scan_layer import LENS, lens_from_pinhole
-from usdbrdf.asset.readers.scene import authored
+from usdbrdf.asset.layers.scan_layer import lens_from_pinhole
+from usdbrdf.asset.readers.scene import LENS, authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule
 

@@ -93,10 +93,8 @@ def attribute_per_frame(
     *,
     always: bool = False,
 ) -> None:
-    """An attribute that has ``values[i]`` at time code i + 1, and the first by default.
-
-    Without ``always`` a constant gets no samples: it is easier to override then.
-    """
+    """An attribute that has ``values[i]`` at time code i + 1, and the first by default. Without
+    ``always`` a constant gets no samples: it is easier to override then."""
     varies = always or any(value != values[0] for value in values)
     samples = {float(i + 1): value for i, value in enumerate(values)} if varies else {}
     attribute(prim, name, type_name, values[0], samples=samples)
@@ -164,22 +162,19 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
             raise failure from error
         if not stored or stored.defaultPrim != layer.defaultPrim:
             raise failure
-        _check_composition(stored, path, folder)
+
+        def absolute(asset: str) -> str:
+            return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
+
+        UsdUtils.ModifyAssetPaths(stored, absolute)
+        # Each layer is checked when it is written; what lies there now may be damaged, about to be
+        # replaced, or the artist's.
+        stored.subLayerPaths = []
+        stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
+        problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
+        if problems:
+            raise UsdBrdfError(
+                f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of "
+                "usdbrdf; please report it. [stage.composition]"
+            )
         os.replace(written, path)
-
-
-def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
-    def absolute(asset: str) -> str:
-        return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
-
-    UsdUtils.ModifyAssetPaths(stored, absolute)
-    # Each layer is checked when it is written; what lies there now may be damaged, about to be
-    # replaced, or the artist's.
-    stored.subLayerPaths = []
-    stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
-    problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
-    if problems:
-        raise UsdBrdfError(
-            f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of usdbrdf; "
-            "please report it. [stage.composition]"
-        )

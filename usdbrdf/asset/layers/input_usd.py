@@ -210,8 +210,7 @@ def weaken_bindings(layer: Sdf.Layer, mesh: Usd.Prim, source: Usd.Prim, root: st
 
 def recorded_bindings(asset: Asset) -> dict[str, Competing]:
     """What the scan layer lists, per object's prim path; empty where the geometry is ours."""
-    layer = asset.layer("scan")
-    recorded = read_provenance(layer).get("competing_bindings", {}) if layer.is_file() else {}
+    recorded = read_provenance(asset.layer("scan")).get("competing_bindings", {})
     return {prim_path: dict(found) for prim_path, found in recorded.items()}
 
 

@@ -65,7 +65,18 @@ def write_lights_layer(
         layer.GetPrimAtPath(scopes.root).variantSelections[VARIANT_SET] = EMISSIVE
         define(layer, _within(usdlux, scopes.path("lights")), "Scope")
         for lamp in shaped:
-            _author_lamp(layer, usdlux, draft, lamp, world_from_root)
+            lights = _within(usdlux, scopes.path("lights", lamp.identifier))
+            define(layer, lights, "Scope")
+            for number, shape in enumerate(lamp.shapes, start=1):
+                prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
+                _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
+            # The lamp itself must not shine beside them.
+            texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
+            prim = over(layer, _within(usdlux, texture))
+            author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
+            if lamp.shapes[0].kind == "sphere":
+                hidden = over(layer, _within(usdlux, lamp.prim_path))
+                attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
     export(layer, path, folder=path.parent)
 
 
@@ -73,24 +84,6 @@ def world_from_root(stage: Usd.Stage) -> Double:
     """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
     cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
-
-
-def _author_lamp(
-    layer: Sdf.Layer, variant: Sdf.Path, draft: Draft, lamp: Lamp, world_from_root: Double
-) -> None:
-    """The lights, and what keeps the lamp itself from shining beside them."""
-    scopes = draft.scopes
-    lights = _within(variant, scopes.path("lights", lamp.identifier))
-    define(layer, lights, "Scope")
-    for number, shape in enumerate(lamp.shapes, start=1):
-        prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
-        _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
-    texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
-    prim = over(layer, _within(variant, texture))
-    author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
-    if lamp.shapes[0].kind == "sphere":
-        hidden = over(layer, _within(variant, lamp.prim_path))
-        attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
 
 
 def _within(variant: Sdf.Path, path: str) -> str:

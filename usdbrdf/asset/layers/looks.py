@@ -6,9 +6,7 @@ and local opinions beat variants: every look would show the same material."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
 
 from pxr import Gf, Sdf
 
@@ -43,13 +41,8 @@ def surface(
 
     ``specularColor`` stays away: some applications multiply it onto the reflectance of ``ior``.
     """
-    shader = f"{material}/{SURFACE}"
-    connect(
-        define(layer, material, "Material"),
-        "outputs:surface",
-        Types.Token,
-        f"{shader}.outputs:surface",
-    )
+    shader, prim = f"{material}/{SURFACE}", define(layer, material, "Material")
+    connect(prim, "outputs:surface", Types.Token, f"{shader}.outputs:surface")
     prim = node(layer, shader, "UsdPreviewSurface", "surface", Types.Token)
     author_inputs(prim, Types.Int, useSpecularWorkflow=0)
     author_inputs(prim, Types.Float, metallic=0.0)
@@ -99,31 +92,14 @@ def colour_from_texture(
     author_inputs(prim, Types.Float4, fallback=Gf.Vec4f(*map(float, fallback), 1.0))
     if scale != 1.0:
         scale_texture(layer, material, texture, scale)
-    shader = over(layer, f"{material}/{SURFACE}")
-    source = f"{material}/{texture}.outputs:rgb"
-    connected = connect(shader, f"inputs:{surface_input}", Types.Color3f, source)
-    connected.ClearDefaultValue()
+    shader, source = over(layer, f"{material}/{SURFACE}"), f"{material}/{texture}.outputs:rgb"
+    connect(shader, f"inputs:{surface_input}", Types.Color3f, source).ClearDefaultValue()
 
 
 def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -> None:
     """A factor on the colour of a texture that this layer, or a weaker one, defines."""
     prim = over(layer, f"{material}/{texture}")
     author_inputs(prim, Types.Float4, scale=Gf.Vec4f(scale, scale, scale, 1.0))
-
-
-def unlit_texture(layer: Sdf.Layer, material: str, file: str, scale: float) -> None:
-    """A material that glows with a map and reflects nothing, so that any viewer shows the map.
-
-    A map of one channel shows as grey: applications repeat it over red, green and blue.
-    """
-    surface(layer, material)
-    colour_from_texture(layer, material, "emissiveColor", "AovTexture", file, scale=scale)
-
-
-def unlit_colour(layer: Sdf.Layer, material: str, colour: Colour) -> None:
-    """A material that glows with one linear colour and reflects nothing."""
-    shader = surface(layer, material)
-    author_inputs(shader, Types.Color3f, emissiveColor=Gf.Vec3f(*map(float, colour)))
 
 
 VARIANT_SET = "look"
@@ -135,7 +111,6 @@ NO_DATA_COLOUR = (0.5, 0.0, 0.5)
 Bindings = Mapping[str, str]
 # What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
 Shown = Aov | Colour | None
-Measured = TypeVar("Measured", bound=MeasuredObject)
 
 
 def author_looks(
@@ -164,26 +139,28 @@ def author_look_materials(
     layer: Sdf.Layer,
     scopes: Scopes,
     look: str,
-    objects: Sequence[Measured],
-    shown_of: Callable[[Measured], Shown],
+    objects: Sequence[MeasuredObject],
+    shown: Sequence[Shown],
 ) -> dict[str, str]:
-    """Unlit materials for one look, one per object, and how they are bound.
+    """Materials for one look that glow and reflect nothing, so that any viewer shows what they
+    are about: one per object, which has its place in ``shown``; and how they are bound.
 
-    Objects of which there is nothing to show share one material that says so.
+    A map of one channel shows as grey: applications repeat it over red, green and blue. Objects of
+    which there is nothing to show share one material that says so.
     """
     define(layer, scopes.path("looks"), "Scope")
     define(layer, scopes.path("looks", look), "Scope")
     bindings = {}
-    for item in objects:
-        material, shown = scopes.path("looks", look, item.identifier), shown_of(item)
-        if isinstance(shown, Aov):
-            unlit_texture(layer, material, shown.file, shown.scale)
-        elif shown is not None:
-            unlit_colour(layer, material, shown)
+    for item, glow in zip(objects, shown, strict=True):
+        own, nothing = scopes.path("looks", look, item.identifier), scopes.path("looks", NO_DATA)
+        material = bindings[item.prim_path] = nothing if glow is None else own
+        shader = surface(layer, material)
+        if isinstance(glow, Aov):
+            texture = ("emissiveColor", "AovTexture", glow.file)
+            colour_from_texture(layer, material, *texture, scale=glow.scale)
         else:
-            material = scopes.path("looks", NO_DATA)
-            unlit_colour(layer, material, NO_DATA_COLOUR)
-        bindings[item.prim_path] = material
+            colour = Gf.Vec3f(*map(float, glow or NO_DATA_COLOUR))
+            author_inputs(shader, Types.Color3f, emissiveColor=colour)
     return bindings
 
 
@@ -194,12 +171,8 @@ def aov_looks(
     hidden: frozenset[str] = frozenset(),
 ) -> dict[str, dict[str, str]]:
     """One look per map that any object has, with a binding for every object."""
-    names = {aov.name: None for item in objects for aov in item.aovs if aov.name not in hidden}
+    maps = [{aov.name: aov for aov in item.aovs} for item in objects]
     return {
-        name: author_look_materials(layer, scopes, name, objects, partial(_map_of, name=name))
-        for name in names
+        name: author_look_materials(layer, scopes, name, objects, [own.get(name) for own in maps])
+        for name in dict.fromkeys(name for own in maps for name in own if name not in hidden)
     }
-
-
-def _map_of(item: MeasuredObject, name: str) -> Aov | None:
-    return next((aov for aov in item.aovs if aov.name == name), None)

@@ -34,6 +34,7 @@ from usdbrdf.asset.layers.input_usd import (
 )
 from usdbrdf.asset.layout import ROLES, Asset, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, known_facts
+from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
@@ -95,13 +96,6 @@ def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
 
 
 Types = Sdf.ValueTypeNames
-LENS = (
-    "focalLength",
-    "horizontalAperture",
-    "verticalAperture",
-    "horizontalApertureOffset",
-    "verticalApertureOffset",
-)
 APERTURE_MM = 36.0
 NEAR_M, FAR_M = 0.01, 1000.0
 
@@ -119,7 +113,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
         adapter=scan.adapter,
         radiometric=frames.radiometric,
         counts=scan.counts,
-        scopes=scopes.names(),
+        scopes=scopes.names,
         competing_bindings=competing or None,
     )
     # A typed root would hide the input's own type.

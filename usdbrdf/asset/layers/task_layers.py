@@ -8,7 +8,7 @@ emission the variants of the lights switch off."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,6 @@ from usdbrdf.asset.layers.looks import (
     LIT,
     SHADED,
     SURFACE,
-    Shown,
     aov_looks,
     author_look_materials,
     author_looks,
@@ -67,20 +66,21 @@ def write_texturing_layer(
     with Sdf.ChangeBlock():
         for item in objects:
             declared = scanned.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
-            author_texture_coordinates(
-                over(coordinates, item.prim_path),
-                item.corner_uv,
-                declared.GetTypeName() if declared else Types.TexCoord2fArray,
-            )
+            kind = declared.GetTypeName() if declared else Types.TexCoord2fArray
+            _author_texture_coordinates(over(coordinates, item.prim_path), item.corner_uv, kind)
             author_record(over(layer, item.prim_path), item)
-    _author_thumbnail(layer.GetPrimAtPath(scopes.root))
+    # What browsers of assets show: the picture that the task writes beside the layer.
+    root = layer.GetPrimAtPath(scopes.root)
+    apply_schema(root, "AssetPreviewsAPI")
+    picture = {"defaultImage": Sdf.AssetPath(path_in_layer(THUMBNAIL))}
+    root.SetInfo("assetInfo", {"previews": {"thumbnails": {"default": picture}}})
     author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=LIT)
     export(coordinates, uv_path, folder=folder)
     export(layer, path, folder=folder)
 
 
-def author_texture_coordinates(
-    prim: Sdf.PrimSpec, corner_uv: Float, declared: Sdf.ValueTypeName = Types.TexCoord2fArray
+def _author_texture_coordinates(
+    prim: Sdf.PrimSpec, corner_uv: Float, declared: Sdf.ValueTypeName
 ) -> None:
     """primvars:st, one value per triangle corner; equal values are stored once and indexed.
 
@@ -93,14 +93,6 @@ def author_texture_coordinates(
     values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
     attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
     attribute(prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32))
-
-
-def _author_thumbnail(root: Sdf.PrimSpec) -> None:
-    """What browsers of assets show: the picture that the task texture writes beside the layer."""
-    apply_schema(root, "AssetPreviewsAPI")
-    picture = Sdf.AssetPath(path_in_layer(THUMBNAIL))
-    thumbnails = {"default": {"defaultImage": picture}}
-    root.SetInfo("assetInfo", {"previews": {"thumbnails": thumbnails}})
 
 
 ALBEDO, EMISSION = "albedo", "emission"
@@ -125,33 +117,29 @@ def write_shading_layer(path: Path, draft: Draft, objects: Sequence[ShadedObject
     define(layer, scopes.path("materials"), "Scope")
     for item in objects:
         author_record(over(layer, item.prim_path), item)
-        _author_material(layer, scopes, item)
+        # Diffuse only: the lobe is what the task fit adds, in a stronger layer.
+        material = scopes.path("materials", item.identifier)
+        surface(layer, material)
+        files = {aov.name: aov.file for aov in item.aovs}
+        wanted = EMISSION if item.emitter else ALBEDO
+        if wanted not in files:
+            raise UsdBrdfError(
+                f"<{item.prim_path}>: the task shade delivered no {wanted} map. This is a defect "
+                "of usdbrdf; please report it. [stage.aov]"
+            )
+        # An emitter reflects nothing that could be measured; other objects may glow in places.
+        inputs = [("emissiveColor", EMISSION_TEXTURE, EMISSION, item.radiance)]
+        if not item.emitter:
+            inputs.append(("diffuseColor", ALBEDO_TEXTURE, ALBEDO, item.mean_albedo))
+        for name, texture, aov, mean in inputs:
+            if aov in files:
+                colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
     # Emission is not a look: it is nothing on most objects, and the shaded look shows it.
     looks = aov_looks(layer, scopes, objects, hidden=frozenset([EMISSION]))
     looks[SHADED] = {item.prim_path: scopes.path("materials", item.identifier) for item in objects}
     author_looks(layer, draft, looks, selected=SHADED)
     _author_render_outputs(layer, scopes)
     export(layer, path, folder=asset.layer("shading").parent)
-
-
-def _author_material(layer: Sdf.Layer, scopes: Scopes, item: ShadedObject) -> None:
-    """Diffuse only: the lobe is what the task fit adds, in a stronger layer."""
-    material = scopes.path("materials", item.identifier)
-    surface(layer, material)
-    files = {aov.name: aov.file for aov in item.aovs}
-    wanted = EMISSION if item.emitter else ALBEDO
-    if wanted not in files:
-        raise UsdBrdfError(
-            f"<{item.prim_path}>: the task shade delivered no {wanted} map. This is a defect of "
-            "usdbrdf; please report it. [stage.aov]"
-        )
-    # An emitter reflects nothing that could be measured; other objects may glow in places.
-    inputs = [("emissiveColor", EMISSION_TEXTURE, EMISSION, item.radiance)]
-    if not item.emitter:
-        inputs.append(("diffuseColor", ALBEDO_TEXTURE, ALBEDO, item.mean_albedo))
-    for name, texture, aov, mean in inputs:
-        if aov in files:
-            colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
 
 
 def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
@@ -186,31 +174,25 @@ def write_material_layer(
         shown = NO_LOBE
         if item.is_known:
             shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
-            _author_lobe(layer, material, shown)
+            lobe(layer, material, shown.roughness, shown.ior)
+            shader = over(layer, f"{material}/{SURFACE}")
+            author_inputs(shader, Types.Float, metallic=0.0)
+            author_inputs(shader, Types.Int, useSpecularWorkflow=0)
         texture = _author_colour(layer, material, item, shown.diffuse, shading)
         if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
             networks[material] = (shown, texture)
-    looks = {
-        **aov_looks(layer, scopes, objects),
-        "roughness": author_look_materials(
-            layer, scopes, "roughness", objects, lambda item: _grey(item, item.phi)
-        ),
-        "specular": author_look_materials(
-            layer, scopes, "specular", objects, lambda item: _grey(item, item.psi)
-        ),
-    }
+    looks = aov_looks(layer, scopes, objects)
+    for look, parameter in (("roughness", "phi"), ("specular", "psi")):
+        greys = [(getattr(i, parameter),) * 3 if i.is_known else None for i in objects]
+        looks[look] = author_look_materials(layer, scopes, look, objects, greys)
     author_looks(layer, draft, looks, selected=SHADED)
     if materialx:
         layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
-        _write_materialx(materialx, draft, networks)
+        beneath = draft.new_layer()
+        for material, (shown, texture) in networks.items():
+            _author_network(beneath, material, shown, texture)
+        export(beneath, materialx, folder=asset.materialx_layer.parent)
     export(layer, path, folder=asset.layer("material").parent)
-
-
-def _author_lobe(layer: Sdf.Layer, material: str, shown: PreviewLobe) -> None:
-    lobe(layer, material, shown.roughness, shown.ior)
-    shader = over(layer, f"{material}/{SURFACE}")
-    author_inputs(shader, Types.Float, metallic=0.0)
-    author_inputs(shader, Types.Int, useSpecularWorkflow=0)
 
 
 def _author_colour(
@@ -233,22 +215,9 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _grey(item: FittedObject, parameter: float) -> Shown:
-    return (parameter,) * 3 if item.is_known else None
-
-
-def _write_materialx(
-    path: Path, draft: Draft, materials: Mapping[str, tuple[PreviewLobe, str]]
-) -> None:
-    """Write materialx.usda to ``path``. materials, by prim path: what UsdPreviewSurface is told,
-    and the texture of its diffuse colour as layers spell its path; "" is black."""
-    layer = draft.new_layer()
-    for material, (shown, texture) in materials.items():
-        _author_network(layer, material, shown, texture)
-    export(layer, path, folder=draft.asset.materialx_layer.parent)
-
-
 def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
+    """OpenPBR with what UsdPreviewSurface is told; ``file`` is the texture of its diffuse colour as
+    layers spell its path, "" is black."""
     surface = f"{material}/OpenPBR"
     connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
     prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)

@@ -85,12 +85,11 @@ def try_in_child(layer: Path, *, composes: bool = True) -> None:
 
 def open_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
     """The child's part of ``try_in_child``."""
-    layer = Path(parameters["layer"])
     if parameters["composes"]:
-        open_stage(layer)
+        open_stage(Path(parameters["layer"]))
     else:
         with suppress(Tf.ErrorException):
-            Usd.Stage.Open(str(layer))
+            Usd.Stage.Open(parameters["layer"])
     return {}
 
 
@@ -169,7 +168,6 @@ def hashes_of_inputs(
 ) -> dict[str, str]:
     """By label the SHA-256 of all that a task of ``role`` reads: the weaker layers and the USD
     geometry that they refer to, the maps ``aovs``, the photographs, the picture of the sky."""
-    layers = _weaker_layers(asset, role)
     files = {
         "geometry": maps.layers_elsewhere(asset.folder),
         "environment": [environment] if environment else [],
@@ -180,7 +178,7 @@ def hashes_of_inputs(
         raise InputRefused(
             f"{environment}: no such file. Check --environment. [shading.environment]"
         )
-    by_label = {layer.name: sha256_of(layer) for layer in layers}
+    by_label = {layer.name: sha256_of(layer) for layer in _weaker_layers(asset, role)}
     return by_label | {label: hash_of_files(some) for label, some in files.items() if some}
 
 

@@ -33,6 +33,13 @@ from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
 
+LENS = (
+    "focalLength",
+    "horizontalAperture",
+    "verticalAperture",
+    "horizontalApertureOffset",
+    "verticalApertureOffset",
+)
 _IMAGE = CAPTURE.attribute(CAPTURE.key)
 
 

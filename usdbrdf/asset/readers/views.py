@@ -67,7 +67,21 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
             f"{source}: {'no views' if not records else 'two views have images of one name'}. "
             "Correct the document. [relight.views]"
         )
-    return tuple(_camera(record, metres_per_unit) for record in records)
+    cameras = []
+    for record in records:
+        pose = record.world_from_camera.copy()
+        pose[:3, 3] *= metres_per_unit
+        width, height = record.resolution
+        cameras.append(
+            Camera(
+                name=record.name,
+                world_from_camera=pose,
+                intrinsics=record.intrinsics,
+                width=width,
+                height=height,
+            )
+        )
+    return tuple(cameras)
 
 
 def photographs_of_views(
@@ -113,19 +127,6 @@ def _rigid_records(
     records = frame_records(source, options, findings, images=images)
     pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
     return rigid_records(records, findings, source, pose_scale=pose_scale)
-
-
-def _camera(record: FrameRecord, metres_per_unit: float) -> Camera:
-    pose = record.world_from_camera.copy()
-    pose[:3, 3] *= metres_per_unit
-    width, height = record.resolution
-    return Camera(
-        name=record.name,
-        world_from_camera=pose,
-        intrinsics=record.intrinsics,
-        width=width,
-        height=height,
-    )
 
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
