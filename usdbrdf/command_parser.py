@@ -13,7 +13,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -53,7 +53,12 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
     app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
-    app.default(_signed(commands[name]))
+
+    def bound() -> None: ...
+
+    signed: Any = bound
+    signed.__signature__ = inspect.Signature([_argument(said) for said in _said(commands[name])])
+    app.default(signed)
     try:
         _, given, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except CycloptsError as error:
@@ -72,19 +77,16 @@ class _Said(NamedTuple):
     title: str
 
 
-def _all_said(owner: type[Options], title: str = "") -> Iterator[_Said]:
-    for field in option_fields(owner):
-        if field.option is None:
-            yield from _all_said(field.kind, title or field.name.removeprefix("options"))
-        else:
-            yield _Said(field.option, field, owner, field.option.shared or title)
-
-
-def _said(owner: type[Options]) -> list[_Said]:
+def _said(owner: type[Options], title: str = "") -> list[_Said]:
     """All that can be said to a command, each once, what has no name first."""
     found: dict[str, _Said] = {}
-    for said in _all_said(owner):
-        found.setdefault(said.option.name, said)
+    for field in option_fields(owner):
+        if field.option is None:
+            for said in _said(field.kind, title or field.name.removeprefix("options")):
+                found.setdefault(said.option.name, said)
+        else:
+            own = _Said(field.option, field, owner, field.option.shared or title)
+            found.setdefault(own.option.name, own)
     return sorted(found.values(), key=lambda said: not said.option.placed)
 
 
@@ -105,17 +107,8 @@ def _made(owner: type[Any], given: Mapping[str, Any]) -> Any:
     return owner(**known)
 
 
-def _signed(owner: type[Options]) -> Any:
-    """A function with the arguments of a command, for cyclopts to bind to."""
-
-    def command() -> None: ...
-
-    signed: Any = command
-    signed.__signature__ = inspect.Signature([_argument(*said) for said in _said(owner)])
-    return signed
-
-
-def _argument(option: Option, field: OptionField, *_: Any) -> inspect.Parameter:
+def _argument(said: _Said) -> inspect.Parameter:
+    option, field = said.option, said.field
     kind, several = field.kind, get_origin(field.kind) is tuple
 
     def read(_kind: Any, tokens: Any) -> Any:
@@ -214,9 +207,6 @@ def _matrix(text: str) -> Any:
             "[relight.matrix]"
         )
     return matrix
-
-
-# Help
 
 
 def help_text(arguments: Sequence[str], commands: Commands) -> str | None:

@@ -115,16 +115,11 @@ def _folder(source: Path, identity: str) -> Path | None:
     with contextlib.suppress(OSError):
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
-            _prune(root, module)
+            states = [p for p in root.glob(f"{module}-*") if p.name.rpartition("-")[0] == module]
+            for path in sorted(states, key=lambda path: path.stat().st_mtime)[:-_STATES_KEPT]:
+                shutil.rmtree(path, ignore_errors=True)
         os.utime(folder)
     return folder
-
-
-def _prune(root: Path, module: str) -> None:
-    """Delete the kernels of all but the last used states of a module's code."""
-    states = [path for path in root.glob(f"{module}-*") if path.name.rpartition("-")[0] == module]
-    for path in sorted(states, key=lambda path: path.stat().st_mtime)[:-_STATES_KEPT]:
-        shutil.rmtree(path, ignore_errors=True)
 
 
 @cache

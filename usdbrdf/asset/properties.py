@@ -271,10 +271,6 @@ class ShadedObject(MeasuredObject):
     area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
         object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
 
-    @property
-    def radiance_is_lower_bound(self) -> bool:
-        return self.radiance_status == "lowerBound"
-
 
 @dataclass(frozen=True, kw_only=True)
 class FittedObject(MeasuredObject):

@@ -16,9 +16,8 @@ from usdbrdf.asset.properties import FittedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, judged, survey_frames
+from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
 from usdbrdf.material.refine import Lobes, refined_light
-from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
@@ -54,8 +53,18 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         survey = survey_frames(run, lit, maps.texels, usable, maps.frames, options)
         found = fitted_objects(run, lit, maps.texels, maps.frames, survey, options)
         objects = [
-            _record(obj, found[i], options, maps.is_observed(i))
-            for i, obj in enumerate(maps.scene.objects)
+            FittedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                cost=own.cost,
+                evidence=own.evidence,
+                target_frame=own.target if math.isfinite(own.phi) else -1,
+                num_pixels=own.num_samples,
+                method=options.method,
+                mapping=options.mapping,
+                **vars(judged(own, obj, options.method, maps.is_observed(i))),
+            )
+            for i, (obj, own) in enumerate(zip(maps.scene.objects, found, strict=True))
         ]
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
@@ -71,20 +80,6 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         return {"objects": {item.identifier: item.summary for item in objects}}
 
     return task.run(work)
-
-
-def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool) -> FittedObject:
-    return FittedObject(
-        prim_path=obj.prim_path,
-        identifier=obj.identifier,
-        cost=found.cost,
-        evidence=found.evidence,
-        target_frame=found.target if math.isfinite(found.phi) else -1,
-        num_pixels=found.num_samples,
-        method=options.method,
-        mapping=options.mapping,
-        **vars(judged(found, obj, options.method, seen)),
-    )
 
 
 def _refined(

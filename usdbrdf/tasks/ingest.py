@@ -93,11 +93,11 @@ def _inputs(
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
-    inputs = {"capture": _hash_of_folder(folder, asset.folder)}
-    places = {"capture": capture, "mesh": options.mesh}
-    for i, outside in enumerate(options.allow_outside):
-        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset.folder)
-        places[f"outside-{i}"] = outside
+    outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
+    inputs = {
+        label: hash_of_files(files_below(place, without=asset.folder), place)
+        for label, place in ({"capture": folder} | outside).items()
+    }
     mesh, objects = options.mesh, options.objects
     if mesh is not None and mesh.is_file():
         # What a USD mesh refers to may lie beside it, out of the capture.
@@ -106,10 +106,7 @@ def _inputs(
         inputs["mesh"] = hash_of_files(layers)
     if objects is not None and objects.is_file():
         inputs["objects"] = hash_of_files([objects])
+    named = {"mesh": mesh.resolve()} if mesh is not None else {}
+    places = {"capture": capture.resolve()} | named | outside
     here = asset.layer("scan").parent
-    named = {name: place.resolve() for name, place in places.items() if place is not None}
-    return inputs, {name: relative_path(place, here) for name, place in named.items()}
-
-
-def _hash_of_folder(folder: Path, asset: Path) -> str:
-    return hash_of_files(files_below(folder, without=asset), folder)
+    return inputs, {name: relative_path(place, here) for name, place in places.items()}

@@ -165,9 +165,9 @@ def _author_gathered(
     attribute(prim, source.GetName(), source.GetTypeName(), type(values)(gathered))
 
 
-def has_transform(prim: Usd.Prim) -> bool:
-    """True where the input's default prim moves what lies below it."""
-    if not prim.IsA(UsdGeom.Xformable):
+def has_transform(prim: Usd.Prim | None) -> bool:
+    """True where there is an input, whose default prim moves what lies below it."""
+    if not prim or not prim.IsA(UsdGeom.Xformable):
         return False
     matrix = UsdGeom.Xformable(prim).GetLocalTransformation(_FIRST)
     return not Gf.IsClose(matrix, Gf.Matrix4d(1.0), 1e-12)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from pxr import Gf, Sdf, UsdGeom
 
 from usdbrdf.asset.header import Draft, Provenance, Scopes, StageHeader, new_layer, read_header
+from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
     apply_schema,
     attribute,
@@ -23,17 +24,8 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layers.input_usd import (
-    author_overrides,
-    author_reference,
-    competing_bindings,
-    has_transform,
-    input_meshes,
-    open_input,
-    weaken_bindings,
-)
 from usdbrdf.asset.layout import ROLES, Asset, storable_path
-from usdbrdf.asset.properties import LabelledObject, Photographs, known_facts
+from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.naming import readable_label
@@ -103,12 +95,14 @@ NEAR_M, FAR_M = 0.01, 1000.0
 def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
     asset, folder, frames = draft.asset, draft.asset.layer("scan").parent, scan.frames
-    stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
+    stage = input_usd.open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
     scopes = Scopes.beside(f"/{draft.header.name}", taken)
-    meshes = input_meshes(source, scan.object_prims, scopes.root) if source else {}
-    competing = {at: competing_bindings(mesh, source, scopes.root) for at, mesh in meshes.items()}
+    meshes = input_usd.input_meshes(source, scan.object_prims, scopes.root) if source else {}
+    competing = {
+        at: input_usd.competing_bindings(mesh, source, scopes.root) for at, mesh in meshes.items()
+    }
     layer = draft.new_layer(
         adapter=scan.adapter,
         radiometric=frames.radiometric,
@@ -125,17 +119,19 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     apply_schema(root, "ColorSpaceAPI")
     attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
     if source and scan.usd_geometry:
-        author_reference(layer, scopes.root, scan.usd_geometry, folder)
+        input_usd.author_reference(layer, scopes.root, scan.usd_geometry, folder)
         normals, face_object = scan.mesh.corner_normals, scan.mesh.face_object
         for i, (at, mesh) in enumerate(meshes.items()):
-            weaken_bindings(layer, mesh, source, scopes.root)
-            author_overrides(layer, at, mesh, normals[face_object == i])
+            input_usd.weaken_bindings(layer, mesh, source, scopes.root)
+            input_usd.author_overrides(layer, at, mesh, normals[face_object == i])
             _author_label(over(layer, at), scan.objects[i])
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
     camera = define(layer, scopes.path("cameras", "capture"), "Camera")
-    _author_pose_and_lens(camera, scan, reset_transform=bool(source and has_transform(source)))
+    _author_pose_and_lens(
+        camera, scan, reset_transform=bool(source and input_usd.has_transform(source))
+    )
     _author_capture(camera, frames, folder)
     # Settings that render the capture's own view; the shading layer adds the products.
     define(layer, scopes.path("render"), "Scope")
@@ -240,18 +236,10 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
     images = [storable_path(path, folder) for path in frames.image_paths]
-    photographs = Photographs(
-        image=images,
-        exposure_time=frames.exposure_time.tolist(),
-        saturation_radiance=frames.saturation_radiance.tolist(),
-        noise_floor_radiance=frames.noise_floor_radiance.tolist(),
-        intrinsics=frames.intrinsics.tolist(),
-        resolution=frames.resolution.tolist(),
-        encoding=frames.encoding,
-        radiometric=frames.radiometric,
-    )
+    stored = {name: getattr(frames, name) for name, _ in facts_of(Photographs) if name != "image"}
+    plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in stored.items()}
     plates = [Sdf.AssetPath(image) for image in images]
-    for fact, value in known_facts(photographs):
+    for fact, value in known_facts(Photographs(image=images, **plain)):
         author_fact(prim, fact, value)
         if fact.name == "image":
             apply_schema(prim, "BackPlateAPI:photograph")

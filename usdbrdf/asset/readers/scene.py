@@ -89,6 +89,7 @@ def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | N
     return Path(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
 
 
+Number = TypeVar("Number", np.float32, np.float64)
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
 
@@ -179,12 +180,17 @@ def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
     given = primvar.ComputeFlattened(_TIME) if primvar and primvar.HasAuthoredValue() else None
     if not isinstance(given, Vt.Vec2fArray | Vt.Vec2dArray | Vt.Vec2hArray):
         return None
-    values = np.asarray(given, np.float32)
-    element = triangulation_of(mesh).element_of_corner(primvar.GetInterpolation())
-    if element.max(initial=-1) >= len(values):
-        return None
-    uv = values[element]
-    return np.ascontiguousarray(uv[:, [0, 2, 1]] if _is_mirrored(mesh) else uv)
+    uv = per_corner(given, np.float32, primvar.GetInterpolation(), triangulation_of(mesh))
+    return uv[:, [0, 2, 1]] if uv is not None and _is_mirrored(mesh) else uv
+
+
+def per_corner(
+    values: Any, kind: type[Number], interpolation: str, fans: Triangulation
+) -> npt.NDArray[Number] | None:
+    """(T, 3, ...) the value that each triangle's corner has; None where there are too few of them:
+    the file is wrong about these values, not about its shape."""
+    elements = fans.element_of_corner(interpolation)
+    return np.asarray(values, kind)[elements] if elements.max(initial=-1) < len(values) else None
 
 
 def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
@@ -212,15 +218,10 @@ def authored_normals(
     else:
         values = mesh.GetNormalsAttr().Get(time)
         interpolation = mesh.GetNormalsInterpolation()
-    if not values:
+    chosen = per_corner(values, np.float64, interpolation, fans) if values else None
+    if chosen is None or not np.isfinite(chosen).all():
         return None
-    normals = np.asarray(values, np.float64).reshape(-1, 3)
-    element_of_corner = fans.element_of_corner(interpolation)
-    if element_of_corner.max(initial=-1) >= len(normals):
-        return None  # too few of them: the file is wrong about its normals, not about its shape
-    chosen = normals[element_of_corner]
-    usable = np.isfinite(chosen).all() and (np.linalg.norm(chosen, axis=-1) > 1e-12).all()
-    return chosen if usable else None
+    return chosen if (np.linalg.norm(chosen, axis=-1) > 1e-12).all() else None
 
 
 Record = TypeVar("Record")

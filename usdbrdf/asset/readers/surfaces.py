@@ -13,7 +13,13 @@ import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from usdbrdf.asset.preview_lobe import fit_from_preview_surface
-from usdbrdf.asset.readers.scene import asset_file, authored, authored_normals, triangulation_of
+from usdbrdf.asset.readers.scene import (
+    asset_file,
+    authored,
+    authored_normals,
+    per_corner,
+    triangulation_of,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, is_eight_bit, read_exr, read_radiance
@@ -349,7 +355,4 @@ def _primvar(
     rows = np.asarray(primvar.ComputeFlattened(time) or [], np.float32)
     if not rows.size or rows.size % width:
         return None
-    rows = rows.reshape(-1, width)
-    row_of_corner = fans.element_of_corner(primvar.GetInterpolation())
-    # Too few of them: the file is wrong about these values, not about its shape.
-    return rows[row_of_corner] if row_of_corner.max() < len(rows) else None
+    return per_corner(rows.reshape(-1, width), np.float32, primvar.GetInterpolation(), fans)
