@@ -45,10 +45,8 @@ Commands = Mapping[str, type[Command]]
 
 
 def parsed(arguments: Sequence[str], commands: Commands) -> Command:
-    """The command that is asked for, its options checked.
-
-    Raises UsageError, and InputRefused for files that are not there.
-    """
+    """The command that is asked for, its options checked. Raises UsageError, and InputRefused for
+    files that are not there."""
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
@@ -135,10 +133,9 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
     if field.kind == tuple[Path, ...]:
         return tuple(_path(word) for _, word in words)
     if field.kind == tuple[Insert, ...]:
-        inserts: list[list[str]] = []
-        for number, word in words:
-            inserts = [*inserts, [word]] if number == 0 else [*inserts[:-1], [*inserts[-1], word]]
-        return tuple(_insert(*insert) for insert in inserts)
+        texts = [word for _, word in words]
+        bounds = [*(i for i, (number, _) in enumerate(words) if number == 0), len(words)]
+        return tuple(_insert(*texts[first:end]) for first, end in pairwise(bounds))
     text = words[-1][1]
     if text == option.none:
         return None

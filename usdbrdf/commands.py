@@ -49,10 +49,8 @@ class _Run(_Talking):
         }
         lines = [f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}"]
         if steps.get("ingest", {}).get("radiometric") is False:
-            told = (
-                "warning: the images are not radiometric; albedo and fit have no absolute meaning."
-            )
-            lines = [told, *lines]
+            doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
+            lines = [f"warning: {doubt}", *lines]
         return self.told({"asset": str(root), "steps": steps}, *lines)
 
 

@@ -40,11 +40,8 @@ _SEAL = hashlib.sha256().digest_size
 
 
 class KernelCache(Cache):  # type: ignore[misc]
-    """numba's cache of one function, with the package's own places and seals.
-
-    numba gives the key of a specialisation (types, processor, bytecode, closure), the reduced code
-    and its way back.
-    """
+    """numba's cache of one function, with the package's own places and seals. numba gives the key
+    of a specialisation (types, processor, bytecode, closure), the reduced code and its way back."""
 
     def __init__(self, function: Any) -> None:
         self._py_func = function
@@ -124,10 +121,8 @@ def _folder(source: Path, identity: str) -> Path | None:
 
 @cache
 def _root() -> Path | None:
-    """Where kernels are kept: ``NUMBA_CACHE_DIR``, the user's cache, or a temporary folder.
-
-    Code is run from there, so it must be ours and nobody else's, unless the user named the place.
-    """
+    """Where kernels are kept: ``NUMBA_CACHE_DIR``, the user's cache, or a temporary folder. Code is
+    run from there, so it must be ours and nobody else's, unless the user named the place."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen) / "usdbrdf"
     with contextlib.suppress(OSError, RuntimeError):  # no home at all is a RuntimeError

@@ -20,11 +20,9 @@ _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
 
 def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     """Copy edited tool-owned files beside edits.usda and return the copies, for the artist to use.
-
-    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go
-    to a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
-    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it.
-    """
+    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go to
+    a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
+    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it."""
     layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
     others = [path for path in edited if path.suffix not in _LAYER_SUFFIXES]
     stems = (asset.folder / f"adopted-{n}" for n in itertools.count(1))

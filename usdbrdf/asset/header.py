@@ -49,9 +49,7 @@ class StageHeader:
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
     """How a layer came about: the role, the code's version, its options, SHA-256 of its inputs.
-
-    Nothing here may depend on the machine or the hour: equal work must give equal bytes.
-    """
+    Nothing here may depend on the machine or the hour: equal work must give equal bytes."""
 
     role: str
     version: str
@@ -119,11 +117,9 @@ _SCOPES = {
 
 @dataclass(frozen=True)
 class Scopes:
-    """Names of the scopes that hold our prims; ``root`` is the default prim's path.
-
-    If the geometry came as USD, its default prim may have children of these names already (``mtl``
-    is the usual one): ours then begin with ``usdbrdf_``, since prims of one path would merge.
-    """
+    """Names of the scopes that hold our prims; ``root`` is the default prim's path. If the geometry
+    came as USD, its default prim may have children of these names already (``mtl`` is the usual
+    one): ours then begin with ``usdbrdf_``, since prims of one path would merge."""
 
     root: str
     names: Mapping[str, str]

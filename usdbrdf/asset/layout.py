@@ -27,10 +27,8 @@ class Asset:
 
     @staticmethod
     def at(folder: Path) -> Asset:
-        """The asset in a folder: its name is the one it was made with, else the folder's name.
-
-        A folder that was renamed after its making keeps its files' names.
-        """
+        """The asset in a folder: its name is the one it was made with, else the folder's name. A
+        folder that was renamed after its making keeps its files' names."""
         folder = Path(folder).absolute()
         if not is_storable(folder) or "\\" in str(folder):
             raise InputRefused(
@@ -116,11 +114,9 @@ def is_storable(path: Path) -> bool:
 
 
 def relative_path(target: Path, folder: Path) -> str:
-    """Path from ``folder`` to a file, anchored and with forward slashes.
-
-    Folders are resolved first: ``..`` above a symbolic link would lead elsewhere. The file itself
-    may be a link and stays one.
-    """
+    """Path from ``folder`` to a file, anchored and with forward slashes. Folders are resolved
+    first: ``..`` above a symbolic link would lead elsewhere. The file itself may be a link and
+    stays one."""
     target = Path(os.path.realpath(target.parent)) / target.name
     relative = os.path.relpath(target, os.path.realpath(folder)).replace(os.sep, "/")
     return relative if relative.startswith("../") else f"./{relative}"

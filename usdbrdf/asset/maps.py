@@ -96,11 +96,10 @@ _AT_A_TIME = min(4, os.cpu_count() or 1)
 
 
 class AssetMaps:
-    """The scene of a composed stage, its photographs, and what tasks measured of its texels.
-
-    Each is read when it is first asked for, and every map is decoded at most once; the arrays are
-    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear Rec.709.
-    """
+    """The scene of a composed stage, its photographs, and what tasks measured of its texels. Each
+    is read when it is first asked for, and every map is decoded at most once; the arrays are
+    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear
+    Rec.709."""
 
     def __init__(self, stage: Usd.Stage) -> None:
         self.stage = stage

@@ -32,12 +32,9 @@ def validators_path() -> Path:
 
 
 def register() -> None:
-    """Announce the schemas and the validators to USD; harmless when PXR_PLUGINPATH_NAME has done
-    so already.
-
-    Asks the schema registry nothing: the first question builds it, and what is registered
-    afterwards, by us or by another package, would stay unknown.
-    """
+    """Announce the schemas and the validators to USD; harmless when PXR_PLUGINPATH_NAME has done so
+    already. Asks the schema registry nothing: the first question builds it, and what is registered
+    afterwards, by us or by another package, would stay unknown."""
     registry = Plug.Registry()
     if not registry.GetPluginWithName(_PLUGIN):
         registry.RegisterPlugins(str(plugin_path()))
@@ -46,11 +43,9 @@ def register() -> None:
 
 
 def verify() -> None:
-    """Raise unless USD knows the schemas with their attributes; called before the first write.
-
-    A plug-in that came too late, or whose resources were not found, still lists the types: only
-    the attributes tell.
-    """
+    """Raise unless USD knows the schemas with their attributes; called before the first write. A
+    plug-in that came too late, or whose resources were not found, still lists the types: only the
+    attributes tell."""
     definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(FIT.identifier)
     if not definition or FIT.attribute(FIT.key) not in definition.GetPropertyNames():
         raise UsdBrdfError(

@@ -35,10 +35,8 @@ def ingest(
     *,
     plugins: bool = True,
 ) -> TaskResult:
-    """Read and check a capture and write it as the weakest layer of ``asset``.
-
-    Raises InputRefused for a capture that cannot be used; nothing is published then.
-    """
+    """Read and check a capture and write it as the weakest layer of ``asset``. Raises InputRefused
+    for a capture that cannot be used; nothing is published then."""
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()

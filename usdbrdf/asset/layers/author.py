@@ -7,12 +7,12 @@ anywhere but these calls, and equal calls give equal bytes."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
@@ -20,19 +20,6 @@ from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.files.atomic import temporary_beside
 
 Types = Sdf.ValueTypeNames
-# From plain values, which may be numpy's, to those that USD takes for attributes of a type.
-_USD_VALUE: dict[str, Callable[[Any], Any]] = {
-    "asset": Sdf.AssetPath,
-    "bool": bool,
-    "color3f": lambda rgb: Gf.Vec3f(*map(float, rgb)),
-    "double": float,
-    "double4": lambda values: Gf.Vec4d(*map(float, values)),
-    "float": float,
-    "int": int,
-    "int2": lambda values: Gf.Vec2i(*map(int, values)),
-    "string": str,
-    "token": str,
-}
 
 
 def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
@@ -104,7 +91,11 @@ def author_fact(prim: Sdf.PrimSpec, fact: Fact, value: Any, instance: str = "") 
     """One attribute of ours with its schema; of a fact with samples a value per frame."""
     apply_schema(prim, fact.schema.applied(instance))
     name, type_name = fact.attribute(instance), Types.Find(fact.type)
-    convert = _USD_VALUE[fact.type]
+    made = type(type_name.defaultValue)
+
+    def convert(plain: Any) -> Any:
+        return made(*np.asarray(plain).tolist()) if hasattr(made, "dimension") else made(plain)
+
     if fact.samples:
         values, always = [convert(each) for each in value], fact.samples == "every"
         attribute_per_frame(prim, name, type_name, values, always=always)

@@ -38,9 +38,7 @@ def surface(
     ior: float = NO_LOBE.ior,
 ) -> Sdf.PrimSpec:
     """A material with one UsdPreviewSurface, black until a colour is given; returns the shader.
-
-    ``specularColor`` stays away: some applications multiply it onto the reflectance of ``ior``.
-    """
+    ``specularColor`` stays away: some applications multiply it onto the reflectance of ``ior``."""
     shader, prim = f"{material}/{SURFACE}", define(layer, material, "Material")
     connect(prim, "outputs:surface", Types.Token, f"{shader}.outputs:surface")
     prim = node(layer, shader, "UsdPreviewSurface", "surface", Types.Token)
@@ -116,10 +114,8 @@ Shown = Aov | Colour | None
 def author_looks(
     layer: Sdf.Layer, draft: Draft, looks: Mapping[str, Bindings], *, selected: str
 ) -> None:
-    """Add variants to the default prim and select one; weaker layers' variants remain.
-
-    What an input file binds otherwise than by the mesh is bound in every look too.
-    """
+    """Add variants to the default prim and select one; weaker layers' variants remain. What an
+    input file binds otherwise than by the mesh is bound in every look too."""
     root, competing = Sdf.Path(draft.scopes.root), recorded_bindings(draft.asset)
     for look, bindings in looks.items():
         variant = root.AppendVariantSelection(VARIANT_SET, look)
@@ -142,12 +138,10 @@ def author_look_materials(
     objects: Sequence[MeasuredObject],
     shown: Sequence[Shown],
 ) -> dict[str, str]:
-    """Materials for one look that glow and reflect nothing, so that any viewer shows what they
-    are about: one per object, which has its place in ``shown``; and how they are bound.
-
-    A map of one channel shows as grey: applications repeat it over red, green and blue. Objects of
-    which there is nothing to show share one material that says so.
-    """
+    """Materials for one look that glow and reflect nothing, so that any viewer shows what they are
+    about: one per object, which has its place in ``shown``; and how they are bound. A map of one
+    channel shows as grey: applications repeat it over red, green and blue. Objects of which there
+    is nothing to show share one material that says so."""
     define(layer, scopes.path("looks"), "Scope")
     define(layer, scopes.path("looks", look), "Scope")
     bindings = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +56,9 @@ def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
 
 
 def check_root(asset: Asset, header: StageHeader) -> None:
-    """Raise if the asset has a root layer that says otherwise about units or the up axis.
-
-    USD believes the root, which is never written again: a capture in other units would come out
-    in the wrong size, beneath edits that were made for the old one.
-    """
+    """Raise if the asset has a root layer that says otherwise about units or the up axis. USD
+    believes the root, which is never written again: a capture in other units would come out in the
+    wrong size, beneath edits that were made for the old one."""
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
@@ -100,9 +99,8 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
     scopes = Scopes.beside(f"/{draft.header.name}", taken)
     meshes = input_usd.input_meshes(source, scan.object_prims, scopes.root) if source else {}
-    competing = {
-        at: input_usd.competing_bindings(mesh, source, scopes.root) for at, mesh in meshes.items()
-    }
+    rivals = partial(input_usd.competing_bindings, source=source, root=scopes.root)
+    competing = {at: rivals(mesh) for at, mesh in meshes.items()}
     layer = draft.new_layer(
         adapter=scan.adapter,
         radiometric=frames.radiometric,
@@ -129,9 +127,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
     camera = define(layer, scopes.path("cameras", "capture"), "Camera")
-    _author_pose_and_lens(
-        camera, scan, reset_transform=bool(source and input_usd.has_transform(source))
-    )
+    _author_pose_and_lens(camera, scan, reset_transform=input_usd.has_transform(source))
     _author_capture(camera, frames, folder)
     # Settings that render the capture's own view; the shading layer adds the products.
     define(layer, scopes.path("render"), "Scope")

@@ -24,24 +24,17 @@ _TIMEOUT_S = 600.0
 
 
 def in_one_line(error: object) -> str:
-    """The text of an error of USD, which often spans lines and repeats itself, on one line.
-
-    Of an exception what its errors say, without the places in USD's own source.
-    """
-    told = (
-        [each.commentary for each in error.args]
-        if isinstance(error, Tf.ErrorException)
-        else [error]
-    )
-    text = "; ".join(" ".join(str(part).split()).rstrip(".; ") for part in told)
+    """The text of an error of USD, which often spans lines and repeats itself, on one line. Of an
+    exception what its errors say, without the places in USD's own source."""
+    told = error.args if isinstance(error, Tf.ErrorException) else [error]
+    parts = (str(getattr(part, "commentary", part)) for part in told)
+    text = "; ".join(" ".join(part.split()).rstrip(".; ") for part in parts)
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 
 
 def open_weaker(asset: Asset, role: str) -> Usd.Stage:
-    """The stage that the task of a role builds upon: only the layers weaker than its own.
-
-    Never edits.usda: what an artist overrides must not flow back into the measurement.
-    """
+    """The stage that the task of a role builds upon: only the layers weaker than its own. Never
+    edits.usda: what an artist overrides must not flow back into the measurement."""
     return _sublayered(asset, ROLES[: ROLES.index(role)])
 
 
@@ -52,9 +45,7 @@ def open_measured(asset: Asset) -> Usd.Stage:
 
 def open_edited(asset: Asset) -> Usd.Stage:
     """The asset as everybody else opens it: the root layer, with the artist's opinions.
-
-    InputRefused where it does not compose, or USD crashes on it.
-    """
+    InputRefused where it does not compose, or USD crashes on it."""
     try_in_child(asset.root_layer)
     return open_stage(asset.root_layer)
 

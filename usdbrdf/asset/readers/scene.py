@@ -102,9 +102,7 @@ class _Mesh(NamedTuple):
 
 def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
-
-    Meshes without normals of their own get them by the crease angle that ingest was given.
-    """
+    Meshes without normals of their own get them by the crease angle that ingest was given."""
     prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh) and is_measured(p, OBJECT)]
     if not prims:
         raise InputRefused(

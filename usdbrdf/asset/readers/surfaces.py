@@ -81,7 +81,7 @@ class _MaterialReader:
             self.warn(f"<{path}>: opacity is not rendered; the surface is taken as opaque.")
         ior, never_ours = float(known["ior"].flat[0]), ("metallic", "useSpecularWorkflow")
         if mapping == "matched" and not any(known[name].any() for name in never_ours):
-            fitted = fit_from_preview_surface(float(known["roughness"].mean()), ior, "matched")
+            fitted = fit_from_preview_surface(float(known["roughness"].mean()), ior)
             known["diffuseColor"] = np.asarray(known["diffuseColor"] / fitted.diffuse, np.float32)
             ior = fitted.ior
         material = preview_material(
@@ -111,8 +111,26 @@ class _MaterialReader:
         return plain
 
     def _texture(self, shader: UsdShade.Shader, output: str, channels: int) -> Float:
-        self._uv(shader)
-        self._wrap(shader)
+        source = _source(shader.GetInput("st"))
+        if source is not None and source[0].GetShaderId() == "UsdTransform2d":
+            # Scale, then rotate counter-clockwise, then translate.
+            node = source[0]
+            turn = np.radians(self._numbers(node.GetInput("rotation"), (0,))[0])
+            scale = self._numbers(node.GetInput("scale"), (1, 1))
+            matrix = np.eye(3, dtype=np.float32)
+            matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
+            matrix[:2, 2] = self._numbers(node.GetInput("translation"), (0, 0))
+            self.uv_from_st, source = matrix, _source(node.GetInput("in"))
+        if source is not None:
+            self.uv_primvar = str(_value(source[0].GetInput("varname"), self.time) or "st")
+        modes = [str(_value(shader.GetInput(name), self.time)) for name in ("wrapS", "wrapT")]
+        found = [_WRAP.get(mode, "clamp") for mode in modes]
+        self.wrap = self.wrap or found[0]
+        if {*found} != {self.wrap}:
+            self.warn(
+                f"<{shader.GetPath()}>: one mode of wrapping is rendered for all textures of a "
+                f"material; it is {self.wrap!r}."
+            )
         unread = self._numbers(shader.GetInput("fallback"), (0, 0, 0, 1))
         named = shader.GetInput("file")
         file = asset_file(_producer(named), self.time) if named else None
@@ -127,30 +145,6 @@ class _MaterialReader:
         if channels == 1:
             texels = texels[..., [_CHANNEL.get(output, 0)]]
         return np.ascontiguousarray(texels, np.float32)
-
-    def _uv(self, texture: UsdShade.Shader) -> None:
-        source = _source(texture.GetInput("st"))
-        if source is not None and source[0].GetShaderId() == "UsdTransform2d":
-            # Scale, then rotate counter-clockwise, then translate.
-            node = source[0]
-            turn = np.radians(self._numbers(node.GetInput("rotation"), (0,))[0])
-            scale = self._numbers(node.GetInput("scale"), (1, 1))
-            matrix = np.eye(3, dtype=np.float32)
-            matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]] * scale
-            matrix[:2, 2] = self._numbers(node.GetInput("translation"), (0, 0))
-            self.uv_from_st, source = matrix, _source(node.GetInput("in"))
-        if source is not None:
-            self.uv_primvar = str(_value(source[0].GetInput("varname"), self.time) or "st")
-
-    def _wrap(self, texture: UsdShade.Shader) -> None:
-        modes = [str(_value(texture.GetInput(name), self.time)) for name in ("wrapS", "wrapT")]
-        found = [_WRAP.get(mode, "clamp") for mode in modes]
-        if len({*found, self.wrap or found[0]}) > 1:
-            self.warn(
-                f"<{texture.GetPath()}>: one mode of wrapping is rendered for all textures of a "
-                f"material; it is {self.wrap or found[0]!r}."
-            )
-        self.wrap = self.wrap or found[0]
 
     def _numbers(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(N,) float32 of a plain value; the fallback where it has another type or is not

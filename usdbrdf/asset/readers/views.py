@@ -49,11 +49,9 @@ class Views:
 
 
 def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
-    """The cameras of a document, named after their images, to render from.
-
-    Images need not exist where the document states width and height. InputRefused where a view
-    cannot be used, or two have images of one name.
-    """
+    """The cameras of a document, named after their images, to render from. Images need not exist
+    where the document states width and height. InputRefused where a view cannot be used, or two
+    have images of one name."""
     findings = Findings()
     records = _rigid_records(source, asset, IngestOptions(), findings, images=False)
     if findings.dropped:
@@ -87,11 +85,9 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
 def photographs_of_views(
     source: Path, asset: Asset, stage: Usd.Stage, scene: Scene, allow_outside: tuple[Path, ...] = ()
 ) -> Views:
-    """The photographs of a document, checked as those of a capture are.
-
-    Images have the capture's encoding. Views that cannot be used are dropped with a warning;
-    InputRefused where none is left or where the cameras do not see the asset.
-    """
+    """The photographs of a document, checked as those of a capture are. Images have the capture's
+    encoding. Views that cannot be used are dropped with a warning; InputRefused where none is left
+    or where the cameras do not see the asset."""
     captured = frames_from_stage(stage)
     findings = Findings()
     options = IngestOptions(allow_outside=allow_outside)
