@@ -19,10 +19,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_origin
 
-from cyclopts import App, CycloptsError, Parameter
-
 from usdbrdf import options
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.job.interrupts import loading
 from usdbrdf.options import REQUIRED, Insert, Option, OptionField, Options, option_fields
 
 EXIT_CODES = """exit codes:
@@ -50,12 +49,17 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
+    said = _said(commands[name])
+    if not words and all(item.field.default is not REQUIRED for item in said):
+        return commands[name]()  # needs no parser, which takes time to load
+    with loading():
+        from cyclopts import App, CycloptsError
     app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
 
     def bound() -> None: ...
 
     signed: Any = bound
-    signed.__signature__ = inspect.Signature([_argument(said) for said in _said(commands[name])])
+    signed.__signature__ = inspect.Signature([_argument(item) for item in said])
     app.default(signed)
     try:
         _, given, _ = app.parse_args(words, exit_on_error=False, print_error=False)
@@ -106,6 +110,8 @@ def _made(owner: type[Any], given: Mapping[str, Any]) -> Any:
 
 
 def _argument(said: _Said) -> inspect.Parameter:
+    from cyclopts import Parameter
+
     option, field = said.option, said.field
     kind, several = field.kind, get_origin(field.kind) is tuple
 
