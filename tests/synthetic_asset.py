@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader
-from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.scan_layer import (
     write_edits,
     write_pending_layer,
@@ -16,6 +15,9 @@ from usdbrdf.asset.layers.scan_layer import (
     write_scan_layer,
 )
 from usdbrdf.asset.layers.task_layers import (
+    Lamp,
+    world_from_root,
+    write_lights_layer,
     write_material_layer,
     write_shading_layer,
     write_texturing_layer,

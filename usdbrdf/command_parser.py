@@ -49,24 +49,24 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
-    said = _said(commands[name])
-    if not words and all(item.field.default is not REQUIRED for item in said):
-        return commands[name]()  # needs no parser, which takes time to load
-    with loading():
-        from cyclopts import App, CycloptsError
-    app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
+    said, given = _said(commands[name]), {}
+    # Nothing that was or must be said needs a parser, which takes time to load.
+    if words or any(item.field.default is REQUIRED for item in said):
+        with loading():
+            from cyclopts import App, CycloptsError
+        app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
 
-    def bound() -> None: ...
+        def bound() -> None: ...
 
-    signed: Any = bound
-    signed.__signature__ = inspect.Signature([_argument(item) for item in said])
-    app.default(signed)
-    try:
-        _, given, _ = app.parse_args(words, exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        found = " ".join(str(error).split()).rstrip(".")
-        raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
-    command: Command = _made(commands[name], given.arguments)
+        signed: Any = bound
+        signed.__signature__ = inspect.Signature([_argument(item) for item in said])
+        app.default(signed)
+        try:
+            given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
+        except CycloptsError as error:
+            found = " ".join(str(error).split()).rstrip(".")
+            raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
+    command: Command = _made(commands[name], given)
     return command
 
 

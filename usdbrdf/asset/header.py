@@ -13,8 +13,7 @@ import numpy as np
 from pxr import Sdf, UsdGeom, Vt
 
 from usdbrdf.asset.layout import Asset, open_metadata
-from usdbrdf.asset.properties import SCHEMA_VERSION
-from usdbrdf.asset.schema import verify
+from usdbrdf.asset.properties import SCHEMA_VERSION, verify
 from usdbrdf.model.capture import Scan
 
 TIME_CODES_PER_SECOND = 24.0
@@ -22,18 +21,12 @@ TIME_CODES_PER_SECOND = 24.0
 
 @dataclass(frozen=True, kw_only=True)
 class StageHeader:
-    """Metadata that all layers share; USD reads it from the root and does not compare.
+    """Metadata that all layers share; USD reads it from the root and does not compare."""
 
-    name             default prim
-    meters_per_unit  length of a scene unit in metres
-    up_axis          "Y" or "Z"
-    start, end       time codes of the first and the last photograph
-    """
-
-    name: str
+    name: str  # of the default prim
     meters_per_unit: float = 1.0
-    up_axis: str = "Z"
-    start: float = 1.0
+    up_axis: str = "Z"  # or "Y"
+    start: float = 1.0  # time codes of the first and the last photograph
     end: float = 1.0
 
     @staticmethod

@@ -15,9 +15,8 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from usdbrdf.asset.header import Scopes
-from usdbrdf.asset.layers.lights_layer import EMISSIVE
-from usdbrdf.asset.layers.lights_layer import VARIANT_SET as LIGHTS
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
+from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of

@@ -13,7 +13,7 @@ from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import FittedObject, colour
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
@@ -30,7 +30,7 @@ _READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
-    maps = AssetMaps(open_before(asset, "material"))
+    maps = AssetMaps(open_weaker(asset, "material"))
     # S is refined as it was filtered, if the filter is here too.
     shading = read_provenance(asset.layer("shading")).get("parameters", {})
     filtered = options.method == "views" and shading.get("denoise") == OIDN

@@ -8,12 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
-from usdbrdf.asset.layers.task_layers import write_shading_layer
+from usdbrdf.asset.layers.task_layers import (
+    Lamp,
+    world_from_root,
+    write_lights_layer,
+    write_shading_layer,
+)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import ShadedObject, colour
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import ShadeOptions
@@ -28,7 +32,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
-    maps = AssetMaps(open_before(asset, "shading"))
+    maps = AssetMaps(open_weaker(asset, "shading"))
     task = Task(
         asset=asset,
         name="shade",

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
-from usdbrdf.asset.layers.lights_layer import EMISSIVE, USDLUX, VARIANT_SET
+from usdbrdf.asset.layers.task_layers import EMISSIVE, USDLUX
+from usdbrdf.asset.layers.task_layers import LIGHTS as VARIANT_SET
 from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Fault, Severity, Site, cure, rule

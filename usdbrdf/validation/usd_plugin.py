@@ -9,7 +9,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdValidation
 
-from usdbrdf.asset.schema import validators_path
+from usdbrdf.asset.properties import validators_path
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.validation.asset_stage import AssetStage
 from usdbrdf.validation.rule import Rule, Severity, Site

@@ -1,5 +1,20 @@
 """What the tasks texture, shade and fit add to the scan, each in a layer of its own.
 
+Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``. A lighter wants
+lights: something to dim, to link, to sample well. The measured emission is in the materials, and a
+renderer that honoured both would count every lamp twice. So the default prim has a variant set:
+``emissive``, the default, has no lights; ``usdlux`` has them, and scales the emission of the lamps
+they stand for to nothing. A shot that references the asset chooses by one opinion of its own, which
+neither a muted layer nor invisible lights in the root would allow: mutes are a session's, not a
+file's, and visibility would leave the glowing surfaces on. A layer may still be muted: all of it is
+in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+
+Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
+``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
+an object only, keep their emission in both variants. Flat lights shine from the front of the faces;
+their lamps are dark where a renderer does not show lights to the camera. A ball is hidden, since
+its light encloses it, and some renderers draw such a light from its centre.
+
 Where it is asked for, the materials once more as OpenPBR networks of MaterialX, for renderers that
 take those rather than UsdPreviewSurface; they get the same numbers. materialx.usda is a sublayer of
 material.usda, weaker than it and listed there: so the root layer need not be written again, and a
@@ -8,11 +23,13 @@ emission the variants of the lights switch off."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from usdbrdf.asset.header import Draft, Scopes
 from usdbrdf.asset.layers.author import (
@@ -26,7 +43,6 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layers.lights_layer import EMISSION_TEXTURE
 from usdbrdf.asset.layers.looks import (
     LIT,
     SHADED,
@@ -44,7 +60,92 @@ from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
 from usdbrdf.asset.properties import FittedObject, ShadedObject, TexturedObject
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.model.arrays import Float
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.light import LampShape
+
+LIGHTS = "lights"
+EMISSIVE, USDLUX = "emissive", "usdlux"
+# The texture node of the materials' emission, which has no scale of its own.
+EMISSION_TEXTURE = "EmissionTexture"
+_TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp:
+    """An emitter and the lights that may stand for it; none where it has no shape for that."""
+
+    prim_path: str
+    identifier: str
+    shapes: tuple[LampShape, ...]
+
+
+def write_lights_layer(
+    path: Path, draft: Draft, lamps: Sequence[Lamp], world_from_root: Double
+) -> None:
+    """Write lights.usda to ``path``; without a lamp that has shapes it holds nothing.
+
+    world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
+    """
+    scopes, layer = draft.scopes, draft.new_layer()
+    shaped = [lamp for lamp in lamps if lamp.shapes]
+    if shaped:
+        emissive, usdlux = (
+            Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, name)
+            for name in (EMISSIVE, USDLUX)
+        )
+        over(layer, str(emissive))
+        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE
+        define(layer, _within(usdlux, scopes.path("lights")), "Scope")
+        for lamp in shaped:
+            lights = _within(usdlux, scopes.path("lights", lamp.identifier))
+            define(layer, lights, "Scope")
+            for number, shape in enumerate(lamp.shapes, start=1):
+                prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
+                _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
+            # The lamp itself must not shine beside them.
+            texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
+            prim = over(layer, _within(usdlux, texture))
+            author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
+            if lamp.shapes[0].kind == "sphere":
+                hidden = over(layer, _within(usdlux, lamp.prim_path))
+                attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
+    export(layer, path, folder=path.parent)
+
+
+def world_from_root(stage: Usd.Stage) -> Double:
+    """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+    return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
+
+
+def _within(variant: Sdf.Path, path: str) -> str:
+    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
+
+
+def _author_light(
+    prim: Sdf.PrimSpec, shape: LampShape, world_from_root: Double, meters_per_unit: float
+) -> None:
+    """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
+    brightest = max(shape.radiance)
+    colour = Gf.Vec3f(*(value / brightest for value in shape.radiance))
+    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    author_inputs(prim, Types.Color3f, color=colour)
+    author_inputs(prim, Types.Bool, normalize=False)
+    width, height = (side / meters_per_unit for side in shape.size)
+    if shape.kind == "rectangle":
+        author_inputs(prim, Types.Float, width=width, height=height)
+    else:
+        author_inputs(prim, Types.Float, radius=width / 2)
+    half = Gf.Vec3f(width / 2, height / 2, width / 2 if shape.kind == "sphere" else 0)
+    attribute(prim, "extent", Types.Float3Array, [-half, half])
+    # Rigid in the world, in units of the stage: what the root does to sizes is undone here.
+    in_units = shape.world_from_light.copy()
+    in_units[:3, 3] /= meters_per_unit
+    pose = np.linalg.inv(world_from_root) @ in_units
+    # USD multiplies row vectors from the left: its matrices are ours transposed.
+    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
+    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
+
 
 Types = Sdf.ValueTypeNames
 # Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.

@@ -34,13 +34,14 @@ def in_one_line(error: object) -> str:
 
 def open_weaker(asset: Asset, role: str) -> Usd.Stage:
     """The stage that the task of a role builds upon: only the layers weaker than its own. Never
-    edits.usda: what an artist overrides must not flow back into the measurement."""
-    return _sublayered(asset, ROLES[: ROLES.index(role)])
+    edits.usda: what an artist overrides must not flow back into the measurement.
+    InputRefused where one of the tasks before has not run."""
+    return _sublayered(asset, _weaker_layers(asset, role))
 
 
 def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's."""
-    return _sublayered(asset, ROLES)
+    return _sublayered(asset, [asset.layer(role) for role in ROLES])
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
@@ -123,29 +124,18 @@ def named_files(layer: Sdf.Layer) -> set[str]:
     return found - {""}
 
 
-def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
-    layers = [asset.layer(role) for role in roles]
+def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     for layer in layers:
-        if not layer.is_file():
-            raise InputRefused(
-                f"{layer}: the layer is missing. Run the task that writes it first. [stage.missing]"
-            )
-    header = read_header(layers[0])
-    root = new_layer(header, Provenance(role="view", version="1"))
-    root.subLayerPaths = [str(layer) for layer in reversed(layers)]
-    return open_stage(root)
-
-
-def open_before(asset: Asset, role: str) -> Usd.Stage:
-    """The stage that tasks before that of ``role`` wrote; InputRefused where one has not run."""
-    for layer in _weaker_layers(asset, role):
         if not layer.is_file():
             raise InputRefused(
                 f"{asset.folder}: {layer.name} is missing, so an earlier step has not run here. "
                 "Run `usdbrdf convert`, or the steps ingest, texture, shade, fit in this order. "
                 "[asset.incomplete]"
             )
-    return open_weaker(asset, role)
+    root = new_layer(read_header(layers[0]), Provenance(role="view", version="1"))
+    # Texture coordinates are a sublayer of texturing.usda already.
+    root.subLayerPaths = [str(layer) for layer in reversed(layers) if layer != asset.uv_layer]
+    return open_stage(root)
 
 
 def hashes_of_inputs(

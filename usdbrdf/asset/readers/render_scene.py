@@ -31,16 +31,12 @@ _DEFAULT_WIDTH = 1280
 
 @dataclass(frozen=True, kw_only=True)
 class RenderScene:
-    """Surfaces and lights in metres, in the world of the stage.
-
-    up_axis          "Y" or "Z"
-    metres_per_unit  of the stage, whose units these were
-    """
+    """Surfaces and lights in metres, in the world of the stage."""
 
     surfaces: tuple[Surface, ...]
     lights: tuple[Light, ...]
-    up_axis: str
-    metres_per_unit: float
+    up_axis: str  # "Y" or "Z"
+    metres_per_unit: float  # of the stage, whose units these were
 
 
 def render_scene_from_stage(

@@ -46,17 +46,13 @@ _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 @dataclass(kw_only=True)
 class _MaterialReader:
-    """Reads the surface of a material, and gathers which primvars of a mesh that leads to ("" for
-    none).
-
-    uv_from_st  (3, 3) of column vectors, a UsdTransform2d; None is the identity
-    """
+    """Reads the surface of a material, and gathers which primvars of a mesh that leads to."""
 
     time: Usd.TimeCode
     warn: Callable[[str], None]
-    uv_primvar: str = ""
+    uv_primvar: str = ""  # "" for none
     colour_primvar: str = ""
-    uv_from_st: Float | None = None
+    uv_from_st: Float | None = None  # (3, 3) of column vectors, a UsdTransform2d; None: identity
     wrap: str = ""
 
     def material(self, bound: UsdShade.Material, mapping: str) -> Material:
