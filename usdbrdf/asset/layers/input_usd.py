@@ -13,7 +13,7 @@ others are listed there, and every look binds them as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import attribute, over, relationship
-from usdbrdf.asset.layout import Asset, relative_path
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
@@ -33,8 +33,6 @@ from usdbrdf.untrusted.usd_files import is_deforming, is_moving
 Types = Sdf.ValueTypeNames
 BINDING = "material:binding"
 _FIRST = Usd.TimeCode.EarliestTime()
-# Relationships to bind besides the mesh's own: path -> the collection it is about, or "".
-Competing = Mapping[str, str]
 
 
 def open_input(file: Path) -> Usd.Stage:
@@ -51,12 +49,6 @@ def open_input(file: Path) -> Usd.Stage:
             "Set defaultPrim in the file. [stage.default_prim]"
         )
     return stage
-
-
-def author_reference(layer: Sdf.Layer, root: str, file: Path, folder: Path) -> None:
-    """Reference the input's default prim on ours, by a path relative to the layer's folder."""
-    reference = Sdf.Reference(relative_path(file, folder))
-    over(layer, root).referenceList.prependedItems = [reference]
 
 
 def input_meshes(source: Usd.Prim, places: Sequence[str], root: str) -> dict[str, Usd.Prim]:
@@ -174,7 +166,8 @@ def has_transform(prim: Usd.Prim | None) -> bool:
 
 
 def competing_bindings(mesh: Usd.Prim, source: Usd.Prim, root: str) -> dict[str, str]:
-    """For one mesh of the input; paths below ``source``, its default prim, become ours."""
+    """Relationships to bind besides the own one of a mesh of the input: path -> the collection it
+    is about, or ""; paths below ``source``, the input's default prim, become ours."""
     purposes = set()
     for prim in _with_ancestors(mesh, source):
         for binding in _bindings(prim):
@@ -208,10 +201,9 @@ def weaken_bindings(layer: Sdf.Layer, mesh: Usd.Prim, source: Usd.Prim, root: st
                 weaker.SetInfo("bindMaterialAs", UsdShade.Tokens.weakerThanDescendants)
 
 
-def recorded_bindings(asset: Asset) -> dict[str, Competing]:
+def recorded_bindings(asset: Asset) -> dict[str, dict[str, str]]:
     """What the scan layer lists, per object's prim path; empty where the geometry is ours."""
-    recorded = read_provenance(asset.layer("scan")).get("competing_bindings", {})
-    return {prim_path: dict(found) for prim_path, found in recorded.items()}
+    return dict(read_provenance(asset.layer("scan")).get("competing_bindings", {}))
 
 
 def _with_ancestors(mesh: Usd.Prim, source: Usd.Prim) -> list[Usd.Prim]:

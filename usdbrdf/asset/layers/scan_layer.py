@@ -25,7 +25,7 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layout import ROLES, Asset, storable_path
+from usdbrdf.asset.layout import ROLES, Asset, relative_path, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import OwnershipConflict
@@ -117,7 +117,8 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     apply_schema(root, "ColorSpaceAPI")
     attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
     if source and scan.usd_geometry:
-        input_usd.author_reference(layer, scopes.root, scan.usd_geometry, folder)
+        reference = Sdf.Reference(relative_path(scan.usd_geometry, folder))
+        root.referenceList.prependedItems = [reference]
         normals, face_object = scan.mesh.corner_normals, scan.mesh.face_object
         for i, (at, mesh) in enumerate(meshes.items()):
             input_usd.weaken_bindings(layer, mesh, source, scopes.root)

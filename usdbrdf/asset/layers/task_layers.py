@@ -259,9 +259,6 @@ def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
         attribute(prim, "sourceType", Types.Token, source_type, uniform=True)
 
 
-BASE_COLOR = "base_color"
-
-
 def write_material_layer(
     path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
 ) -> None:
@@ -302,7 +299,7 @@ def _author_colour(
     """The refined colour instead of the albedo, on what reflects; without one a factor on the
     albedo. Returns the texture's path in layers; "" where there is none, as of an emitter."""
     for aov in item.aovs:
-        if aov.name == BASE_COLOR and any(item.mean_color):
+        if aov.name == "base_color" and any(item.mean_color):
             colour_from_texture(
                 layer, material, "diffuseColor", "BaseColorTexture", aov.file,
                 scale=scale, fallback=item.mean_color,

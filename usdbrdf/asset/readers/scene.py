@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -93,13 +93,6 @@ Number = TypeVar("Number", np.float32, np.float64)
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
 
-class _Mesh(NamedTuple):
-    points: Float
-    triangles: Int
-    corner_normals: Float
-    corner_uv: Float | None
-
-
 def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
     Meshes without normals of their own get them by the crease angle that ingest was given."""
@@ -112,10 +105,10 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
     records = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetLayerStack()]
     angles = (record.get("parameters", {}).get("crease_angle_deg") for record in records)
     angle = next((a for a in angles if a is not None), IngestOptions().crease_angle_deg)
-    meshes = [_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims]
-    num_faces = [len(mesh.triangles) for mesh in meshes]
-    first_face = np.cumsum([0, *num_faces])
-    first_point = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    read = (_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims)
+    points, triangles, normals, uvs = zip(*read, strict=True)
+    num_faces = [len(own) for own in triangles]
+    first_face, first_point = np.cumsum([0, *num_faces]), np.cumsum([0, *map(len, points)])
     objects = tuple(
         SceneObject(
             prim_path=str(prim.GetPath()),
@@ -127,25 +120,27 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
         )
         for i, prim in enumerate(prims)
     )
-    uvs = [mesh.corner_uv for mesh in meshes if mesh.corner_uv is not None]
-    if 0 < len(uvs) < len(meshes):
-        missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
+    without = [prim.GetPath() for prim, uv in zip(prims, uvs, strict=True) if uv is None]
+    if 0 < len(without) < len(prims):
         raise InputRefused(
-            f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
+            f"<{without[0]}>: the mesh has no texture coordinates though others have. "
             "Run `usdbrdf texture` again. [stage.st]"
         )
-    shifted = [mesh.triangles + first_point[i] for i, mesh in enumerate(meshes)]
+    shifted = [own + first_point[i] for i, own in enumerate(triangles)]
     return Scene(
         objects=objects,
-        points=np.concatenate([mesh.points for mesh in meshes]),
+        points=np.concatenate(points),
         triangles=np.concatenate(shifted).astype(np.int32),
-        corner_normals=np.concatenate([mesh.corner_normals for mesh in meshes]),
-        face_object=np.repeat(np.arange(len(meshes), dtype=np.int32), num_faces),
-        corner_uv=np.concatenate(uvs) if uvs else None,
+        corner_normals=np.concatenate(normals),
+        face_object=np.repeat(np.arange(len(prims), dtype=np.int32), num_faces),
+        corner_uv=None if without else np.concatenate(uvs),
     )
 
 
-def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
+def _read_mesh(
+    mesh: UsdGeom.Mesh, crease_angle_deg: float
+) -> tuple[Float, Int, Float, Float | None]:
+    """Points in the world, triangles, their corners' normals and texture coordinates of ours."""
     fans = triangulation_of(mesh)
     world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
     meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
@@ -167,7 +162,7 @@ def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
         turned = normals @ np.linalg.inv(world_from_local[:3, :3])
         unit = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
         in_world = np.ascontiguousarray(unit, np.float32)
-    return _Mesh(points, triangles, in_world, uv)
+    return points, triangles, in_world, uv
 
 
 def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -209,15 +209,6 @@ _MAX_SHOWN = 5
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
-class _Reading(NamedTuple):
-    """When the stage is looked at; what a fit recorded of the materials that its objects are bound
-    to (usdBrdf:fit:mapping), by material path; and who is told what is left out."""
-
-    time: Usd.TimeCode
-    mappings: Mapping[str, str]
-    warn: Callable[[str], None]
-
-
 def surfaces_from_stage(
     stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None], subject: Path | None = None
 ) -> tuple[Surface, ...]:
@@ -230,13 +221,14 @@ def surfaces_from_stage(
     surfaces: list[Surface] = []
     left_out: list[Usd.Prim] = []
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    # What a fit recorded of the materials that its objects are bound to.
     mappings = {
         str(bound.GetPath()): str(mapping)
         for prim in prims
         if (mapping := authored(prim, "usdBrdf:fit:mapping")) is not None
         if (bound := UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0])
     }
-    reading, transforms = _Reading(time, mappings, warn), UsdGeom.XformCache(time)
+    transforms = UsdGeom.XformCache(time)
     for prim in prims:
         if not prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.PointInstancer):
             continue
@@ -249,7 +241,7 @@ def surfaces_from_stage(
             left_out.append(prim)
             continue
         world_from_local = np.array(transforms.GetLocalToWorldTransform(prim)).T
-        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, reading)
+        surfaces += _surfaces_of_mesh(UsdGeom.Mesh(prim), world_from_local, time, mappings, warn)
     if left_out:
         about = subject or stage.GetRootLayer().identifier
         warn(f"{about}: only meshes are taken; left out: {paths_of(left_out)}.")
@@ -270,9 +262,12 @@ def metres_from_units(stage: Usd.Stage) -> Double:
 
 
 def _surfaces_of_mesh(
-    mesh: UsdGeom.Mesh, world_from_local: Double, reading: _Reading
+    mesh: UsdGeom.Mesh,
+    world_from_local: Double,
+    time: Usd.TimeCode,
+    mappings: Mapping[str, str],
+    warn: Callable[[str], None],
 ) -> list[Surface]:
-    time, warn = reading.time, reading.warn
     points = np.asarray(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
     fans = triangulation_of(mesh)
     if not len(fans.triangles) or fans.triangles.max() >= len(points):
@@ -293,7 +288,7 @@ def _surfaces_of_mesh(
     surfaces = []
     for faces, bound in _faces_by_material(mesh, fans, time):
         reader = _MaterialReader(time=time, warn=warn)
-        mapping = reading.mappings.get(str(bound.GetPath()), "") if bound else ""
+        mapping = mappings.get(str(bound.GetPath()), "") if bound else ""
         material = reader.material(bound, mapping)
         colour = _primvar(mesh, reader.colour_primvar, 3, fans, time)
         if colour is not None:
