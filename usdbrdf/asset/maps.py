@@ -32,6 +32,8 @@ from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
+# Pictures decoded or written at a time.
+_AT_A_TIME = min(4, os.cpu_count() or 1)
 _MAX_WIDTH = 640
 # The camera is chosen among this many frames, by about this many rays through each.
 _CANDIDATES, _RAYS = 64, 2000
@@ -89,10 +91,6 @@ def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int)
     """First surfaces behind the frame's pixels, were it ``width`` x ``height`` pixels."""
     camera = frames.camera(i).at_size(width, height)
     return rays.closest(*camera.rays(camera.pixels()))
-
-
-# Pictures decoded or written at a time.
-_AT_A_TIME = min(4, os.cpu_count() or 1)
 
 
 class AssetMaps:

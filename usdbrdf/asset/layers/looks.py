@@ -27,6 +27,15 @@ from usdbrdf.asset.properties import Aov, MeasuredObject
 
 Types = Sdf.ValueTypeNames
 Colour = Sequence[float]
+VARIANT_SET = "look"
+SHADED, LIT = "shaded", "lit"
+# What has no value in a look is shown in a colour that no measurement has: unknown is not black.
+NO_DATA = "no_data"
+NO_DATA_COLOUR = (0.5, 0.0, 0.5)
+# A look: the material's path per object's prim path.
+Bindings = Mapping[str, str]
+# What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
+Shown = Aov | Colour | None
 SURFACE = "PreviewSurface"
 
 
@@ -98,17 +107,6 @@ def scale_texture(layer: Sdf.Layer, material: str, texture: str, scale: float) -
     """A factor on the colour of a texture that this layer, or a weaker one, defines."""
     prim = over(layer, f"{material}/{texture}")
     author_inputs(prim, Types.Float4, scale=Gf.Vec4f(scale, scale, scale, 1.0))
-
-
-VARIANT_SET = "look"
-SHADED, LIT = "shaded", "lit"
-# What has no value in a look is shown in a colour that no measurement has: unknown is not black.
-NO_DATA = "no_data"
-NO_DATA_COLOUR = (0.5, 0.0, 0.5)
-# A look: the material's path per object's prim path.
-Bindings = Mapping[str, str]
-# What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
-Shown = Aov | Colour | None
 
 
 def author_looks(

@@ -34,6 +34,9 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded
 
+Types = Sdf.ValueTypeNames
+APERTURE_MM = 36.0
+NEAR_M, FAR_M = 0.01, 1000.0
 _VERSION = "1"  # of the folder's layout; these layers outlive the version of the tool
 
 
@@ -84,11 +87,6 @@ def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
     layer = new_layer(header, Provenance(role=role, version=_VERSION), state="pending")
     over(layer, f"/{header.name}")
     export(layer, path, folder=path.parent)
-
-
-Types = Sdf.ValueTypeNames
-APERTURE_MM = 36.0
-NEAR_M, FAR_M = 0.01, 1000.0
 
 
 def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:

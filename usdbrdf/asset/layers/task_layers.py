@@ -60,13 +60,18 @@ from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
 from usdbrdf.asset.properties import FittedObject, ShadedObject, TexturedObject
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.arrays import Double
 from usdbrdf.model.light import LampShape
 
+Types = Sdf.ValueTypeNames
+THUMBNAIL = "previews/lit.png"  # in the asset folder
+# Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
+_PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
+ALBEDO, EMISSION = "albedo", "emission"
+# Texture nodes of the materials; that of the emission has no scale of its own.
+ALBEDO_TEXTURE, EMISSION_TEXTURE = "AlbedoTexture", "EmissionTexture"
 LIGHTS = "lights"
 EMISSIVE, USDLUX = "emissive", "usdlux"
-# The texture node of the materials' emission, which has no scale of its own.
-EMISSION_TEXTURE = "EmissionTexture"
 _TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
 
 
@@ -147,12 +152,6 @@ def _author_light(
     attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
 
 
-Types = Sdf.ValueTypeNames
-# Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
-_PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
-THUMBNAIL = "previews/lit.png"  # in the asset folder
-
-
 def write_texturing_layer(
     path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject], scanned: Usd.Stage
 ) -> None:
@@ -166,9 +165,22 @@ def write_texturing_layer(
     layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
     with Sdf.ChangeBlock():
         for item in objects:
+            # One value per triangle corner; equal values are stored once and indexed. Their type is
+            # the one that an input file gives its own, which ours must share: float2[] is usual.
             declared = scanned.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
             kind = declared.GetTypeName() if declared else Types.TexCoord2fArray
-            _author_texture_coordinates(over(coordinates, item.prim_path), item.corner_uv, kind)
+            if type(kind.defaultValue) not in _PAIRS:
+                kind = Types.TexCoord2fArray
+            corners = np.ascontiguousarray(item.corner_uv, np.float32).reshape(-1, 2)
+            # Two floats as one integer: equal bits, much faster than rows.
+            bits = corners.view(np.uint64)
+            _, first, index = np.unique(bits, return_index=True, return_inverse=True)
+            values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
+            prim = over(coordinates, item.prim_path)
+            attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
+            attribute(
+                prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32)
+            )
             author_record(over(layer, item.prim_path), item)
     # What browsers of assets show: the picture that the task writes beside the layer.
     root = layer.GetPrimAtPath(scopes.root)
@@ -180,24 +192,6 @@ def write_texturing_layer(
     export(layer, path, folder=folder)
 
 
-def _author_texture_coordinates(
-    prim: Sdf.PrimSpec, corner_uv: Float, declared: Sdf.ValueTypeName
-) -> None:
-    """primvars:st, one value per triangle corner; equal values are stored once and indexed.
-
-    declared  the type that an input file gives its own, which ours must share: float2[] is usual
-    """
-    corners = np.ascontiguousarray(corner_uv, np.float32).reshape(-1, 2)
-    # Two floats as one integer: equal bits, much faster than rows.
-    _, first, index = np.unique(corners.view(np.uint64), return_index=True, return_inverse=True)
-    kind = declared if type(declared.defaultValue) in _PAIRS else Types.TexCoord2fArray
-    values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
-    attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
-    attribute(prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32))
-
-
-ALBEDO, EMISSION = "albedo", "emission"
-ALBEDO_TEXTURE = "AlbedoTexture"
 # What a renderer is asked for: name, type, source. Light path expressions say which paths count;
 # "raw" names a renderer's own output.
 _RENDER_VARS = (

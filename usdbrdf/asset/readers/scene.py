@@ -33,6 +33,9 @@ from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
 
+Record = TypeVar("Record")
+Number = TypeVar("Number", np.float32, np.float64)
+_TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 LENS = (
     "focalLength",
     "horizontalAperture",
@@ -87,10 +90,6 @@ def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | N
     # Relative to the layer that holds the opinion.
     layer = attribute.GetPropertyStack(time)[0].layer
     return Path(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
-
-
-Number = TypeVar("Number", np.float32, np.float64)
-_TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
 
 
 def scene_from_stage(stage: Usd.Stage) -> Scene:
@@ -215,9 +214,6 @@ def authored_normals(
     if chosen is None or not np.isfinite(chosen).all():
         return None
     return chosen if (np.linalg.norm(chosen, axis=-1) > 1e-12).all() else None
-
-
-Record = TypeVar("Record")
 
 
 def authored(prim: Usd.Prim, name: str) -> Any:

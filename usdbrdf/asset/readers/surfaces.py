@@ -41,6 +41,11 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
 }
 # "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
 _WRAP = {"repeat": "repeat", "mirror": "mirror"}
+# Meshes that bring no normals are smooth where their faces meet at less than this.
+_CREASE_ANGLE_DEG = 40.0
+# Prims that a sentence names.
+_MAX_SHOWN = 5
+_PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 _CHANNEL = {"r": 0, "g": 1, "b": 2}
 
 
@@ -200,13 +205,6 @@ def _value(wanted: UsdShade.Input | None, time: Usd.TimeCode) -> Any:
         return None
     value = _producer(wanted).Get(time)
     return value.path if isinstance(value, Sdf.AssetPath) else value
-
-
-# Meshes that bring no normals are smooth where their faces meet at less than this.
-_CREASE_ANGLE_DEG = 40.0
-# Prims that a sentence names.
-_MAX_SHOWN = 5
-_PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 
 
 def surfaces_from_stage(
