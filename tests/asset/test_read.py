@@ -182,7 +182,7 @@ def test_a_layer_that_was_written_again_is_read_again(built):
 
 def test_a_missing_layer_is_named(built):
     built.asset.layer("texturing").unlink()
-    with pytest.raises(InputRefused, match=r"texturing\.usda: the layer is missing.+\[stage"):
+    with pytest.raises(InputRefused, match=r"texturing\.usda is missing.+\[asset\.incomplete\]"):
         open_weaker(built.asset, "shading")
 
 
