@@ -23,7 +23,7 @@ from measure import Lit, Spent, figure, lit_asset, parser_of, report, timed
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
 from usdbrdf.material.fit_views import MIXTURE

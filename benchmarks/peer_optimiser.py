@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.files.frames import read_frame
 from usdbrdf.model.light import RelitScene
 from usdbrdf.model.material import Material, Surface, constant_map

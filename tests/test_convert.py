@@ -19,9 +19,13 @@ from tests.scenes import MadeCapture, edited, make_capture, poses_down_and_up, w
 from usdbrdf.asset.layers.looks import VARIANT_SET
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import read_aovs, read_fit, read_shading
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import (
+    frames_from_stage,
+    read_aovs,
+    read_fit,
+    read_shading,
+    scene_from_stage,
+)
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of

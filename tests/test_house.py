@@ -27,7 +27,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 
 # --- The arrows. A room may import what it names here, and all rooms that those may. -------------
 
-GROUND = {"calibration", "errors", "identity", "kernel", "kernel_cache", "options"}
+GROUND = {"calibration", "errors", "identity", "kernel", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
 READERS = {"delivery", "evaluation", "relighting", "validation"}
@@ -37,8 +37,7 @@ ARROWS: dict[str, set[str]] = {
     "identity": set(),
     "calibration": set(),
     "options": {"model", "calibration"},
-    "kernel_cache": {"identity"},
-    "kernel": {"kernel_cache"},
+    "kernel": {"identity"},
     "model": {"errors"},
     "files": {"model"},
     "job": {"files", "identity"},
@@ -73,14 +72,14 @@ IMPORTERS: dict[str, set[str]] = {
     "embreex": {"transport/rays.py"},
     "filelock": {"job/ownership.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
-    "llvmlite": {"kernel_cache.py", "transport/"},
+    "llvmlite": {"kernel.py", "transport/"},
     "matplotlib": {"evaluation/"},
     "mitsuba": {"relighting/"},
     "msgspec": {"files/documents.py"},
-    "numba": {"kernel.py", "kernel_cache.py", "geometry/", "material/", "texturing/", "transport/"},
+    "numba": {"kernel.py", "geometry/", "material/", "texturing/", "transport/"},
     "omni": {"validation/omniverse.py"},
     "OpenImageIO": {"files/images.py"},
-    "pickle": {"kernel_cache.py"},
+    "pickle": {"kernel.py"},
     "PIL": {"delivery/"},
     "psutil": {"job/memory.py"},
     "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
@@ -104,7 +103,7 @@ OPENERS: dict[str, str] = {
     "delivery/": "packages are files",
     "calibration.py": "its own data",
     "identity.py": "hashes the sources",
-    "kernel_cache.py": "compiled code",
+    "kernel.py": "compiled code",
     "evaluation/metrics.py": "truth comes as .npz",
     "command_parser.py": "a matrix comes as a text file",
     "validation/validate.py": "the layer of cures is an artist's file",

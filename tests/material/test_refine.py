@@ -18,8 +18,7 @@ from tests.scenes import MadeCapture, make_capture, poses_down_and_up
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import read_aovs, read_shading
+from usdbrdf.asset.readers.scene import frames_from_stage, read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import read_frames
 from usdbrdf.files.images import read_exr, write_exr

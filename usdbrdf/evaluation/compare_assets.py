@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.previews import camera_hits
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.maps import AssetMaps, camera_hits
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.evaluation.metrics import MIN_SAMPLES, MapError, map_error

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
 from usdbrdf.job.child import run_child

@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.layers.material_layer import write_material_layer
+from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import FittedObject, colour
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, judged, survey_frames
+from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
 from usdbrdf.material.refine import Lobes, refined_light
-from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
@@ -32,7 +30,7 @@ _READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
-    maps = AssetMaps(open_before(asset, "material"))
+    maps = AssetMaps(open_weaker(asset, "material"))
     # S is refined as it was filtered, if the filter is here too.
     shading = read_provenance(asset.layer("shading")).get("parameters", {})
     filtered = options.method == "views" and shading.get("denoise") == OIDN
@@ -55,8 +53,18 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         survey = survey_frames(run, lit, maps.texels, usable, maps.frames, options)
         found = fitted_objects(run, lit, maps.texels, maps.frames, survey, options)
         objects = [
-            _record(obj, found[i], options, maps.is_observed(i))
-            for i, obj in enumerate(maps.scene.objects)
+            FittedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                cost=own.cost,
+                evidence=own.evidence,
+                target_frame=own.target if math.isfinite(own.phi) else -1,
+                num_pixels=own.num_samples,
+                method=options.method,
+                mapping=options.mapping,
+                **vars(judged(own, obj, options.method, maps.is_observed(i))),
+            )
+            for i, (obj, own) in enumerate(zip(maps.scene.objects, found, strict=True))
         ]
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
@@ -72,20 +80,6 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         return {"objects": {item.identifier: item.summary for item in objects}}
 
     return task.run(work)
-
-
-def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool) -> FittedObject:
-    return FittedObject(
-        prim_path=obj.prim_path,
-        identifier=obj.identifier,
-        cost=found.cost,
-        evidence=found.evidence,
-        target_frame=found.target if math.isfinite(found.phi) else -1,
-        num_pixels=found.num_samples,
-        method=options.method,
-        mapping=options.mapping,
-        **vars(judged(found, obj, options.method, seen)),
-    )
 
 
 def _refined(

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
-from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
+from usdbrdf.asset.layers.task_layers import write_texturing_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import charts_of_scene
@@ -26,7 +25,7 @@ from usdbrdf.transport.rays import RayScene
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
-    maps = AssetMaps(open_before(asset, "texturing"))
+    maps = AssetMaps(open_weaker(asset, "texturing"))
     task = Task(
         asset=asset,
         name="texture",

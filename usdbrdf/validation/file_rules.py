@@ -13,7 +13,7 @@ from pxr import Ar, Sdf, Usd
 
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.asset.properties import SCHEMA_VERSION
-from usdbrdf.asset.readers.frames import asset_file
+from usdbrdf.asset.readers.scene import asset_file
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
 

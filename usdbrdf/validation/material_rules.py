@@ -10,7 +10,7 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.preview_lobe import preview_surface_from_fit
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
 Types = Sdf.ValueTypeNames

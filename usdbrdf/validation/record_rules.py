@@ -11,9 +11,9 @@ from itertools import chain
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from usdbrdf.asset.layers.scan_layer import LENS, lens_from_pinhole
+from usdbrdf.asset.layers.scan_layer import lens_from_pinhole
 from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, Fact, facts_by_attribute
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import LENS, authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
 # Of a scale, and of the lens.

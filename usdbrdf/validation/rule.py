@@ -16,7 +16,7 @@ from pxr import Ar, Sdf, Usd, UsdShade
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import named_files
-from usdbrdf.asset.readers.objects import authored
+from usdbrdf.asset.readers.scene import authored
 
 # Before the name of a rule of ours, where it stands among those of others.
 PREFIX = "usdbrdf"
