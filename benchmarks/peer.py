@@ -4,7 +4,7 @@
     python benchmarks/peer.py ASSET TRUTH_FOLDER [-o FOLDER] [--quick]
 
 ASSET was shaded, TRUTH_FOLDER holds its capture's true phi and psi, as `samples/study/truth` does.
-The peer optimises the same two parameters of the same lobe (usdbrdf/relighting/render.py, so
+The peer optimises the same two parameters of the same lobe (usdbrdf/relighting/lobe_plugin.py, so
 nothing has to be converted) against the same frames. It is lit by the lit texture L_d, as our fit
 is. As the diffuse radiance, which our fit eliminates, it is given the asset's refined map
 `diffuse`, free of specular light: the best case for the peer, which owes it to our fit and does not
