@@ -129,7 +129,7 @@ def streamed(
     atlas: AssetMaps, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
-    images = read_frames(frames, range(count))
+    images = read_frames(functools.partial(read_frame, frames), range(count))
     cpu, wall = time.process_time(), time.perf_counter()
     for some in samples_from_frames(atlas.texels, atlas.scene, rays, frames, images):
         observed.add(some, QUANTILE)

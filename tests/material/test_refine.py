@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +22,7 @@ from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.frames import frames_from_stage
 from usdbrdf.asset.readers.objects import read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import FramePixels, FrameReader, read_frame, read_frames
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import checkpoints
 from usdbrdf.job.progress import set_quiet
@@ -81,7 +82,8 @@ def _lobes(atlas: AssetMaps) -> Lobes:
 
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
-    return refined_light(run, lit, atlas.texels, frames, atlas, _lobes(atlas), "none", None, 0)
+    reader, lobes = FrameReader(frames, most_bytes=0), _lobes(atlas)
+    return refined_light(run, lit, atlas.texels, reader, atlas, lobes, "none", None, 0)
 
 
 def _irradiance(
@@ -360,9 +362,9 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     starts = []
     through_all = refine.samples_from_frames
 
-    def read(frames, order):
+    def read(how, order):
         starts.append(NUM_FRAMES - len(order))
-        return read_frames(frames, order)
+        return read_frames(how, order)
 
     def interrupted(*arguments, **options):
         for done, samples in enumerate(through_all(*arguments, **options)):
@@ -382,6 +384,22 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
         usdbrdf.fit(asset, usdbrdf.FitOptions())
     assert starts == [0, INTERRUPTED + 1]
     assert _contents(folder) == _contents(fitted.folder)
+
+
+@pytest.mark.parametrize("memory", [None, 0.01])
+def test_frames_are_decoded_once_where_memory_suffices(
+    room: Room, fitted: Asset, monkeypatch, memory: float | None
+):
+    decoded: Counter[int] = Counter()
+
+    def counting(of: Frames, i: int) -> FramePixels:
+        decoded[i] += 1
+        return read_frame(of, i)
+
+    monkeypatch.setattr("usdbrdf.files.frames.read_frame", counting)
+    found = _fitted(room, f"read with {memory}", usdbrdf.FitOptions(memory=memory))
+    assert decoded == dict.fromkeys(range(NUM_FRAMES), 1 if memory is None else 2)
+    assert _contents(found.folder) == _contents(fitted.folder)
 
 
 def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, monkeypatch, capsys):

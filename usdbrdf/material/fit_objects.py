@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FrameReader, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_target import (
@@ -96,12 +96,18 @@ class ObjectFit(NamedTuple):
 
 
 def survey_frames(
-    run: TaskRun, lit: LitScene, texels: Texels, usable: Bool, frames: Frames, options: FitOptions
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    usable: Bool,
+    reader: FrameReader,
+    options: FitOptions,
 ) -> Survey:
     """Gather all that the fits need of the frames, which are read once.
 
     usable (T,): measured by frames, and no lamp
     """
+    frames = reader.frames
 
     def gather() -> dict[str, Array]:
         by_views = options.method == "views"
@@ -109,9 +115,8 @@ def survey_frames(
             lit, texels, usable & texels.interior & by_views, len(frames), options.seed
         )
         counts = []
-        numbers = range(len(frames))
-        for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
-            pixels = read_frame(frames, i)
+        images = read_frames(reader.read, range(len(frames)))
+        for i, pixels in progress(images, total=len(frames), label="fit: survey", unit="frames"):
             if by_views:
                 view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
                 follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
@@ -137,7 +142,12 @@ def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
 
 
 def fitted_objects(
-    run: TaskRun, lit: LitScene, texels: Texels, frames: Frames, survey: Survey, options: FitOptions
+    run: TaskRun,
+    lit: LitScene,
+    texels: Texels,
+    reader: FrameReader,
+    survey: Survey,
+    options: FitOptions,
 ) -> list[ObjectFit]:
     """``fit_object`` of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))
@@ -149,7 +159,7 @@ def fitted_objects(
         ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
     ):
         jobs = {
-            pool.submit(fit_object, lit, texels, frames, survey, i, options): i
+            pool.submit(fit_object, lit, texels, reader, survey, i, options): i
             for i in numbers
             if i not in done
         }
@@ -167,7 +177,7 @@ def fitted_objects(
 def fit_object(
     lit: LitScene,
     texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     survey: Survey,
     index: int,
     options: FitOptions,
@@ -178,7 +188,7 @@ def fit_object(
     if options.method == "views":
         own = survey.observations.of_texels(texels.of_object(index))
         lobe, used = fit_views(
-            lit, texels, own, survey.smoothing, frames.camera, index, options.seed, mixture
+            lit, texels, own, survey.smoothing, reader.frames.camera, index, options.seed, mixture
         )
         if lobe is None:
             return ObjectFit(num_samples=used, target=target)
@@ -188,8 +198,8 @@ def fit_object(
         )  # fmt: skip
     if target < 0 or _is_lamp(lit, index):
         return ObjectFit(target=target)
-    pixels = read_frame(frames, target)
-    view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
+    pixels = reader.read(target)
+    view = _view(reader.frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
     residual: Residual = "paper" if options.method == "paper" else "scaled"
     found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
     if found is None:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import FrameReader, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -33,7 +33,13 @@ from usdbrdf.shading.shaded import albedo_map, denoised_irradiance, tiles_of_pat
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
-from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
+from usdbrdf.texturing.passes import (
+    BytesPerTexel,
+    bytes_for_frames,
+    groups_of_texels,
+    in_passes,
+    smallest_groups,
+)
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
@@ -163,7 +169,7 @@ def refined_light(
     run: TaskRun,
     lit: LitScene,
     texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     before: LightBefore,
     lobes: Lobes,
     lightmap_filter: str,
@@ -176,7 +182,7 @@ def refined_light(
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
-    found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
+    found = _means_without_lobes(run, lit, texels, reader, before, lobes, memory, seed)
     emissive, observed = before.emissive, before.coverage.observed
     known = np.isfinite(found.mean[:, 0]) & ~emissive
     restored_light = _restored(texels, found, known, _level(before.lit))
@@ -217,7 +223,7 @@ def _means_without_lobes(
     run: TaskRun,
     lit: LitScene,
     texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     before: LightBefore,
     lobes: Lobes,
     memory: float | None,
@@ -225,37 +231,46 @@ def _means_without_lobes(
 ) -> RobustMean:
     """Of T texels the mean over all frames without their specular light, relative to ``_level`` of
     their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
-    textures = _bytes_of(lit) // len(texels)
-    need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
+    need = _need(lit, texels)
     try:
-        groups = groups_of_texels(texels, lit.scene, frames, memory, need)
+        groups = groups_of_texels(texels, lit.scene, reader.frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
         warn(str(short))
         groups = smallest_groups(texels)
 
     def means(part: slice) -> dict[str, Float]:
-        observed = _observed(run, lit, texels, frames, before, lobes, seed, part)
+        observed = _observed(run, lit, texels, reader, before, lobes, seed, part)
         return robust_mean(observed)._asdict()
 
     return RobustMean(**in_passes(run, "means", groups, means))
 
 
-def _bytes_of(lit: LitScene) -> int:
-    """What the light takes beside scene and texels."""
-    return lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+def frame_reader(
+    lit: LitScene, texels: Texels, frames: Frames, memory: float | None
+) -> FrameReader:
+    """Keeps the frames for which refining T texels leaves room in ``memory`` (GiB)."""
+    need = _need(lit, texels)
+    return FrameReader(frames, bytes_for_frames(texels, lit.scene, frames, memory, need))
+
+
+def _need(lit: LitScene, texels: Texels) -> BytesPerTexel:
+    """With the light, which lies beside scene and texels."""
+    light = lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+    return _OF_REFINING._replace(always=_OF_REFINING.always + light // len(texels))
 
 
 def _observed(
     run: TaskRun,
     lit: LitScene,
     texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     before: LightBefore,
     lobes: Lobes,
     seed: int,
     part: slice,
 ) -> MeanState:
     """Some texels in all frames, going on from the last saved state of an interrupted run."""
+    frames = reader.frames
     owner, level, samples = texels.object_index(), _level(before.lit), before.samples
     name = f"refined-{part.start}-{part.stop}"
     saved = run.latest(name)
@@ -264,7 +279,7 @@ def _observed(
         start, observed = saved[0] + 1, MeanState(**saved[1])
     # The mean starts from its first samples, which must not all show one highlight.
     order = spread_order(len(frames))[start:]
-    images = read_frames(frames, order)
+    images = read_frames(reader.read, order)
     sampled = samples_from_frames(texels, lit.scene, lit.rays, frames, images, part)
     bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
     for done, some in enumerate(bar, start):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
@@ -84,7 +85,7 @@ def _observed(
     if saved is not None:
         start = saved[0] + 1
         observed.restore(saved[1])
-    images = read_frames(frames, range(start, len(frames)))
+    images = read_frames(partial(read_frame, frames), range(start, len(frames)))
     sampled = samples_from_frames(surface.texels, surface.scene, surface.rays, frames, images, part)
     for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
         observed.add(some, quantile)
