@@ -77,9 +77,9 @@ def fitted(
     """Time of the pass over the frames, and each object by its label."""
     frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
     options = FitOptions(seed=seed)
-    texels, usable = lit.atlas.texels, lit.atlas.coverage.measured & ~lit.atlas.emissive
+    usable = lit.atlas.coverage.measured & ~lit.atlas.emissive
     reader = FrameReader(frames, most_bytes=0)
-    given = NoCheckpoints(), lit.scene, texels, usable, reader, options
+    given = NoCheckpoints(), lit.scene, usable, reader, options
     survey, surveying = timed(lambda: fit_objects.survey_frames(*given))
     chosen = np.unique(survey.observations.texel)[:: effort.of_texels]
     kept = np.flatnonzero(np.isin(survey.observations.texel, chosen))
@@ -87,7 +87,7 @@ def fitted(
 
     def fit_one(i: int) -> ObjectFit:
         mixture = effort.mixture
-        return fit_objects.fit_object(lit.scene, texels, reader, survey, i, options, mixture)
+        return fit_objects.fit_object(lit.scene, reader, survey, i, options, mixture)
 
     fit_one(0)  # compiles
     objects = {}

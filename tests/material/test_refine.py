@@ -83,7 +83,7 @@ def _lobes(atlas: AssetMaps) -> Lobes:
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
     reader, lobes = FrameReader(frames, most_bytes=0), _lobes(atlas)
-    return refined_light(run, lit, atlas.texels, reader, atlas, lobes, "none", None, 0)
+    return refined_light(run, lit, reader, atlas, lobes, "none", None, 0)
 
 
 def _irradiance(
@@ -92,7 +92,7 @@ def _irradiance(
     """S of the asset, with the diffuse radiance and the lobes as the light instead of its L_d."""
     change = np.where(atlas.emissive[:, None], 0, diffuse - atlas.lit).astype(np.float32)
     traced = atlas.irradiance
-    return refined_irradiance(run, lit, atlas.texels, traced, change, lobes, "none", 0)
+    return refined_irradiance(run, lit, traced, change, lobes, "none", 0)
 
 
 def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, seed: int) -> Float:
@@ -260,9 +260,9 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     frames, lit = frames_from_stage(atlas.stage), atlas.lit_scene(black_environment())
     given = []
 
-    def spied(run, lit, texels, traced, change, *others):
+    def spied(run, lit, traced, change, *others):
         given.append(atlas.lit + change)
-        return refined_irradiance(run, lit, texels, traced, change, *others)
+        return refined_irradiance(run, lit, traced, change, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
     run = TaskRun(tmp_path, "fit", tmp_path / "work")

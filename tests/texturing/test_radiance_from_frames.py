@@ -21,6 +21,7 @@ from usdbrdf.texturing.exposures import Probes
 from usdbrdf.texturing.footprints import texel_size_from_frames
 from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
+from usdbrdf.transport.lit_scene import TexturedScene
 
 SATURATION = 4.0
 WIDTH, HEIGHT = 48, 36
@@ -83,8 +84,9 @@ def _observe(
     world: World, frames: Frames, observed: Observation, start: int = 0, part: slice | None = None
 ) -> list[int]:
     images = read_frames(partial(read_frame, frames), range(start, len(frames)))
+    surface = TexturedScene(world.scene, world.texels, world.rays)
     done = []
-    for some in samples_from_frames(world.texels, world.scene, world.rays, frames, images, part):
+    for some in samples_from_frames(surface, frames, images, part):
         observed.add(some, 0.5)
         done.append(some.frame)
     return done

@@ -53,9 +53,9 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         environment = environment_from_file(options.environment, task.header.up_axis)
         lit = maps.lit_scene(environment)
         usable = maps.coverage.measured & ~maps.emissive
-        reader = frame_reader(lit, maps.texels, maps.frames, options.memory)
-        survey = survey_frames(run, lit, maps.texels, usable, reader, options)
-        found = fitted_objects(run, lit, maps.texels, reader, survey, options)
+        reader = frame_reader(lit, maps.frames, options.memory)
+        survey = survey_frames(run, lit, usable, reader, options)
+        found = fitted_objects(run, lit, reader, survey, options)
         objects = [
             _record(obj, found[i], options, maps.is_observed(i))
             for i, obj in enumerate(maps.scene.objects)
@@ -100,7 +100,7 @@ def _refined(
     numbers = [item.phi for item in objects], [item.psi for item in objects]
     lobes = Lobes(*np.array(numbers, np.float32))
     refined = refined_light(
-        run, lit, maps.texels, reader, maps, lobes, lightmap_filter, options.memory, options.seed
+        run, lit, reader, maps, lobes, lightmap_filter, options.memory, options.seed
     )
     written = {
         "diffuse": TexelMap(refined.diffuse, 1.0, "W/(m^2 sr)"),

@@ -108,8 +108,9 @@ def _budget(
 ) -> tuple[float, float, float]:
     """Bytes: the limit, what is held beside the present group, and when all groups are done."""
     limit = memory * GIB if memory else _SHARE * machine_bytes()
-    held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
-    held += need.always * len(texels)
+    tables = [*vars(scene).values(), *vars(texels).values()]
+    held = _PROCESS + sum(table.nbytes for table in tables if isinstance(table, np.ndarray))
+    held += _PER_TRIANGLE * len(scene.triangles) + need.always * len(texels)
     # Whoever called may hold more, and an allocator keeps some of what was freed.
     give_back_freed()
     held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
@@ -132,7 +133,3 @@ def _groups(count: int, most: int) -> list[slice]:
     number = -(-count // most)
     ends = [k * count // number for k in range(number + 1)]
     return [slice(low, high) for low, high in pairwise(ends)]
-
-
-def _bytes(table: Scene | Texels) -> int:
-    return sum(a.nbytes for a in vars(table).values() if isinstance(a, np.ndarray))
