@@ -185,7 +185,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
     usable[own] = True
     angles = np.radians(np.linspace(-60, 60, 9))
     cameras = []
-    follower = Follower(lit, studio.world.texels, usable, len(angles), 0)
+    follower = Follower(lit, usable, len(angles), 0)
     for angle in angles:
         eye = np.array([1.6 * np.sin(angle), -1.6 * np.cos(angle), 1.0 + 0.3 * np.sin(3 * angle)])
         there = studio._replace(
@@ -196,9 +196,8 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         )
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
-    texels = studio.world.texels
-    observed, smoothing = follower.chosen(texels, 0).of_texels(own), follower.smoothing
-    found, used = fit_views(lit, texels, observed, smoothing, cameras.__getitem__, SPHERE, 0)
+    observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
+    found, used = fit_views(lit, observed, smoothing, cameras.__getitem__, SPHERE, 0)
     assert found is not None
     assert used > 500
     assert found.phi == pytest.approx(phi, abs=0.04)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -19,6 +20,8 @@ PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 _CLIPPED_SHARE = 0.998
 # Threads that decode, and frames in memory besides the one that is used.
 _READERS, _AHEAD = 2, 3
+# Of a frame: three channels of radiance and four masks.
+_BYTES_OF_PIXEL = 16
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
 
@@ -84,20 +87,43 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     )
 
 
-def read_frames(frames: Frames, order: Sequence[int]) -> Iterator[tuple[int, FramePixels]]:
+def read_frames(
+    read: Callable[[int], FramePixels], order: Sequence[int]
+) -> Iterator[tuple[int, FramePixels]]:
     """Number and pixels of the frames of ``order``, the next ones decoded while one is used."""
     with ThreadPoolExecutor(max_workers=_READERS) as readers:
-        coming = deque((i, readers.submit(read_frame, frames, i)) for i in order[:_AHEAD])
+        coming = deque((i, readers.submit(read, i)) for i in order[:_AHEAD])
         try:
             for ahead in range(_AHEAD, len(order) + _AHEAD):
                 i, pixels = coming.popleft()
                 found = pixels.result()
                 if ahead < len(order):
-                    coming.append((order[ahead], readers.submit(read_frame, frames, order[ahead])))
+                    coming.append((order[ahead], readers.submit(read, order[ahead])))
                 yield i, found
         finally:
             for _, job in coming:
                 job.cancel()
+
+
+class FrameReader:
+    """Frames that are asked for again and again: the first of them, as many as fit into
+    ``most_bytes`` decoded, are read once and kept, the others read each time."""
+
+    def __init__(self, frames: Frames, most_bytes: int) -> None:
+        self.frames = frames
+        sizes = _BYTES_OF_PIXEL * frames.resolution.prod(axis=1, dtype=np.int64)
+        self._num_kept = int(np.searchsorted(sizes.cumsum(), most_bytes, side="right"))
+        self._kept: dict[int, FramePixels] = {}
+        self._locks = [Lock() for _ in range(self._num_kept)]
+
+    def read(self, i: int) -> FramePixels:
+        """Pixels of frame ``i``, not to be written to; from any thread. See ``read_frame``."""
+        if i >= self._num_kept:
+            return read_frame(self.frames, i)
+        with self._locks[i]:
+            if i not in self._kept:
+                self._kept[i] = read_frame(self.frames, i)
+            return self._kept[i]
 
 
 def _in_any_channel(true: Bool) -> Bool:

@@ -51,26 +51,20 @@ def blurred(texels: Texels, values: Float, covariance: Float) -> Float:
     the texel's own area. covariance (T, 3): xx, xy, yy, in texels. What lies off a texel's chart
     counts as the texel itself.
     """
-    owner, chart = texels.object_index(), _chart_of_pixels(texels)
-    picture = np.ascontiguousarray(values[np.maximum(texels.nearest_texel, 0)])
-    blurry = np.zeros_like(values)
-    _blur(
-        picture, chart, texels.pixel, texels.first_pixel[owner], texels.resolution[owner],
-        covariance, RINGS, blurry,
-    )  # fmt: skip
-    return blurry
-
-
-def _chart_of_pixels(texels: Texels) -> Int:
-    """Number of the chart that each flat pixel shows, (P,): texels that touch share one."""
     occupied = np.zeros(len(texels.nearest_texel), np.bool_)
     occupied[texels.pixel] = True
+    # Number of the chart that each flat pixel lies on, (P,): texels that touch share one.
     chart = np.zeros(len(occupied), np.int32)
     for i, (width, height) in enumerate(texels.resolution):
         own = slice(int(texels.first_pixel[i]), int(texels.first_pixel[i + 1]))
         chart[own] = ndimage.label(occupied[own].reshape(height, width), np.ones((3, 3)))[0].ravel()
-    shown: Int = chart[texels.pixel[np.maximum(texels.nearest_texel, 0)]]
-    return shown
+    owner, nearest = texels.object_index(), np.maximum(texels.nearest_texel, 0)
+    blurry = np.zeros_like(values)
+    _blur(
+        np.ascontiguousarray(values[nearest]), chart[texels.pixel[nearest]], texels.pixel,
+        texels.first_pixel[owner], texels.resolution[owner], covariance, RINGS, blurry,
+    )  # fmt: skip
+    return blurry
 
 
 @parallel_kernel
@@ -198,8 +192,5 @@ def texel_size_from_frames(scene: Scene, rays: RayScene, frames: Frames, max_tex
     area = doubled_areas(scene.points, scene.triangles).sum() / 2
     size = float(f"{np.median(footprint):.{_DIGITS}g}")
     least = float(np.sqrt(area / (_PACKING * max_texels)))
-    return size if size >= least else _rounded_up(least)
-
-
-def _rounded_up(size: float) -> float:
-    return float(Context(prec=_DIGITS, rounding=ROUND_CEILING).create_decimal_from_float(size))
+    up = Context(prec=_DIGITS, rounding=ROUND_CEILING)
+    return size if size >= least else float(up.create_decimal_from_float(least))
