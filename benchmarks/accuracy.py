@@ -27,9 +27,8 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import read_shading
-from usdbrdf.evaluation.truth import (
+from usdbrdf.asset.readers.scene import frames_from_stage, read_shading
+from usdbrdf.evaluation.metrics import (
     albedo_error,
     emitters,
     known_objects,

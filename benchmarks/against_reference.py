@@ -35,8 +35,8 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.objects import aov_path
-from usdbrdf.files.arrays import load_arrays
+from usdbrdf.asset.readers.scene import aov_path
+from usdbrdf.files.documents import load_arrays
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 

@@ -27,15 +27,14 @@ from pxr import Sdf, Usd, UsdGeom
 
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.header import Scopes
-from usdbrdf.asset.layers.preview_surface import lobe, scale_texture
+from usdbrdf.asset.layers.looks import lobe, scale_texture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.preview_lobe import preview_surface_from_fit
-from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
-from usdbrdf.evaluation.evaluate_views import exposure_of_views
+from usdbrdf.evaluation.evaluate_views import exposure_of_views, measured_atlas
 from usdbrdf.evaluation.metrics import Pair, flip_maps, relative_l2
-from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_radiance

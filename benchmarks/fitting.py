@@ -23,7 +23,8 @@ from measure import Lit, Spent, figure, lit_asset, parser_of, report, timed
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
+from usdbrdf.files.frames import FrameReader
 from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
 from usdbrdf.material.fit_views import MIXTURE
@@ -76,8 +77,9 @@ def fitted(
     """Time of the pass over the frames, and each object by its label."""
     frames = some_frames(frames_from_stage(open_measured(Asset.at(asset))), effort.of_frames)
     options = FitOptions(seed=seed)
-    texels, usable = lit.atlas.texels, lit.atlas.coverage.measured & ~lit.atlas.emissive
-    given = NoCheckpoints(), lit.scene, texels, usable, frames, options
+    usable = lit.atlas.coverage.measured & ~lit.atlas.emissive
+    reader = FrameReader(frames, most_bytes=0)
+    given = NoCheckpoints(), lit.scene, usable, reader, options
     survey, surveying = timed(lambda: fit_objects.survey_frames(*given))
     chosen = np.unique(survey.observations.texel)[:: effort.of_texels]
     kept = np.flatnonzero(np.isin(survey.observations.texel, chosen))
@@ -85,7 +87,7 @@ def fitted(
 
     def fit_one(i: int) -> ObjectFit:
         mixture = effort.mixture
-        return fit_objects.fit_object(lit.scene, texels, frames, survey, i, options, mixture)
+        return fit_objects.fit_object(lit.scene, reader, survey, i, options, mixture)
 
     fit_one(0)  # compiles
     objects = {}

@@ -20,7 +20,7 @@ from blender import in_blender
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
 import usdbrdf  # noqa: F401  (registers the schemas)
-from usdbrdf.asset.layers.preview_surface import surface
+from usdbrdf.asset.layers.looks import surface
 from usdbrdf.asset.preview_lobe import preview_surface_from_fit
 from usdbrdf.evaluation.metrics import Pair, flip_maps
 from usdbrdf.files.colour import to_display_srgb

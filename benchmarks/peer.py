@@ -61,7 +61,7 @@ from measure import Lit, Spent, figure, lit_asset, parser_of, report, saved_plot
 from peer_optimiser import Check, Course, Settings, optimised
 
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.evaluation.truth import known_objects
+from usdbrdf.evaluation.metrics import known_objects
 from usdbrdf.relighting.render import mitsuba_variant
 from usdbrdf.transport.lobe_radiance import Mixture
 

@@ -14,11 +14,11 @@ from scipy.ndimage import uniform_filter
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.files.frames import read_frame
 from usdbrdf.model.light import RelitScene
 from usdbrdf.model.material import Material, Surface, constant_map
-from usdbrdf.relighting import mitsuba_scene, render
+from usdbrdf.relighting import render
 
 START = 0.5
 _OPTICS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -245,7 +245,7 @@ def scene_of(mi: Any, lit: Lit, radiance: np.ndarray) -> Any:
             )
         )
     relit = RelitScene(surfaces=tuple(surfaces), lights=())
-    return mitsuba_scene.mitsuba_scene(mi, relit, bounces=1)
+    return render.mitsuba_scene(mi, relit, bounces=1)
 
 
 def targets_of(mi: Any, asset: Path, lit: Lit, labels: list[str]) -> Targets:

@@ -95,7 +95,7 @@ def converted(size: Size, folder: Path) -> dict[str, Any]:
 def found(asset: Asset) -> dict[str, int]:
     from usdbrdf.asset.maps import AssetMaps
     from usdbrdf.asset.readers.compose import open_measured
-    from usdbrdf.asset.readers.frames import frames_from_stage
+    from usdbrdf.asset.readers.scene import frames_from_stage
 
     stage = open_measured(asset)
     atlas = AssetMaps(stage)

@@ -47,17 +47,18 @@ from measure import (
 import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
-from usdbrdf.transport.cosine_sampling import cosine_directions, frames_of
 from usdbrdf.transport.irradiance import tiles_of_texels, whole_tiles
-from usdbrdf.transport.light_sampling import (
+from usdbrdf.transport.rays import RayScene, closest_hits, closest_hits_of_groups, empty_hits
+from usdbrdf.transport.sampling_loops import (
     Met,
     Receivers,
+    cosine_directions,
     empty_picked,
     empty_segments,
+    frames_of,
     light_segments,
     turns,
 )
-from usdbrdf.transport.rays import RayScene, closest_hits, closest_hits_of_groups, empty_hits
 from usdbrdf.transport.surface_texture import AHEAD
 from usdbrdf.transport.tile_draws import groups_of
 

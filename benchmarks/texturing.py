@@ -34,7 +34,7 @@ import usdbrdf  # noqa: F401  (registers the schemas)
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing import psquare
@@ -47,6 +47,7 @@ from usdbrdf.texturing.samples import (
     first_surfaces,
     samples_from_frame,
 )
+from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
 QUANTILE = 0.5
@@ -129,9 +130,9 @@ def streamed(
     atlas: AssetMaps, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
-    images = read_frames(frames, range(count))
+    images = read_frames(functools.partial(read_frame, frames), range(count))
     cpu, wall = time.process_time(), time.perf_counter()
-    for some in samples_from_frames(atlas.texels, atlas.scene, rays, frames, images):
+    for some in samples_from_frames(TexturedScene(atlas.scene, atlas.texels, rays), frames, images):
         observed.add(some, QUANTILE)
     return time.process_time() - cpu, time.perf_counter() - wall
 

@@ -34,9 +34,9 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.mesh import triangulate
+from usdbrdf.model.mesh import ScanGeometry, triangulate
 from usdbrdf.transport.rays import RayScene
-from usdbrdf.untrusted.usd_files import UsdMeshes, meshes_from_usd
+from usdbrdf.untrusted.usd_files import meshes_from_usd
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import validate
 
@@ -82,7 +82,7 @@ def main() -> int:
     )  # fmt: skip
     report: dict[str, Any] = {
         "asset": name,
-        "objects": len(found.labels),
+        "objects": len(found.objects),
         "triangles": len(found.mesh.triangles),
         "warnings": list(found.warnings),
         "convert": converted.returncode,
@@ -151,7 +151,9 @@ def omni(command: str, layer: Path, table: Path) -> set[str]:
     }
 
 
-def photograph_all(scan: Path, mesh: Path, found: UsdMeshes, options: argparse.Namespace) -> float:
+def photograph_all(
+    scan: Path, mesh: Path, found: ScanGeometry, options: argparse.Namespace
+) -> float:
     """All frames, then transforms.json; returns the asset's size in metres."""
     points, triangles = found.mesh.points.astype(np.float64), found.mesh.triangles
     albedo = face_albedo(mesh, found)
@@ -161,7 +163,7 @@ def photograph_all(scan: Path, mesh: Path, found: UsdMeshes, options: argparse.N
     width, height = options.width, options.height
     lens = np.array([FOCAL * width, FOCAL * width, width / 2, height / 2])
     # In metres: rays have an offset of their own near the surface.
-    meters = found.meters_per_unit
+    meters = found.meters_per_unit or 1.0
     rays = RayScene((points * meters).astype(np.float32), triangles)
     (scan / "frames").mkdir()
     frames = []
@@ -204,7 +206,7 @@ def look_at(centre: Array, target: Array, up: Array) -> Array:
 
 
 def radiance(
-    rays: RayScene, found: UsdMeshes, albedo: Array, camera: Array, lens: Array,
+    rays: RayScene, found: ScanGeometry, albedo: Array, camera: Array, lens: Array,
     size: tuple[int, int], up: Array,
 ) -> Array:  # fmt: skip
     """(H, W, 3): albedo / pi times the irradiance of sky and sun; black where nothing is."""
@@ -233,7 +235,7 @@ def radiance(
     return image.reshape(size[1], size[0], 3)
 
 
-def face_albedo(mesh: Path, found: UsdMeshes) -> Array:
+def face_albedo(mesh: Path, found: ScanGeometry) -> Array:
     """(F, 3) linear albedo of the triangles that ``meshes_from_usd`` made."""
     stage = Usd.Stage.Open(str(mesh))
     parts = []

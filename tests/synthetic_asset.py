@@ -8,12 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader
-from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
-from usdbrdf.asset.layers.material_layer import write_material_layer
-from usdbrdf.asset.layers.root_layer import write_edits, write_pending_layer, write_root
-from usdbrdf.asset.layers.scan_layer import write_scan_layer
-from usdbrdf.asset.layers.shading_layer import write_shading_layer
-from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
+from usdbrdf.asset.layers.scan_layer import (
+    write_edits,
+    write_pending_layer,
+    write_root,
+    write_scan_layer,
+)
+from usdbrdf.asset.layers.task_layers import (
+    Lamp,
+    world_from_root,
+    write_lights_layer,
+    write_material_layer,
+    write_shading_layer,
+    write_texturing_layer,
+)
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.properties import Aov, FittedObject, ShadedObject, TexturedObject
 from usdbrdf.asset.readers.compose import open_weaker

@@ -20,7 +20,7 @@ from usdbrdf.capture.adapters import Adapter
 from usdbrdf.cli import main
 from usdbrdf.command_parser import parsed
 from usdbrdf.commands import COMMANDS
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.options import BEFORE_FILTER, ConvertOptions
 

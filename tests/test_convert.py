@@ -19,16 +19,20 @@ from tests.scenes import MadeCapture, edited, make_capture, poses_down_and_up, w
 from usdbrdf.asset.layers.looks import VARIANT_SET
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import read_aovs, read_fit, read_shading
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import (
+    frames_from_stage,
+    read_aovs,
+    read_fit,
+    read_shading,
+    scene_from_stage,
+)
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import to_display_srgb8
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.job.stamp import hash_of_files
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),

@@ -27,7 +27,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 
 # --- The arrows. A room may import what it names here, and all rooms that those may. -------------
 
-GROUND = {"calibration", "errors", "identity", "kernel", "kernel_cache", "options"}
+GROUND = {"calibration", "errors", "identity", "kernel", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
 READERS = {"delivery", "evaluation", "relighting", "validation"}
@@ -37,8 +37,7 @@ ARROWS: dict[str, set[str]] = {
     "identity": set(),
     "calibration": set(),
     "options": {"model", "calibration"},
-    "kernel_cache": {"identity"},
-    "kernel": {"kernel_cache"},
+    "kernel": {"identity"},
     "model": {"errors"},
     "files": {"model"},
     "job": {"files", "identity"},
@@ -71,16 +70,16 @@ IMPORTERS: dict[str, set[str]] = {
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "drjit": {"relighting/"},
     "embreex": {"transport/rays.py"},
-    "filelock": {"job/lock.py"},
+    "filelock": {"job/ownership.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
-    "llvmlite": {"kernel_cache.py", "transport/"},
+    "llvmlite": {"kernel.py", "transport/"},
     "matplotlib": {"evaluation/"},
     "mitsuba": {"relighting/"},
     "msgspec": {"files/documents.py"},
-    "numba": {"kernel.py", "kernel_cache.py", "geometry/", "material/", "texturing/", "transport/"},
+    "numba": {"kernel.py", "geometry/", "material/", "texturing/", "transport/"},
     "omni": {"validation/omniverse.py"},
     "OpenImageIO": {"files/images.py"},
-    "pickle": {"kernel_cache.py"},
+    "pickle": {"kernel.py"},
     "PIL": {"delivery/"},
     "psutil": {"job/memory.py"},
     "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
@@ -104,10 +103,10 @@ OPENERS: dict[str, str] = {
     "delivery/": "packages are files",
     "calibration.py": "its own data",
     "identity.py": "hashes the sources",
-    "kernel_cache.py": "compiled code",
-    "evaluation/truth.py": "truth comes as .npz",
+    "kernel.py": "compiled code",
+    "evaluation/metrics.py": "truth comes as .npz",
     "command_parser.py": "a matrix comes as a text file",
-    "validation/cure_layer.py": "the layer of cures is an artist's file",
+    "validation/validate.py": "the layer of cures is an artist's file",
 }
 _OPEN = {
     "open", "read_text", "write_text", "read_bytes", "write_bytes", "load", "loadtxt", "save",

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from usdbrdf import identity, kernel_cache
+from usdbrdf import identity
+from usdbrdf import kernel as kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -185,7 +186,7 @@ def test_another_user_without_a_home(copy):
 import os, sys, numba, numpy as np, tempfile
 sys.path.insert(0, sys.argv[1] if len(sys.argv) > 1 else ".")
 numba.njit(lambda x: x + 1)(np.arange(3))
-import usdbrdf.kernel_cache
+import usdbrdf.kernel
 from usdbrdf.transport.probe import probe
 os.setgid(65534); os.setuid(65534)
 print(probe(np.arange(3)).sum(), probe.stats.cache_path)
@@ -207,12 +208,12 @@ print(probe(np.arange(3)).sum(), probe.stats.cache_path)
 
 
 def test_a_place_that_others_can_write_is_not_used(tmp_path):
-    assert kernel_cache._is_private(tmp_path / "a" / "b")
+    assert kernels._is_private(tmp_path / "a" / "b")
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
-    assert not kernel_cache._is_private(tmp_path / "open")
+    assert not kernels._is_private(tmp_path / "open")
     (tmp_path / "link").symlink_to(tmp_path / "a" / "b")
-    assert not kernel_cache._is_private(tmp_path / "link")
+    assert not kernels._is_private(tmp_path / "link")
 
 
 def test_with_no_place_at_all_kernels_run_unkept(monkeypatch, caplog):
@@ -221,9 +222,9 @@ def test_with_no_place_at_all_kernels_run_unkept(monkeypatch, caplog):
     def refuse(_folder: Path) -> bool:
         raise PermissionError
 
-    monkeypatch.setattr(kernel_cache, "_is_private", refuse)
-    kernel_cache._say_once.cache_clear()
-    assert kernel_cache._root.__wrapped__() is None
+    monkeypatch.setattr(kernels, "_is_private", refuse)
+    kernels._say_once.cache_clear()
+    assert kernels._root.__wrapped__() is None
     assert "compiled kernels are not kept" in caplog.text
 
 

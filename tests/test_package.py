@@ -14,7 +14,7 @@ import usdbrdf
 from tests.scenes import make_capture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import FolderBusy, OwnershipConflict, UsageError
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 
 
 def declared():

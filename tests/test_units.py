@@ -12,7 +12,7 @@ from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.objects import read_fit
+from usdbrdf.asset.readers.scene import read_fit
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),

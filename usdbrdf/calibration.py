@@ -18,7 +18,7 @@ from typing import Any
 
 def number(name: str) -> float:
     """The value of one entry, in its ``unit``."""
-    value = _value(name)
+    value = entries()[name]["value"]
     if not isinstance(value, float):
         raise TypeError(f"{name}: {value!r} is no number with a decimal point. [calibration.type]")
     return value
@@ -26,7 +26,7 @@ def number(name: str) -> float:
 
 def count(name: str) -> int:
     """The value of an entry that counts things."""
-    value = _value(name)
+    value = entries()[name]["value"]
     if not isinstance(value, int):
         raise TypeError(f"{name}: {value!r} is no whole number. [calibration.type]")
     return value
@@ -34,7 +34,7 @@ def count(name: str) -> int:
 
 def numbers(name: str) -> tuple[float, ...]:
     """The values of an entry that has several, in the order that its ``meaning`` tells."""
-    return tuple(float(value) for value in _value(name))
+    return tuple(float(value) for value in entries()[name]["value"])
 
 
 def pair(name: str) -> tuple[float, float]:
@@ -45,8 +45,8 @@ def pair(name: str) -> tuple[float, float]:
 
 def pairs(name: str) -> Mapping[str, tuple[float, float]]:
     """The table of an entry, word -> two values; it cannot be changed."""
-    table = {word: (float(first), float(second)) for word, (first, second) in _value(name).items()}
-    return MappingProxyType(table)
+    table = entries()[name]["value"]
+    return MappingProxyType({word: (float(a), float(b)) for word, (a, b) in table.items()})
 
 
 @cache
@@ -54,7 +54,3 @@ def entries() -> Mapping[str, Mapping[str, Any]]:
     """All entries as they stand in the file, by name."""
     text = Path(__file__).with_suffix(".json").read_text("utf-8")
     return MappingProxyType(json.loads(text))
-
-
-def _value(name: str) -> Any:
-    return entries()[name]["value"]

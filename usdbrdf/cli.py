@@ -38,7 +38,6 @@ def _run(arguments: Sequence[str]) -> int:
     with loading():
         from usdbrdf.command_parser import help_text, parsed
         from usdbrdf.commands import COMMANDS
-        from usdbrdf.job.memory import refuse_few_addresses
     if (page := help_text(arguments, COMMANDS)) is not None:
         show(page)
         return 0
@@ -48,6 +47,8 @@ def _run(arguments: Sequence[str]) -> int:
         show(f"usdbrdf {code_version()}")
         return 0
     command = parsed(arguments, COMMANDS)
+    with loading():
+        from usdbrdf.job.memory import refuse_few_addresses
     set_quiet(getattr(command, "quiet", False))
     refuse_few_addresses()
     return command.run()

@@ -13,16 +13,15 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_origin
 
-from cyclopts import App, CycloptsError, Parameter
-
 from usdbrdf import options
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.job.interrupts import loading
 from usdbrdf.options import REQUIRED, Insert, Option, OptionField, Options, option_fields
 
 EXIT_CODES = """exit codes:
@@ -45,21 +44,29 @@ Commands = Mapping[str, type[Command]]
 
 
 def parsed(arguments: Sequence[str], commands: Commands) -> Command:
-    """The command that is asked for, its options checked.
-
-    Raises UsageError, and InputRefused for files that are not there.
-    """
+    """The command that is asked for, its options checked. Raises UsageError, and InputRefused for
+    files that are not there."""
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
-    app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
-    app.default(_signed(commands[name]))
-    try:
-        _, given, _ = app.parse_args(words, exit_on_error=False, print_error=False)
-    except CycloptsError as error:
-        found = " ".join(str(error).split()).rstrip(".")
-        raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
-    command: Command = _made(commands[name], given.arguments)
+    said, given = _said(commands[name]), {}
+    # Nothing that was or must be said needs a parser, which takes time to load.
+    if words or any(item.field.default is REQUIRED for item in said):
+        with loading():
+            from cyclopts import App, CycloptsError
+        app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
+
+        def bound() -> None: ...
+
+        signed: Any = bound
+        signed.__signature__ = inspect.Signature([_argument(item) for item in said])
+        app.default(signed)
+        try:
+            given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
+        except CycloptsError as error:
+            found = " ".join(str(error).split()).rstrip(".")
+            raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
+    command: Command = _made(commands[name], given)
     return command
 
 
@@ -72,19 +79,16 @@ class _Said(NamedTuple):
     title: str
 
 
-def _all_said(owner: type[Options], title: str = "") -> Iterator[_Said]:
-    for field in option_fields(owner):
-        if field.option is None:
-            yield from _all_said(field.kind, title or field.name.removeprefix("options"))
-        else:
-            yield _Said(field.option, field, owner, field.option.shared or title)
-
-
-def _said(owner: type[Options]) -> list[_Said]:
+def _said(owner: type[Options], title: str = "") -> list[_Said]:
     """All that can be said to a command, each once, what has no name first."""
     found: dict[str, _Said] = {}
-    for said in _all_said(owner):
-        found.setdefault(said.option.name, said)
+    for field in option_fields(owner):
+        if field.option is None:
+            for said in _said(field.kind, title or field.name.removeprefix("options")):
+                found.setdefault(said.option.name, said)
+        else:
+            own = _Said(field.option, field, owner, field.option.shared or title)
+            found.setdefault(own.option.name, own)
     return sorted(found.values(), key=lambda said: not said.option.placed)
 
 
@@ -105,17 +109,10 @@ def _made(owner: type[Any], given: Mapping[str, Any]) -> Any:
     return owner(**known)
 
 
-def _signed(owner: type[Options]) -> Any:
-    """A function with the arguments of a command, for cyclopts to bind to."""
+def _argument(said: _Said) -> inspect.Parameter:
+    from cyclopts import Parameter
 
-    def command() -> None: ...
-
-    signed: Any = command
-    signed.__signature__ = inspect.Signature([_argument(*said) for said in _said(owner)])
-    return signed
-
-
-def _argument(option: Option, field: OptionField, *_: Any) -> inspect.Parameter:
+    option, field = said.option, said.field
     kind, several = field.kind, get_origin(field.kind) is tuple
 
     def read(_kind: Any, tokens: Any) -> Any:
@@ -142,10 +139,9 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
     if field.kind == tuple[Path, ...]:
         return tuple(_path(word) for _, word in words)
     if field.kind == tuple[Insert, ...]:
-        inserts: list[list[str]] = []
-        for number, word in words:
-            inserts = [*inserts, [word]] if number == 0 else [*inserts[:-1], [*inserts[-1], word]]
-        return tuple(_insert(*insert) for insert in inserts)
+        texts = [word for _, word in words]
+        bounds = [*(i for i, (number, _) in enumerate(words) if number == 0), len(words)]
+        return tuple(_insert(*texts[first:end]) for first, end in pairwise(bounds))
     text = words[-1][1]
     if text == option.none:
         return None
@@ -214,9 +210,6 @@ def _matrix(text: str) -> Any:
             "[relight.matrix]"
         )
     return matrix
-
-
-# Help
 
 
 def help_text(arguments: Sequence[str], commands: Commands) -> str | None:

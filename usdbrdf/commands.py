@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,7 @@ if TYPE_CHECKING:
 
     from usdbrdf.job.task import TaskResult
 
-_NOT_RADIOMETRIC = (
-    "warning: the images are not radiometric; albedo and fit have no absolute meaning."
-)
 
-
-@dataclass(frozen=True, kw_only=True)
 class _Talking(TalkOptions, Command):
     def told(self, summary: Mapping[str, Any], *lines: str) -> int:
         """The end of a command that did what it was asked for."""
@@ -39,7 +34,6 @@ class _Talking(TalkOptions, Command):
         return 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Run(_Talking):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
@@ -55,11 +49,11 @@ class _Run(_Talking):
         }
         lines = [f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}"]
         if steps.get("ingest", {}).get("radiometric") is False:
-            lines = [_NOT_RADIOMETRIC, *lines]
+            doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
+            lines = [f"warning: {doubt}", *lines]
         return self.told({"asset": str(root), "steps": steps}, *lines)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _RunOnCapture(_Run):
     capture: Path = option("SCAN", REQUIRED)
     "capture folder or its main file"
@@ -73,7 +67,6 @@ class _RunOnCapture(_Run):
     "use our own adapters only"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Convert(EditOptions, _RunOnCapture):
     """Do all four steps: capture in, USD asset out."""
 
@@ -94,7 +87,6 @@ class Convert(EditOptions, _RunOnCapture):
         return self.report(results, self.output)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ingest(_RunOnCapture):
     """Read a capture into the layer scan.usdc."""
 
@@ -108,7 +100,6 @@ class Ingest(_RunOnCapture):
         return self.report({"ingest": done}, self.output)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _RunOnAsset(_Run):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder made by ingest"
@@ -122,34 +113,29 @@ class _RunOnAsset(_Run):
         return self.report({name: done}, self.asset)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Texture(_RunOnAsset):
     """Project the frames: lit diffuse radiance L_d per texel."""
 
     texture: options.TextureOptions
 
 
-@dataclass(frozen=True, kw_only=True)
 class Shade(_RunOnAsset):
     """Trace irradiance S, divide for albedo, find the emitters."""
 
     shade: options.ShadeOptions
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(_RunOnAsset):
     """Fit roughness and specular of each object."""
 
     fit: options.FitOptions
 
 
-@dataclass(frozen=True, kw_only=True)
 class _WithAsset(_Talking):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder; it is not changed"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Evaluate(_WithAsset):
     """Render views and compare them with photographs."""
 
@@ -171,7 +157,6 @@ class Evaluate(_WithAsset):
         return self.told({"output": str(self.output), **found["summary"], **truth}, *lines)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Compare(_Talking):
     """Compare two assets of one scene, lit differently."""
 
@@ -191,7 +176,6 @@ class Compare(_Talking):
         return self.told(summary, made.comparison_line(found), written)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Relight(_WithAsset):
     """Path trace the published asset in its own or in other light."""
 
@@ -206,7 +190,6 @@ class Relight(_WithAsset):
         return self.told(summary, f"{self.output}: written")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Package(_WithAsset):
     """Write the asset as one file: .usdz or .glb."""
 
@@ -221,7 +204,6 @@ class Package(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Validate(Command):
     """Check an asset by our rules and those of USD."""
 
@@ -234,8 +216,7 @@ class Validate(Command):
     def run(self) -> int:
         with loading():
             from usdbrdf.asset.layout import Asset
-            from usdbrdf.validation.cure_layer import write_cures
-            from usdbrdf.validation.validate import has_errors, validate
+            from usdbrdf.validation.validate import has_errors, validate, write_cures
         asset = Asset.made(self.asset)
         root = asset.root_layer
         findings = validate(root)
@@ -250,7 +231,6 @@ class Validate(Command):
         return 7 if has_errors(findings) else 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class Rules(Command):
     """List what validate looks for."""
 
@@ -271,7 +251,6 @@ class Rules(Command):
         return 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class Adapters(Command):
     """List the capture formats that can be read."""
 
@@ -287,7 +266,6 @@ class Adapters(Command):
         return 0
 
 
-@dataclass(frozen=True, kw_only=True)
 class PluginPath(Command):
     """Print what to put into PXR_PLUGINPATH_NAME."""
 
@@ -297,7 +275,7 @@ class PluginPath(Command):
 
     def run(self) -> int:
         with loading():
-            from usdbrdf.asset.schema import plugin_path, validators_path
+            from usdbrdf.asset.properties import plugin_path, validators_path
         folders = [plugin_path()] if self.schemas else [plugin_path(), validators_path()]
         show(os.pathsep.join(str(folder) for folder in folders))
         return 0

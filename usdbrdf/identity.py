@@ -45,7 +45,12 @@ def kernels_identity(source: Path) -> str:
     the files beside it and the whole package, since what it imports is not followed."""
     module = _module_name(source) if source.is_relative_to(PACKAGE) else None
     if module in _sources():
-        return _digest(_reached(module))
+        reached, waiting = {module}, [module]
+        while waiting:
+            new = _imported(waiting.pop()) - reached
+            reached |= new
+            waiting.extend(new)
+        return _digest(reached)
     beside = b"".join(file.read_bytes() for file in sorted(source.parent.glob("*.py")))
     return hashlib.sha256(beside + _digest(_sources()).encode()).hexdigest()[:16]
 
@@ -77,15 +82,6 @@ def _digest(names: Iterable[str]) -> str:
             whole.update(f"{name} {len(content)}\n".encode())
             whole.update(content)
     return whole.hexdigest()[:16]
-
-
-def _reached(module: str) -> set[str]:
-    reached, waiting = {module}, [module]
-    while waiting:
-        new = _imported(waiting.pop()) - reached
-        reached |= new
-        waiting.extend(new)
-    return reached
 
 
 @cache

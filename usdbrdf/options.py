@@ -7,11 +7,11 @@ The frozen dataclasses are what the Python API takes; the command line and its h
 from __future__ import annotations
 
 import math
+import typing
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
-from typing import get_type_hints as resolved_types
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, Union, dataclass_transform
 
 from usdbrdf import calibration
 from usdbrdf.errors import UsageError
@@ -70,7 +70,7 @@ class OptionField(NamedTuple):
 
     @property
     def choices(self) -> tuple[str, ...]:
-        return get_args(self.kind) if get_origin(self.kind) is Literal else ()
+        return typing.get_args(self.kind) if typing.get_origin(self.kind) is Literal else ()
 
     def check(self, value: Any, subject: str) -> None:
         """Raise UsageError for a value that is none of the choices or out of the limits."""
@@ -95,27 +95,29 @@ class OptionField(NamedTuple):
 
 def option_fields(owner: type[Options]) -> list[OptionField]:
     """All that can be said to an option class."""
-    types, found = resolved_types(owner), []
+    types, found = typing.get_type_hints(owner), []
     for item in fields(owner):
         kind = types[item.name]
-        if get_origin(kind) in (Union, UnionType):
-            kind = next(part for part in get_args(kind) if part is not type(None))
+        if typing.get_origin(kind) in (Union, UnionType):
+            kind = next(part for part in typing.get_args(kind) if part is not type(None))
         found.append(OptionField(item.name, kind, item.default, item.metadata.get("option")))
     return found
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What option classes share: their values are checked when they are made."""
+    """What option classes share: they are frozen dataclasses, whose values are checked when they
+    are made."""
+
+    def __init_subclass__(cls) -> None:
+        dataclass(cls, frozen=True, kw_only=True)
 
     def __post_init__(self) -> None:
         for item in option_fields(type(self)):
             if item.option is not None:
                 value = getattr(self, item.name)
                 item.check(value, f"{item.option.name} {value}")
-
-
-# What several tasks or commands have.
 
 
 def _environment() -> Path | None:
@@ -131,12 +133,9 @@ def _seed() -> int:
 
 def _memory() -> float | None:
     """No result depends on it."""
-    text = (
-        "memory for texturing and for refining, which then take as many passes over the frames as "
-        "that asks for"
-    )
-    more = {"unset": "three quarters of the machine's", "shared": "options", "help": text}
-    return option("--memory GIB", None, (1e-3, 2**20), **more)
+    use = "memory for texturing and for refining, which then take as many passes over the frames"
+    more = {"unset": "three quarters of the machine's", "shared": "options"}
+    return option("--memory GIB", None, (1e-3, 2**20), help=f"{use} as that asks for", **more)
 
 
 def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
@@ -144,7 +143,6 @@ def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
     return option("--allow-outside DIR", (), unset="none", help=text)
 
 
-@dataclass(frozen=True, kw_only=True)
 class TalkOptions(Options):
     """What is said while a command runs and at its end."""
 
@@ -157,7 +155,6 @@ class TalkOptions(Options):
 HandEdits = Literal["refuse", "adopt", "discard"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class EditOptions(Options):
     """What becomes of files of ours that somebody changed: only for the command that can write all
     of them again."""
@@ -177,10 +174,6 @@ class EditOptions(Options):
         return "adopt" if self.adopt else "discard" if self.discard else "refuse"
 
 
-# The four tasks.
-
-
-@dataclass(frozen=True, kw_only=True)
 class IngestOptions(Options):
     """What a user may say about a capture that its files do not say; the same for every adapter."""
 
@@ -213,7 +206,6 @@ class IngestOptions(Options):
     "axis that points up"
 
 
-@dataclass(frozen=True, kw_only=True)
 class TextureOptions(Options):
     """How frames become the lit diffuse texture L_d."""
 
@@ -237,7 +229,6 @@ _RAYS = {"mis": 2048, "cosine": 10_000}
 _BY_ESTIMATOR: Any = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Sampling(Options):
     """How irradiance S is estimated. "mis" doubles a tile's rays until its relative standard error
     is small enough."""
@@ -266,7 +257,6 @@ class Sampling(Options):
 Denoise = Literal["auto", "none", "oidn"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class ShadeOptions(Options):
     """How L_d becomes irradiance, albedo and emitters."""
 
@@ -276,7 +266,6 @@ class ShadeOptions(Options):
     environment: Path | None = _environment()
 
 
-@dataclass(frozen=True, kw_only=True)
 class FitOptions(Options):
     """How roughness and specular are found, and who is told. Without evidence all methods but
     "paper" write the prior of the object's class."""
@@ -296,7 +285,6 @@ class FitOptions(Options):
     seed: int = _seed()
 
 
-@dataclass(frozen=True, kw_only=True)
 class ConvertOptions(Options):
     """The options of all four tasks."""
 
@@ -306,10 +294,6 @@ class ConvertOptions(Options):
     fit: FitOptions = field(default_factory=FitOptions)
 
 
-# What is done with an asset.
-
-
-@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(Options):
     """How views are rendered, and what else is compared."""
 
@@ -346,7 +330,6 @@ class EvaluateOptions(Options):
         return math.isqrt(self.samples_per_pixel)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Insert(Options):
     """A model and what to do with it, lengths in units of the asset's stage. UsageError where it is
     placed in two ways, or where a matrix comes with a scale or a rotation, which it holds itself.
@@ -392,7 +375,6 @@ class Insert(Options):
         return self.drop is not None and len(self.drop) == 2
 
 
-@dataclass(frozen=True, kw_only=True)
 class RelightOptions(Options):
     """What is rendered, in which light."""
 
@@ -429,7 +411,6 @@ class RelightOptions(Options):
     "of .png and .jpg"
 
 
-@dataclass(frozen=True, kw_only=True)
 class PackageOptions(Options):
     """What one file of an asset holds."""
 

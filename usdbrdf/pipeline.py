@@ -24,8 +24,7 @@ from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.errors import OwnershipConflict
-from usdbrdf.job.lock import is_held
-from usdbrdf.job.ownership import edited_files, owned_folder
+from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
@@ -94,7 +93,20 @@ def working_on(
         return
     with owned_folder(place, wait_s=wait_s, without_lock=without_lock) as state:
         asset, before = Asset.at(place), known_hashes(state)
-        _settle(asset, edited_files(asset.folder), hand_edits)
+        changed = edited_files(asset.folder)
+        damaged = [file for file in changed if is_damaged(asset.folder / file)]
+        for file in damaged:
+            say(f"warning: {asset.folder / file}: damaged; it is made again. [layer.damaged]")
+        edited = [file for file in changed if file not in damaged]
+        if edited and hand_edits == "refuse":
+            raise OwnershipConflict(
+                f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run "
+                "`convert` with --adopt to keep the changes beside edits.usda, or --discard to "
+                "drop them. [ownership.edited]"
+            )
+        if edited and hand_edits == "adopt":
+            for copy in adopt(asset, [asset.folder / file for file in edited]):
+                say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")
         yield asset
         if known_hashes(state) != before:
             warn_of_edits(Asset.at(asset.folder))
@@ -119,19 +131,3 @@ ingest = _on_its_folder(ingest_task)
 texture = _on_its_folder(texture_task)
 shade = _on_its_folder(shade_task)
 fit = _on_its_folder(fit_task)
-
-
-def _settle(asset: Asset, changed: list[str], hand_edits: HandEdits) -> None:
-    damaged = [file for file in changed if is_damaged(asset.folder / file)]
-    for file in damaged:
-        say(f"warning: {asset.folder / file}: damaged; it is made again. [layer.damaged]")
-    edited = [file for file in changed if file not in damaged]
-    if edited and hand_edits == "refuse":
-        raise OwnershipConflict(
-            f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `convert` "
-            "with --adopt to keep the changes beside edits.usda, or --discard to drop them. "
-            "[ownership.edited]"
-        )
-    if edited and hand_edits == "adopt":
-        for copy in adopt(asset, [asset.folder / file for file in edited]):
-            say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.layers.root_layer import write_root
+from usdbrdf.asset.layers.scan_layer import write_root
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
-from usdbrdf.delivery.flat_stage import flattened, stage_in_look
+from usdbrdf.delivery.package import flattened, stage_in_look
 from usdbrdf.options import IngestOptions
 from usdbrdf.validation.validate import validate
 

@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.header import Provenance, StageHeader, new_layer, read_header, read_provenance
 from usdbrdf.asset.layers.author import export
-from usdbrdf.asset.layers.root_layer import check_root
+from usdbrdf.asset.layers.scan_layer import check_root
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsdBrdfError
 

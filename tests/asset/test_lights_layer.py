@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
-from usdbrdf.asset.layers.lights_layer import (
-    EMISSIVE,
-    USDLUX,
-    VARIANT_SET,
-    Lamp,
-    write_lights_layer,
-)
+from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS, USDLUX, Lamp, write_lights_layer
 from usdbrdf.asset.readers.render_scene import render_scene_from_stage
 from usdbrdf.files.images import write_exr
 from usdbrdf.model.light import LampShape
@@ -36,7 +30,7 @@ def lit(tmp_path, synthetic, request):
 def opened(built, variant):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     stage.SetEditTarget(stage.GetSessionLayer())
-    assert stage.GetDefaultPrim().GetVariantSet(VARIANT_SET).SetVariantSelection(variant)
+    assert stage.GetDefaultPrim().GetVariantSet(LIGHTS).SetVariantSelection(variant)
     return stage
 
 
@@ -94,7 +88,7 @@ def test_both_variants_light_the_floor_alike(lit, point):
 
 def test_glowing_surfaces_are_the_default(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
-    variants = stage.GetDefaultPrim().GetVariantSet(VARIANT_SET)
+    variants = stage.GetDefaultPrim().GetVariantSet(LIGHTS)
     assert variants.GetVariantNames() == [EMISSIVE, USDLUX]
     assert variants.GetVariantSelection() == EMISSIVE
     assert not [prim for prim in stage.TraverseAll() if prim.HasAPI(UsdLux.LightAPI)]
@@ -144,7 +138,7 @@ def test_a_muted_layer_leaves_the_lamps_on(built):
 def test_both_variants_validate(built):
     assert [str(found) for found in validate(built.asset.root_layer)] == []
     edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
-    edits.GetPrimAtPath("/room").variantSelections[VARIANT_SET] = USDLUX
+    edits.GetPrimAtPath("/room").variantSelections[LIGHTS] = USDLUX
     edits.Save()
     assert [str(found) for found in validate(built.asset.root_layer)] == []
 

@@ -10,10 +10,9 @@ import pytest
 import usdbrdf
 from tests.scenes import MadeCapture, look_at, make_capture, ring_of_poses
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.previews import overview, overview_frame
+from usdbrdf.asset.maps import overview, overview_frame
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.progress import set_quiet

@@ -9,8 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdMedia
 
 from usdbrdf.asset.layout import relative_path
 from usdbrdf.asset.readers.compose import open_weaker
-from usdbrdf.asset.readers.frames import capture_camera, frames_from_stage
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import capture_camera, frames_from_stage, scene_from_stage
 from usdbrdf.errors import InputRefused
 
 UNITS = [(1.0, "Z"), (0.01, "Y")]

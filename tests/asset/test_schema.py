@@ -14,7 +14,7 @@ from typing import Annotated
 import pytest
 from pxr import Plug, Sdf, Usd
 
-from usdbrdf.asset import schema
+from usdbrdf.asset import properties
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import author_record, over
 from usdbrdf.asset.properties import (
@@ -24,13 +24,15 @@ from usdbrdf.asset.properties import (
     Fact,
     FittedObject,
     facts_by_attribute,
+    plugin_path,
+    register,
+    verify,
 )
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.objects import read_record
-from usdbrdf.asset.schema import plugin_path, register, verify
+from usdbrdf.asset.readers.scene import read_record
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.record_rules import not_allowed, out_of_range, undeclared
+from usdbrdf.validation.record_rules import allowed_tokens, fit_range, undeclared_attribute
+from usdbrdf.validation.rule import AssetStage
 
 VARIABILITY = {True: Sdf.VariabilityUniform, False: Sdf.VariabilityVarying}
 SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
@@ -162,7 +164,7 @@ def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
 
 def test_schemas_of_another_version_are_refused_before_the_first_write(monkeypatch):
     register()
-    monkeypatch.setattr(schema, "SCHEMA_VERSION", 99)
+    monkeypatch.setattr(properties, "SCHEMA_VERSION", 99)
     with pytest.raises(UsdBrdfError, match=r"version 1.*99.*\[schema\.version\]"):
         verify()
 
@@ -233,7 +235,7 @@ def test_the_package_is_imported_without_usd_and_leaves_its_modules_as_they_are(
 def test_a_late_import_is_explained_at_the_first_write():
     code = (
         "from pxr import Usd; Usd.SchemaRegistry()\n"
-        "import usdbrdf.asset.schema as s\n"
+        "import usdbrdf.asset.properties as s\n"
         "try: s.verify()\n"
         "except s.UsdBrdfError as error: print(error)"
     )
@@ -245,7 +247,7 @@ def test_a_late_import_is_explained_at_the_first_write():
 def test_a_late_import_is_fine_with_the_environment_variable():
     code = (
         "from pxr import Usd; Usd.SchemaRegistry()\n"
-        "import usdbrdf.asset.schema as s; s.verify(); print('known')"
+        "import usdbrdf.asset.properties as s; s.verify(); print('known')"
     )
     assert run_python(code, PXR_PLUGINPATH_NAME=str(plugin_path())) == "known"
 
@@ -262,7 +264,7 @@ class GlossyFit(FittedObject):
     ] = "matt"
 
 
-def test_a_row_more_is_declared_written_read_back_and_checked(built, generate):
+def test_a_row_more_is_declared_written_read_back_and_checked(built, generate, monkeypatch):
     records = [*RECORDS[:-1], GlossyFit]
     declaration = "    uniform float usdBrdf:fit:gloss = 0.25 ("
     assert declaration in generate.schema_text(records).splitlines()
@@ -283,15 +285,12 @@ def test_a_row_more_is_declared_written_read_back_and_checked(built, generate):
     assert not wall.GetAttribute("usdBrdf:fit:gloss")
     assert math.isnan(read_record(GlossyFit, wall, **others).gloss)
 
-    facts, scene = facts_by_attribute(records), AssetStage(stage)
+    scene = AssetStage(stage)
+    assert len(list(undeclared_attribute.check(scene))) == 5
+    monkeypatch.setattr("usdbrdf.validation.record_rules.FACTS", facts_by_attribute(records))
     sites = [
         str(fault.site.GetPath())
-        for faults in (
-            out_of_range(scene, lambda fact: fact.schema == FIT, facts),
-            not_allowed(scene, facts),
-            undeclared(scene, facts),
-        )
-        for fault in faults
+        for rule in (fit_range, allowed_tokens, undeclared_attribute)
+        for fault in rule.check(scene)
     ]
     assert sites == [f"{built.prims[2]}.usdBrdf:fit:{name}" for name in ("gloss", "finish")]
-    assert len(list(undeclared(scene))) == 5

@@ -12,9 +12,11 @@ from usdbrdf.capture.checks import FrameRecord, frames_from_records
 from usdbrdf.files.frames import (
     PHOTOGRAPH_NOISE_FLOOR,
     PHOTOGRAPH_SATURATION,
+    FramePixels,
+    FrameReader,
     photograph_limits,
-    radiance_scale,
     read_frame,
+    read_frames,
 )
 from usdbrdf.model.capture import Frames
 
@@ -100,18 +102,51 @@ def test_photographs_are_linearised_and_brought_to_one_exposure(tmp_path):
             noise_floor_radiance=floor[exposure],
         )
         scale = 0.02 / (0.01, 0.02, 0.04)[exposure]
-        assert radiance_scale(frames)[0] == pytest.approx(scale)
         frame = read_frame(frames, 0)
         np.testing.assert_allclose(frame.radiance[1], linear * scale, rtol=1e-5)
         assert frame.clipped.sum() == frame.dark.sum() == 1
         assert frame.valid.sum() == 6
 
 
-def test_radiance_scale_of_linear_images_is_one(tmp_path):
-    frames = _frames(tmp_path / "never_opened.exr", saturation_radiance=3.0)
-    assert radiance_scale(frames).tolist() == [1.0]
+def test_linear_images_keep_their_values_whatever_their_saturation(tmp_path):
+    pixels = np.linspace(0.1, 2.5, 24, dtype=np.float32).reshape(2, 4, 3)
+    _write(tmp_path / "a.exr", pixels, "float")
+    frame = read_frame(_frames(tmp_path / "a.exr", saturation_radiance=3.0), 0)
+    np.testing.assert_array_equal(frame.radiance, pixels)
 
 
 def test_photograph_limits_are_linear_values():
     assert pytest.approx(0.9560, abs=1e-4) == PHOTOGRAPH_SATURATION
     assert pytest.approx(3 / 255 / 12.92) == PHOTOGRAPH_NOISE_FLOOR
+
+
+@pytest.mark.parametrize(("kept", "decoded"), [(0, [2, 2, 2]), (2, [1, 1, 2]), (3, [1, 1, 1])])
+def test_frames_are_kept_as_far_as_memory_goes(tmp_path, monkeypatch, kept, decoded):
+    records = []
+    for i in range(3):
+        _write(tmp_path / f"{i}.exr", np.full((2, 4, 3), i + 0.5, np.float32), "float")
+        records.append(
+            FrameRecord(
+                name=f"{i}.exr",
+                image_path=tmp_path / f"{i}.exr",
+                world_from_camera=np.eye(4),
+                intrinsics=(1, 1, 1, 1),
+                resolution=(4, 2),
+            )
+        )
+    frames = frames_from_records(records, encoding="lin_rec709_scene", radiometric=True)
+    counted = [0, 0, 0]
+
+    def counting(of: Frames, i: int) -> FramePixels:
+        counted[i] += 1
+        return read_frame(of, i)
+
+    monkeypatch.setattr("usdbrdf.files.frames.read_frame", counting)
+    size = sum(a.nbytes for a in vars(read_frame(frames, 0)).values() if isinstance(a, np.ndarray))
+    reader = FrameReader(frames, most_bytes=kept * size + size // 2)
+    for order in ([0, 1, 2], [2, 0, 1]):
+        shown = [
+            (i, float(pixels.radiance[0, 0, 0])) for i, pixels in read_frames(reader.read, order)
+        ]
+        assert shown == [(i, i + 0.5) for i in order]
+    assert counted == decoded

@@ -14,7 +14,7 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.parts import geometry_from_usd
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError, UsdBrdfError
-from usdbrdf.model.mesh import face_normals
+from usdbrdf.model.mesh import face_normals_and_angles
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.ingest import ingest
 from usdbrdf.untrusted import bounds
@@ -90,7 +90,8 @@ def test_units_axis_and_options(tmp_path):
     stage.Save()
     found = meshes_from_usd(tmp_path / "a.usdc")
     assert (found.up_axis, found.meters_per_unit) == ("Y", 0.01)
-    assert (found.labels, found.object_prims, found.warnings) == (("m",), ("m",), ())
+    assert [each.label for each in found.objects] == ["m"]
+    assert (found.object_prims, found.warnings) == (("m",), ())
 
 
 def test_polygons_normals_and_handedness(tmp_path):
@@ -240,7 +241,8 @@ def test_a_reference_may_lead_into_the_capture_but_not_beyond(tmp_path):
     stage.Save()
     with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
         meshes_from_usd(tmp_path / "geo" / "a.usda")
-    assert meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,)).labels == ("seat",)
+    found = meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,))
+    assert [each.label for each in found.objects] == ["seat"]
 
 
 @pytest.mark.parametrize("content", [b"", b"#usda 1.0\ndef Xform {{{", b"PXR-USDC" + b"\xff" * 90])
@@ -324,11 +326,13 @@ def test_faces_of_a_usd_mesh_that_look_away_are_turned_in_our_layer_alone(captur
     assert result.summary["counts"]["faces_turned"] == turned.sum()
     scene = scene_from_stage(open_weaker(Asset(tmp_path / "asset", "asset"), "texturing"))
     np.testing.assert_allclose(
-        face_normals(scene.points, scene.triangles),
-        face_normals(expected.mesh.points, expected.mesh.triangles),
+        face_normals_and_angles(scene.points, scene.triangles)[0],
+        face_normals_and_angles(expected.mesh.points, expected.mesh.triangles)[0],
         atol=1e-5,
     )
     np.testing.assert_allclose(
-        scene.corner_normals[:, 0], face_normals(scene.points, scene.triangles), atol=1e-5
+        scene.corner_normals[:, 0],
+        face_normals_and_angles(scene.points, scene.triangles)[0],
+        atol=1e-5,
     )
     assert file.read_bytes() == before

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.capture.labels import label_table, objects_with_faces, segmentation
+from usdbrdf.capture.parts import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused
 from usdbrdf.untrusted.mesh_files import FileMesh
 
@@ -20,7 +20,7 @@ def _squares(sides: list[float], **more) -> FileMesh:
         ]
     )
     triangles = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
-    return FileMesh(points=points.astype(np.float32), triangles=triangles, label_names={}, **more)
+    return FileMesh(points=points.astype(np.float32), triangles=triangles, **more)
 
 
 def test_connected_parts_come_largest_first_and_the_small_ones_together():

@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from tests.blender import needs_blender
 from tests.dcc.renderers import storm
-from usdbrdf.asset.layers.material_layer import write_material_layer
+from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.files.images import write_exr
 
 pytestmark = needs_blender

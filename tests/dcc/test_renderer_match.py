@@ -9,7 +9,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
 
 from tests.blender import needs_blender
 from tests.dcc.renderers import cycles, storm
-from usdbrdf.asset.layers.preview_surface import surface
+from usdbrdf.asset.layers.looks import surface
 from usdbrdf.asset.preview_lobe import preview_surface_from_fit
 from usdbrdf.transport.renderer_match import cycles_albedo, fitted_albedo, storm_albedo
 

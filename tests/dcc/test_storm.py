@@ -9,7 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from tests.blender import needs_blender
 from tests.dcc.renderers import storm
-from usdbrdf.asset.layers.preview_surface import surface
+from usdbrdf.asset.layers.looks import surface
 from usdbrdf.asset.layout import Asset
 
 pytestmark = needs_blender

@@ -13,13 +13,12 @@ from pxr import Sdf, Usd
 
 from tests.blender import in_blender, needs_blender
 from usdbrdf.asset.readers.surfaces import surfaces_from_stage
-from usdbrdf.delivery.flat_stage import stage_in_look
 from usdbrdf.delivery.glb import gltf_material, write_glb
-from usdbrdf.delivery.package import package
+from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.model.material import Surface, constant_map, preview_material
 from usdbrdf.options import PackageOptions
-from usdbrdf.relighting.insert import surfaces_from_model
+from usdbrdf.relighting.relit_scene import surfaces_from_model
 
 pytest.importorskip("PIL", reason="Pillow is not installed")
 

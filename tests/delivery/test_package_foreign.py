@@ -12,12 +12,11 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from usdbrdf.asset.readers.surfaces import surfaces_from_stage
 from usdbrdf.cli import main
-from usdbrdf.delivery.flat_stage import stage_in_look
-from usdbrdf.delivery.package import package
+from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import read_exr, read_radiance
 from usdbrdf.options import PackageOptions
-from usdbrdf.validation.standard import standard_findings
+from usdbrdf.validation.validate import standard_findings
 
 LAMP = "/room/prop/lamp"
 TIME = Usd.TimeCode.EarliestTime()

@@ -7,7 +7,7 @@ from pxr import Usd
 
 from tests.delivery.packing import edit, extracted, packed, surfaces_of
 from usdbrdf.asset.readers.surfaces import paths_of
-from usdbrdf.delivery.flat_stage import lights_of, stage_in_look
+from usdbrdf.delivery.package import lights_of, stage_in_look
 
 LIGHTS_SELECTED = 'over "room" ( variants = { string lights = "usdlux" } ) {}'
 

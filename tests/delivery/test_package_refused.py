@@ -7,8 +7,7 @@ import pytest
 from pxr import Sdf
 
 from tests.delivery.packing import CHAIR_FILE, edit, packed
-from usdbrdf.delivery.flat_stage import look_of, stage_in_look
-from usdbrdf.delivery.package import package, write_usdz
+from usdbrdf.delivery.package import look_of, package, stage_in_look, write_usdz
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.images import write_exr
 

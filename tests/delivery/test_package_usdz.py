@@ -14,12 +14,11 @@ from pxr import Usd, UsdGeom, UsdMedia
 from tests.blender import in_blender, needs_blender
 from tests.delivery.packing import TIME, edit, extracted, members, packed, surfaces_of
 from usdbrdf.cli import main
-from usdbrdf.delivery.flat_stage import stage_in_look
-from usdbrdf.delivery.package import package
+from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.packaged_files import encoded_data, size_within, texture_uses
 from usdbrdf.files.images import image_size, write_exr
 from usdbrdf.options import PackageOptions
-from usdbrdf.validation.standard import standard_findings
+from usdbrdf.validation.validate import standard_findings
 
 ARKIT_CHECK = """
 import json, sys

@@ -14,7 +14,7 @@ from pxr import Sdf
 
 import usdbrdf
 from tests.scenes import MadeCapture, make_capture
-from usdbrdf.evaluation.viewed_asset import measured_atlas
+from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.files.images import write_exr
 from usdbrdf.job.progress import set_quiet
 

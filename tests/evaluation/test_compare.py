@@ -11,8 +11,8 @@ import usdbrdf
 from tests.scenes import edited, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.compare_assets import MapNames, correspondence, matched, relit
-from usdbrdf.evaluation.viewed_asset import measured_atlas
+from usdbrdf.evaluation.compare_assets import correspondence, matched, relit
+from usdbrdf.evaluation.evaluate_views import measured_atlas
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def test_an_asset_agrees_with_itself_exactly(room, itself):
 def test_own_albedo_under_own_light_gives_the_radiance_back(room):
     _, atlas = measured_atlas(room.asset)
     same, scored = matched(atlas, atlas)
-    maps = MapNames(radiance="lit", irradiance="irradiance", albedo="albedo")
-    back = relit(atlas, atlas, same, scored, maps)
+    maps = ("lit", "irradiance", "albedo")
+    back = relit(atlas, atlas, (same, scored), maps)
     # Albedos above 1, of which this room has many, were cut off; the rest is half floats.
     whole = scored & (back.albedo < 0.99).all(axis=1)
     assert whole.sum() > 100
@@ -75,14 +75,14 @@ def test_a_brighter_picture_of_the_same_room_has_the_same_albedo(room, itself, m
 def test_texels_of_another_size_are_found_where_they_are(room, fine):
     for one, other in ((room, fine), (fine, room)):
         a, b = (measured_atlas(x.asset)[1] for x in (one, other))
-        same = correspondence(a.scene, a.texels, b.scene, b.texels)
-        assert same.known().all()
+        same = correspondence(a, b)
+        assert (same.texel >= 0).all()
         assert (same.face >= 0).any()
         away = np.linalg.norm(same.interpolated(b.texels.position) - a.texels.position, axis=1)
         # Bilinear inside a chart; at its border the gutter holds the nearest texel.
         assert np.median(away) < 1e-3
         assert away.max() < 0.2
-        nearest = np.asarray(same.nearest(b.texels.position))
+        nearest = b.texels.position[same.texel]
         assert np.linalg.norm(nearest - a.texels.position, axis=1).max() < 0.25
 
 
@@ -95,13 +95,13 @@ def test_the_same_maps_on_finer_texels_differ_little(room, fine, tmp_path):
 def test_other_triangles_of_the_same_shape_are_found_by_nearness(room, tmp_path):
     other = textured(make_capture(tmp_path / "scan", subdivisions=3), tmp_path / "other")
     a, b = (measured_atlas(folder)[1] for folder in (room.asset, other))
-    same = correspondence(a.scene, a.texels, b.scene, b.texels)
+    same = correspondence(a, b)
     assert (same.face < 0).all()
-    known = same.known()
+    known = same.texel >= 0
     assert known.mean() > 0.99
     away = np.linalg.norm(same.interpolated(b.texels.position) - a.texels.position, axis=1)
     assert away[known].max() < 0.35
-    owner, theirs = a.texels.object_index(), np.asarray(same.nearest(b.texels.object_index()))
+    owner, theirs = a.texels.object_index(), b.texels.object_index()[same.texel]
     labels = [[obj.label for obj in atlas.scene.objects] for atlas in (a, b)]
     assert all(
         labels[0][i] == labels[1][j] for i, j in zip(owner[known], theirs[known], strict=True)
@@ -131,7 +131,7 @@ def test_assets_in_different_places_are_refused(room):
     far.scene.points[:] += 100
     far.texels.position[:] += 100
     with pytest.raises(InputRefused, match=r"no surface.*\[compare.surface\]"):
-        correspondence(atlas.scene, atlas.texels, far.scene, far.texels)
+        correspondence(atlas, far)
 
 
 def test_the_command_prints_its_figures(room, tmp_path, capsys):

@@ -9,13 +9,17 @@ from usdbrdf.evaluation.report import change, magma, sheet
 
 def test_magma_runs_from_black_to_pale_yellow():
     error = np.array([[0.0, 0.5, 1.0, 7.0]], np.float32)
-    colours = magma(error)[0]
+    colours = magma(error, np.ones(error.shape, bool))[0]
     assert colours[0].max() <= 4
     assert (colours[1] == (181, 54, 122)).all()
     assert (colours[2] == colours[3]).all()
     assert colours[2].min() > 180
     # Brighter all the way, so that it can be read without colours.
-    steps = magma(np.linspace(0, 1, 33, dtype=np.float32)[None])[0].astype(int).sum(axis=1)
+    steps = (
+        magma(np.linspace(0, 1, 33, dtype=np.float32)[None], np.ones((1, 33), bool))[0]
+        .astype(int)
+        .sum(axis=1)
+    )
     assert (np.diff(steps) > 0).all()
 
 
@@ -26,7 +30,7 @@ def test_what_is_not_counted_is_grey():
 
 def test_a_smaller_error_is_blue_and_a_larger_one_orange():
     before, after = np.full((1, 3), 0.3, np.float32), np.array([[0.1, 0.3, 0.5]], np.float32)
-    smaller, same, larger = change(before, after)[0].astype(int)
+    smaller, same, larger = change(before, after, np.ones(before.shape, bool))[0].astype(int)
     assert smaller[2] > 200 > smaller[0]
     assert (same == 0).all()
     assert larger[0] > 200 > larger[2]

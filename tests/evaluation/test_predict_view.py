@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from tests.scenes import camera_at, look_at
-from usdbrdf.evaluation.viewed_asset import Quality, measured_atlas, predict_view, viewed_asset
+from usdbrdf.evaluation.evaluate_views import measured_atlas, predict_view, viewed_asset
+from usdbrdf.options import EvaluateOptions
 from usdbrdf.transport.surface_texture import surface_texture
 
 SIZE = (40, 30)
 LENS = (24.0, 24.0, 20.0, 15.0)
 POSE = look_at(np.array([3.0, 0.6, 1.5]), np.array([1.8, 1.5, 0.8]))
 CAMERA = camera_at(POSE, LENS, *SIZE)
-QUICK = Quality(per_side=1, rays=8, seed=0)
+QUICK = EvaluateOptions(samples_per_pixel=1, rays=8)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def seen(room):
 
 
 def test_the_baseline_is_the_radiance_of_what_lies_behind_each_pixel(room, seen):
-    fine = predict_view(seen, CAMERA, QUICK._replace(per_side=2))
+    fine = predict_view(seen, CAMERA, EvaluateOptions(samples_per_pixel=4, rays=4 * 8), 0)
     scene = seen.lit.scene
     table = np.array([room.capture.radiance[obj.label] for obj in scene.objects])
     # Found again by projecting the faces' centres, through none of the renderer's code.
@@ -47,15 +48,15 @@ def test_the_baseline_is_the_radiance_of_what_lies_behind_each_pixel(room, seen)
 def test_nothing_is_claimed_where_the_scan_has_a_hole(seen):
     away = POSE.copy()
     away[:3, 3] += 10
-    empty = predict_view(seen, replace(CAMERA, world_from_camera=away), QUICK)
+    empty = predict_view(seen, replace(CAMERA, world_from_camera=away), QUICK, 0)
     assert not empty.surface.all()
     assert (empty.full[~empty.surface] == 0).all()
 
 
 def test_more_points_per_pixel_are_a_mean_of_more_pixels(seen):
     # 3 x 3 points of a pixel are the centres of 3 x 3 smaller ones.
-    coarse = predict_view(seen, CAMERA, Quality(per_side=3, rays=9 * 8, seed=0))
-    fine = predict_view(seen, CAMERA.at_size(3 * SIZE[0], 3 * SIZE[1]), QUICK)
+    coarse = predict_view(seen, CAMERA, EvaluateOptions(samples_per_pixel=9, rays=9 * 8), 0)
+    fine = predict_view(seen, CAMERA.at_size(3 * SIZE[0], 3 * SIZE[1]), QUICK, 0)
     mean = fine.baseline.reshape(SIZE[1], 3, SIZE[0], 3, 3).mean(axis=(1, 3))
     assert np.abs(mean - coarse.baseline).max() < 1e-5
     lamp = fine.lamp.reshape(SIZE[1], 3, SIZE[0], 3).any(axis=(1, 3))
@@ -68,7 +69,7 @@ def test_lamps_show_what_was_measured(room, seen):
     mask = np.repeat(atlas.texels.object_index()[:, None] == box, 3, axis=1).astype(np.float32)
     emission = surface_texture(atlas.texels, atlas.scene.face_object, mask)
     shining = replace(seen, lit=replace(seen.lit, emission=emission))
-    picture = predict_view(shining, CAMERA, QUICK)
+    picture = predict_view(shining, CAMERA, QUICK, 0)
     assert picture.lamp.any()
     assert (picture.full[picture.lamp] == picture.baseline[picture.lamp]).all()
     lit = ~picture.lamp & picture.surface
@@ -78,7 +79,7 @@ def test_lamps_show_what_was_measured(room, seen):
 
 def test_an_object_without_a_lobe_has_no_specular_light(seen):
     unknown = replace(seen, phi=np.full_like(seen.phi, np.nan))
-    picture = predict_view(unknown, CAMERA, QUICK)
+    picture = predict_view(unknown, CAMERA, QUICK, 0)
     assert (picture.full == picture.baseline).all()
 
 
@@ -86,7 +87,7 @@ def test_where_specular_light_was_taken_out_the_full_model_starts_from_the_rest(
     place, atlas = measured_atlas(separated.asset)
     seen = viewed_asset(place, atlas, None)
     dull = replace(seen, psi=np.zeros_like(seen.psi), lit=in_the_dark(seen.lit))
-    picture = predict_view(dull, CAMERA, QUICK)
+    picture = predict_view(dull, CAMERA, QUICK, 0)
     assert (picture.baseline > 0).all()
     assert np.abs(picture.full / picture.baseline - 0.5).max() < 1e-3
 

@@ -7,10 +7,10 @@ import pytest
 
 import usdbrdf
 from tests.scenes import edited, make_capture, ring_of_poses
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.viewed_asset import measured_atlas
+from usdbrdf.evaluation.evaluate_views import measured_atlas
 
 
 def read(asset, document):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.arrays import load_arrays, save_arrays
+from usdbrdf.files.documents import load_arrays, save_arrays
 
 
 def test_equal_arrays_give_equal_bytes(tmp_path):

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files import documents
 from usdbrdf.files.documents import read_json, write_json
 
 
 @pytest.fixture
 def read(tmp_path):
-    def run(text, **limits):
+    def run(text):
         path = tmp_path / "doc.json"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_json(path, **limits)
+        return read_json(path)
 
     return run
 
@@ -62,18 +63,21 @@ def test_not_utf8(read):
         read(b'["\xff"]')
 
 
-def test_depth(read):
+def test_depth(read, monkeypatch):
     assert read("[" * 64 + "]" * 64)
     for depth in (65, 200_000):
         with pytest.raises(InputRefused, match=r"deeper than 64 levels.+\[document\.depth\]$"):
             read("[" * depth + "]" * depth)
+    monkeypatch.setattr(documents, "MAX_DEPTH", 1)
+    assert read('{"a": 1}')
     with pytest.raises(InputRefused, match="deeper than 1 "):
-        read('{"a": {}}', max_depth=1)
+        read('{"a": {}}')
 
 
-def test_size(read):
+def test_size(read, monkeypatch):
+    monkeypatch.setattr(documents, "MAX_BYTES", 10)
     with pytest.raises(InputRefused, match=r"11 bytes.+limit of 10.+\[document\.size\]$"):
-        read('["1234567"]', max_bytes=10)
+        read('["1234567"]')
 
 
 def test_not_a_regular_file(tmp_path):

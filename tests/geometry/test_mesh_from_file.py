@@ -54,7 +54,7 @@ def test_glb_nodes_become_labels_in_world_positions(tmp_path):
     scene.add_geometry(trimesh.creation.icosphere(), node_name="ball", transform=moved)
     scene.export(tmp_path / "scene.glb")
     mesh = mesh_from_file(tmp_path / "scene.glb")
-    assert sorted(mesh.label_names.values()) == ["ball", "box"]
+    assert sorted(mesh.label_names) == ["ball", "box"]
     np.testing.assert_allclose(mesh.points.max(axis=0), [4, 1, 1], atol=1e-6)
 
 

@@ -16,7 +16,7 @@ from usdbrdf.geometry.sides import (
     sides_from_cameras,
     turned_towards_cameras,
 )
-from usdbrdf.model.mesh import ScanMesh, face_normals
+from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.options import IngestOptions
 
 WIDTH, HEIGHT = 64, 48
@@ -85,7 +85,7 @@ def test_a_part_that_no_frame_shows_faces_what_was_seen():
     poses = [look_at(np.array([2.0 + 0.1 * k, 1.0, 1.5]), np.array([2.0, 3, 1])) for k in range(4)]
     for faces, towards_wall in ((number, True), (number[:, [0, 2, 1]], False)):
         mesh = _mesh(both, np.concatenate([triangles, faces]), owner)
-        assert (face_normals(both, faces)[:, 1] < 0).all() == towards_wall
+        assert (face_normals_and_angles(both, faces)[0][:, 1] < 0).all() == towards_wall
         sides = sides_from_cameras(mesh, _cameras(poses))
         assert (sides.turned[-2:] == towards_wall).all()
 
@@ -102,7 +102,7 @@ def test_a_sheet_seen_from_both_sides_gets_a_second_skin():
     assert not sides.turned.any()
     skinned = turned_towards_cameras(mesh, sides, None, 40)
     assert len(skinned.triangles) == 4
-    normals = face_normals(skinned.points, skinned.triangles)
+    normals = face_normals_and_angles(skinned.points, skinned.triangles)[0]
     np.testing.assert_allclose(normals[2:], -normals[:2], atol=1e-6)
     np.testing.assert_allclose(skinned.corner_normals[2:, 0], normals[2:], atol=1e-6)
     # Behind what it is the back of, but hardly.
@@ -142,8 +142,8 @@ def test_a_capture_with_turned_faces_is_the_same_scan(tmp_path):
     of_expected = expected.mesh.points[expected.mesh.triangles]
     np.testing.assert_array_equal(np.sort(corner, axis=1), np.sort(of_expected, axis=1))
     np.testing.assert_allclose(
-        face_normals(scan.mesh.points, scan.mesh.triangles),
-        face_normals(expected.mesh.points, expected.mesh.triangles),
+        face_normals_and_angles(scan.mesh.points, scan.mesh.triangles)[0],
+        face_normals_and_angles(expected.mesh.points, expected.mesh.triangles)[0],
         atol=1e-6,
     )
     assert scan.counts["faces_turned"] == turned.sum()

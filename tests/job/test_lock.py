@@ -16,13 +16,13 @@ import pytest
 
 from usdbrdf import working_on
 from usdbrdf.errors import FolderBusy
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 
 ROOT = Path(__file__).parents[2]
 HOLD = """
 import sys, time
 from pathlib import Path
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 with folder_lock(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.readline()
@@ -112,7 +112,7 @@ FORK = """
 import os, sys
 from pathlib import Path
 from usdbrdf.errors import FolderBusy
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 with folder_lock(Path(sys.argv[1])):
     child = os.fork()
     if child == 0:

@@ -171,7 +171,7 @@ def test_the_one_that_waited_holds_the_lock_that_others_see(tmp_path):
 TAKE = """
 import sys
 from pathlib import Path
-from usdbrdf.job.lock import folder_lock
+from usdbrdf.job.ownership import folder_lock
 with folder_lock(Path(sys.argv[1])):
     pass
 """

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.job import checkpoints
 from usdbrdf.job import stamp as stamp_module
+from usdbrdf.job import task as task_module
 from usdbrdf.job.task import run_task
 
 STAMP = ".usdbrdf/stamps/20-toy.json"
@@ -194,7 +194,7 @@ def test_checkpoints_give_the_arrays_back_bit_for_bit(tmp_path):
 
 def test_a_running_state_is_not_saved_all_the_time(tmp_path, monkeypatch):
     clock, saved = [0.0], []
-    monkeypatch.setattr(checkpoints.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(task_module.time, "monotonic", lambda: clock[0])
 
     def state():
         saved.append(clock[0])

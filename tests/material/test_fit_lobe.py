@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe
-from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate, averaged
-from usdbrdf.material.verdict import SOME_EVIDENCE
+from usdbrdf.material.verdict import NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate, averaged
 from usdbrdf.material.view_model import ViewSamples
 
 TEXELS, FRAMES = 50, 10
@@ -140,7 +139,7 @@ def test_noise_of_the_rays_does_not_draw_psi_anywhere(phi: float, noise: float):
         first, second, third = (_side_by_side(_noisy(basis, 3 * seed + k, noise)) for k in range(3))
         own = Candidate(first=first, second=second, third=third, blur=0)
         halves.append(fit_lobe(samples, [own]).psi)
-        twice.append(fit_lobe(samples, [replace(own, second=first)]).psi)
+        twice.append(fit_lobe(samples, [own._replace(second=first)]).psi)
     assert np.mean(halves) == pytest.approx(psi, abs=0.04)
     # Noise squared adds to the square of the slope, which psi is divided by.
     assert np.mean(twice) < 0.93 * psi
@@ -219,12 +218,12 @@ def test_footprints_that_fit_alike_are_averaged():
     one = LobeEstimate(
         phi=0.2, psi=0.5, phi_error=0.03, psi_error=0.1, unresolved=0.01, cost=1.0, evidence=0.7
     )
-    other = replace(one, phi=0.3, psi=0.7, unresolved=0.05)
+    other = one._replace(phi=0.3, psi=0.7, unresolved=0.05)
     both = averaged([one, other], 1000, [1, 1])
     assert (both.phi, both.psi, both.unresolved) == pytest.approx((0.25, 0.6, 0.03))
     assert both.phi_error == pytest.approx(math.hypot(0.03, 0.05))
     assert both.psi_error == pytest.approx(math.hypot(0.1, 0.1))
-    worse = replace(other, cost=1.5)
+    worse = other._replace(cost=1.5)
     assert averaged([one, worse], 1000, [1, 1]).phi == pytest.approx(0.2, abs=1e-6)
     assert averaged([one, other], 1000, [1, 3]).phi == pytest.approx((one.phi + 3 * other.phi) / 4)
     assert averaged([one], 1000, [1]) == one

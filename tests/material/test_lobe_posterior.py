@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, lobe_from_costs
+from usdbrdf.material.verdict import NOTHING_KNOWN, lobe_from_costs
 
 PHIS = np.linspace(0, 1, 101)
 FREEDOM = 1000

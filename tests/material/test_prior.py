@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from usdbrdf.material.lobe_posterior import NOTHING_KNOWN
-from usdbrdf.material.verdict import NEUTRAL, PRIOR_ERROR, class_prior, with_prior
+from usdbrdf.material.verdict import NEUTRAL, NOTHING_KNOWN, PRIOR_ERROR, class_prior, with_prior
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import partial
 
 import pytest
 
 from usdbrdf.material.fit_lobe import mean_of_repeats, repeated_where_noisy
-from usdbrdf.material.lobe_posterior import NOTHING_KNOWN, LobeEstimate
+from usdbrdf.material.verdict import NOTHING_KNOWN, LobeEstimate
 
 ONE = LobeEstimate(
     phi=0.1, psi=0.5, phi_error=0.02, psi_error=0.06, unresolved=0.01, cost=1.0, evidence=0.8,
@@ -26,10 +25,10 @@ def test_a_fit_is_repeated_with_rays_of_its_own_only_where_they_matter():
         return one
 
     for one, expected in (
-        (replace(ONE, of_rays=(0.009, 0.029)), 1),
-        (replace(ONE, of_rays=(0.011, 0.0)), 5),
-        (replace(ONE, of_rays=(0.0, 0.031)), 5),
-        (replace(ONE, of_rays=(0.02, 0.05), evidence=0.1), 1),  # its class tells more
+        (ONE._replace(of_rays=(0.009, 0.029)), 1),
+        (ONE._replace(of_rays=(0.011, 0.0)), 5),
+        (ONE._replace(of_rays=(0.0, 0.031)), 5),
+        (ONE._replace(of_rays=(0.02, 0.05), evidence=0.1), 1),  # its class tells more
     ):
         seeds.clear()
         for seed in range(3):
@@ -45,7 +44,7 @@ def test_a_single_fit_keeps_its_values_and_states_what_its_rays_do():
 
 
 def test_repeats_are_averaged_and_their_rays_errors_fall():
-    others = [replace(ONE, psi=0.5 + 0.01 * k) for k in (-1, 0, 1)]
+    others = [ONE._replace(psi=0.5 + 0.01 * k) for k in (-1, 0, 1)]
     found = mean_of_repeats([ONE, *others])
     assert found.psi == pytest.approx(0.5)
     assert found.of_rays == pytest.approx((0.005, 0.02))
@@ -53,11 +52,11 @@ def test_repeats_are_averaged_and_their_rays_errors_fall():
 
 
 def test_one_that_is_far_off_does_not_tell_for_all():
-    found = mean_of_repeats([ONE, ONE, ONE, replace(ONE, of_rays=(5.0, 5.0))])
+    found = mean_of_repeats([ONE, ONE, ONE, ONE._replace(of_rays=(5.0, 5.0))])
     assert found.of_rays == pytest.approx((0.005, 0.02))
 
 
 def test_a_scatter_beyond_what_the_fits_foretell_counts():
-    found = mean_of_repeats([replace(ONE, psi=psi) for psi in (0.3, 0.7, 0.3, 0.7)])
+    found = mean_of_repeats([ONE._replace(psi=psi) for psi in (0.3, 0.7, 0.3, 0.7)])
     assert found.of_rays[1] == pytest.approx(math.sqrt(0.16 / 3) / 2)
-    assert mean_of_repeats([replace(ONE, psi_error=NOTHING_KNOWN)]).psi_error == NOTHING_KNOWN
+    assert mean_of_repeats([ONE._replace(psi_error=NOTHING_KNOWN)]).psi_error == NOTHING_KNOWN

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,12 +19,11 @@ from tests.scenes import MadeCapture, make_capture, poses_down_and_up
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import read_aovs, read_shading
+from usdbrdf.asset.readers.scene import frames_from_stage, read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import FramePixels, FrameReader, read_frame, read_frames
 from usdbrdf.files.images import read_exr, write_exr
-from usdbrdf.job import checkpoints
+from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
@@ -81,7 +81,8 @@ def _lobes(atlas: AssetMaps) -> Lobes:
 
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
-    return refined_light(run, lit, atlas.texels, frames, atlas, _lobes(atlas), "none", None, 0)
+    reader, lobes = FrameReader(frames, most_bytes=0), _lobes(atlas)
+    return refined_light(run, lit, reader, atlas, lobes, "none", None, 0)
 
 
 def _irradiance(
@@ -90,7 +91,7 @@ def _irradiance(
     """S of the asset, with the diffuse radiance and the lobes as the light instead of its L_d."""
     change = np.where(atlas.emissive[:, None], 0, diffuse - atlas.lit).astype(np.float32)
     traced = atlas.irradiance
-    return refined_irradiance(run, lit, atlas.texels, traced, change, lobes, "none", 0)
+    return refined_irradiance(run, lit, traced, change, lobes, "none", 0)
 
 
 def _specular(lit: LitScene, lobes: Lobes, points: SurfacePoints, rays: int, seed: int) -> Float:
@@ -258,9 +259,9 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     frames, lit = frames_from_stage(atlas.stage), atlas.lit_scene(black_environment())
     given = []
 
-    def spied(run, lit, texels, traced, change, *others):
+    def spied(run, lit, traced, change, *others):
         given.append(atlas.lit + change)
-        return refined_irradiance(run, lit, texels, traced, change, *others)
+        return refined_irradiance(run, lit, traced, change, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
     run = TaskRun(tmp_path, "fit", tmp_path / "work")
@@ -360,9 +361,9 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     starts = []
     through_all = refine.samples_from_frames
 
-    def read(frames, order):
+    def read(how, order):
         starts.append(NUM_FRAMES - len(order))
-        return read_frames(frames, order)
+        return read_frames(how, order)
 
     def interrupted(*arguments, **options):
         for done, samples in enumerate(through_all(*arguments, **options)):
@@ -370,8 +371,8 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
             if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoints, "_SAVE_AFTER", 0.0)
-    monkeypatch.setattr(checkpoints, "_SAVE_SELDOM", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
     monkeypatch.setattr(refine, "read_frames", read)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -382,6 +383,22 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
         usdbrdf.fit(asset, usdbrdf.FitOptions())
     assert starts == [0, INTERRUPTED + 1]
     assert _contents(folder) == _contents(fitted.folder)
+
+
+@pytest.mark.parametrize("memory", [None, 0.01])
+def test_frames_are_decoded_once_where_memory_suffices(
+    room: Room, fitted: Asset, monkeypatch, memory: float | None
+):
+    decoded: Counter[int] = Counter()
+
+    def counting(of: Frames, i: int) -> FramePixels:
+        decoded[i] += 1
+        return read_frame(of, i)
+
+    monkeypatch.setattr("usdbrdf.files.frames.read_frame", counting)
+    found = _fitted(room, f"read with {memory}", usdbrdf.FitOptions(memory=memory))
+    assert decoded == dict.fromkeys(range(NUM_FRAMES), 1 if memory is None else 2)
+    assert _contents(found.folder) == _contents(fitted.folder)
 
 
 def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, monkeypatch, capsys):

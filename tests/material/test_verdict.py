@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from usdbrdf.material.lobe_posterior import NOTHING_KNOWN
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
+    NOTHING_KNOWN,
     PRIOR_ERROR,
     SOME_EVIDENCE,
     Verdict,

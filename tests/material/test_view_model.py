@@ -179,7 +179,7 @@ def test_the_samples_tell_how_large_their_errors_are():
 
 
 def _shared_errors(model: ViewModel) -> int:
-    return sum(len(frame.kind) for frame in model._effects.frames)
+    return sum(len(frame.kind) for frame in model._effects)
 
 
 def test_a_group_of_a_single_sample_has_no_error_of_its_own():

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from tests.scenes import look_at
-from usdbrdf.model.camera import Camera, pixel_centres
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 
 LENS = (120.0, 100.0, 31.5, 24.25)
 
 
-def _camera(pose: np.ndarray) -> Camera:
-    return Camera(world_from_camera=pose, intrinsics=LENS, width=60, height=50)
+def _camera(pose: np.ndarray, width: int = 60, height: int = 50) -> Camera:
+    return Camera(world_from_camera=pose, intrinsics=LENS, width=width, height=height)
 
 
 def test_the_first_pixel_is_centred_at_one_half():
-    pixels = pixel_centres(4, 3)
+    pixels = _camera(np.eye(4), 4, 3).pixels()
     assert pixels.shape == (12, 2)
     np.testing.assert_array_equal(pixels[0], [0.5, 0.5])
     np.testing.assert_array_equal(pixels[1], [1.5, 0.5])  # row by row
@@ -27,8 +27,9 @@ def test_the_first_pixel_is_centred_at_one_half():
 
 
 def test_a_stride_keeps_every_nth_pixel():
-    whole = pixel_centres(7, 5).reshape(5, 7, 2)
-    np.testing.assert_array_equal(pixel_centres(7, 5, 3), whole[::3, ::3].reshape(-1, 2))
+    camera = _camera(np.eye(4), 7, 5)
+    whole = camera.pixels().reshape(5, 7, 2)
+    np.testing.assert_array_equal(camera.pixels(3), whole[::3, ::3].reshape(-1, 2))
 
 
 def test_the_axes_are_right_up_and_backwards():

@@ -73,12 +73,12 @@ class World:
         """With L_d (T, 3); ``bright`` (T, 3) is what lights are picked by, else L_d."""
         return LitScene(
             scene=self.scene,
+            texels=self.texels,
             rays=self.rays,
             radiance=self.texture(radiance),
             lights=self.lights(radiance if bright is None else bright),
             emission=self.texture(0 * radiance if emission is None else emission),
             environment=environment or black_environment(),
-            diagonal_m=self.size,
         )
 
     def lights(self, radiance: Float) -> Lights:

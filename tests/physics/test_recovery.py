@@ -17,7 +17,7 @@ from tests.scenes import camera_at, look_at
 from usdbrdf.material.fit_target import fit_target_frame
 from usdbrdf.material.fit_views import fit_views
 from usdbrdf.material.observations import Follower
-from usdbrdf.model.camera import Camera, pixel_centres
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import LitScene, View
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 1.0]), 0.35
@@ -85,6 +85,11 @@ def _sphere_points(studio: Studio, pixels: np.ndarray) -> tuple[np.ndarray, np.n
         return -b - np.sqrt(b * b - c), direction
 
 
+def _centres() -> np.ndarray:
+    lens = (1.0, 1.0, 0.0, 0.0)
+    return Camera(world_from_camera=np.eye(4), intrinsics=lens, width=SIZE, height=SIZE).pixels()
+
+
 def _render(studio: Studio, phi: float, psi: float, samples: int = 96) -> np.ndarray:
     """The frame (H, W, 3): each pixel the mean of 3 x 3 points of it, I = L_d + I_nd.
 
@@ -92,7 +97,7 @@ def _render(studio: Studio, phi: float, psi: float, samples: int = 96) -> np.nda
     balance heuristic, independent random numbers.
     """
     rng = np.random.default_rng(2024)
-    centres = pixel_centres(SIZE, SIZE)
+    centres = _centres()
     offset = (np.arange(3) - 1) / 3
     offsets = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
     image = np.zeros((SIZE * SIZE, 3))
@@ -140,9 +145,7 @@ def _lit_scene(world: World, radiance: np.ndarray) -> LitScene:
 def _whole(studio: Studio) -> np.ndarray:
     """(H, W) bool: every corner of the pixel lies on the sphere."""
     corners = [(-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]
-    inside = [
-        np.isfinite(_sphere_points(studio, pixel_centres(SIZE, SIZE) + c)[0]) for c in corners
-    ]
+    inside = [np.isfinite(_sphere_points(studio, _centres() + c)[0]) for c in corners]
     return np.all(inside, axis=0).reshape(SIZE, SIZE)
 
 
@@ -182,7 +185,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
     usable[own] = True
     angles = np.radians(np.linspace(-60, 60, 9))
     cameras = []
-    follower = Follower(lit, studio.world.texels, usable, len(angles), 0)
+    follower = Follower(lit, usable, len(angles), 0)
     for angle in angles:
         eye = np.array([1.6 * np.sin(angle), -1.6 * np.cos(angle), 1.0 + 0.3 * np.sin(3 * angle)])
         there = studio._replace(
@@ -193,9 +196,8 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         )
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
-    texels = studio.world.texels
-    observed, smoothing = follower.chosen(texels, 0).of_texels(own), follower.smoothing
-    found, used = fit_views(lit, texels, observed, smoothing, cameras.__getitem__, SPHERE, 0)
+    observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
+    found, used = fit_views(lit, observed, smoothing, cameras.__getitem__, SPHERE, 0)
     assert found is not None
     assert used > 500
     assert found.phi == pytest.approx(phi, abs=0.04)

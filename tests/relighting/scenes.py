@@ -9,8 +9,7 @@ import numpy as np
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import Light, RelitScene
 from usdbrdf.model.material import Material, Surface, constant_map
-from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
-from usdbrdf.relighting.render import render_view
+from usdbrdf.relighting.render import mitsuba_scene, render_view
 
 # A smooth lobe of no reflectance at normal incidence: seen and lit from above, it is Lambert's.
 MATTE = {"f0": constant_map(0.0), "roughness": constant_map(0.1)[..., :1]}
@@ -94,4 +93,4 @@ def photograph(
     """(H, W, 3) radiance."""
     scene = RelitScene(surfaces=tuple(surfaces), lights=tuple(lights or []))
     loaded = mitsuba_scene(mi, scene, bounces=bounces)
-    return render_view(mi, loaded, view, samples=samples, seed=(1,), label="test").radiance
+    return render_view(mi, loaded, view, samples=samples, seed=(1,), label="test")[0]

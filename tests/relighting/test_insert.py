@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from tests.relighting.scenes import MATTE, cube, looking, material, photograph, plate
+from usdbrdf.asset.readers.render_scene import RenderScene
 from usdbrdf.errors import UsageError
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import constant_map, preview_material
 from usdbrdf.options import Insert
-from usdbrdf.relighting.insert import placed, with_material
+from usdbrdf.relighting.relit_scene import placed, with_material
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 
 _STUFF = material()
@@ -25,10 +26,9 @@ def _fallen(*scene: Any, up_axis: str = "Z", side: float = 1.0, **how: Any) -> n
     (found,) = placed(
         [cube(_STUFF, side=side)],
         Insert(model=Path("cube.obj"), **how),
-        up_axis=up_axis,
-        metres_per_unit=1.0,
-        scene=scene,
-        eye_height=2.0,
+        RenderScene(surfaces=(), lights=(), up_axis=up_axis, metres_per_unit=1.0),
+        scene,
+        2.0,
     )
     return found.bounds
 
@@ -76,10 +76,9 @@ def test_numbers_are_in_units_of_the_stage() -> None:
     (found,) = placed(
         [cube(_STUFF)],
         Insert(model=Path("a.ply"), at=(100.0, 0, 50), scale=0.5, rotate_deg=90),
-        up_axis="Z",
-        metres_per_unit=0.01,
-        scene=(),
-        eye_height=0.0,
+        RenderScene(surfaces=(), lights=(), up_axis="Z", metres_per_unit=0.01),
+        (),
+        0.0,
     )
     assert found.bounds == pytest.approx(np.array([[0.75, -0.25, 0.25], [1.25, 0.25, 0.75]]))
     # Counter-clockwise from above: +x goes to +y.

@@ -19,9 +19,8 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import Surface
-from usdbrdf.options import Insert
-from usdbrdf.relighting.insert import surfaces_from_model
-from usdbrdf.relighting.relit_scene import relit_scene
+from usdbrdf.options import Insert, RelightOptions
+from usdbrdf.relighting.relit_scene import relit_scene, surfaces_from_model
 from usdbrdf.relighting.render import mitsuba_variant
 from usdbrdf.untrusted import bounds
 
@@ -146,9 +145,10 @@ def test_usd_of_others_is_read_behind_the_boundary(tmp_path: Path, stage: Render
     thing.write_text(_USD.replace("@glow.exr@", "@../lib/glow.exr@"))
     with pytest.raises(InputRefused, match=r"'\.\./lib/glow\.exr' leads out.*\[paths\.outside\]$"):
         _inserted(thing, stage)
-    insert = [Insert(model=thing)]
-    allowed = {"keep_emitters": False, "eye_height": 2.0, "allow_outside": (tmp_path / "lib",)}
-    found = relit_scene(stage, thing, insert, **allowed).surfaces[len(stage.surfaces) :]
+    options = RelightOptions(
+        lights=thing, inserts=(Insert(model=thing),), allow_outside=(tmp_path / "lib",)
+    )
+    found = relit_scene(stage, options, 2.0).surfaces[len(stage.surfaces) :]
     assert [surface.material.emits for surface in found].count(True) == 2
     for good, bad in (("= 0.1", "= nan"), ("= 0.1", "= -1"), ('"Y"', '"X"')):
         thing.write_text(_USD.replace(good, bad, 1))
@@ -158,7 +158,7 @@ def test_usd_of_others_is_read_behind_the_boundary(tmp_path: Path, stage: Render
 
 def _inserted(model: Path, stage: RenderScene, **how: Any) -> tuple[Surface, ...]:
     insert = Insert(model=model, **how)
-    scene = relit_scene(stage, None, [insert], keep_emitters=False, eye_height=2.0)
+    scene = relit_scene(stage, RelightOptions(inserts=(insert,)), 2.0)
     return scene.surfaces[len(stage.surfaces) :]
 
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.shading.clipped_emitters import LAMP_PRIOR, estimate_clipped_emitters
-from usdbrdf.shading.lamp_evidence import Evidence
+from usdbrdf.shading.clipped_emitters import LAMP_PRIOR, Evidence, estimate_clipped_emitters
 
 ROOM = np.array([4.0, 3.0, 2.5])
 LAMPS = np.array([[1.0, 1.0, 2.0], [3.2, 2.2, 1.6]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.clipped_light import clipped_groups
 
 WALL, LAMP = 2, 6

@@ -9,7 +9,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.coverage import CoverageMap
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.transport.environment import black_environment

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
-from usdbrdf.shading.emitters import find_emitters
+from usdbrdf.shading.shaded import find_emitters
 
 LAMP = 6
 ALBEDO = 0.5

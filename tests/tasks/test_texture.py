@@ -17,8 +17,8 @@ from usdbrdf.asset.maps import MapWriter, TexelMap
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import SceneObject
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.texturing import lit_texture as module
 from usdbrdf.texturing.lit_texture import LitTexture
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from usdbrdf.texturing.glare import _median, brightest_glare
+from usdbrdf.texturing.samples import _median, brightest_glare
 
 
 def _expected(radiance: np.ndarray, valid: np.ndarray, clipped: np.ndarray) -> np.ndarray:

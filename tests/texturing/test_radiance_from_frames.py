@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import pytest
 
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.files.images import write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
@@ -20,6 +21,7 @@ from usdbrdf.texturing.exposures import Probes
 from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
+from usdbrdf.transport.lit_scene import TexturedScene
 
 SATURATION = 4.0
 WIDTH, HEIGHT = 48, 36
@@ -81,9 +83,10 @@ def _empty(world: World, part: slice | None = None) -> Observation:
 def _observe(
     world: World, frames: Frames, observed: Observation, start: int = 0, part: slice | None = None
 ) -> list[int]:
-    images = read_frames(frames, range(start, len(frames)))
+    images = read_frames(partial(read_frame, frames), range(start, len(frames)))
+    surface = TexturedScene(world.scene, world.texels, world.rays)
     done = []
-    for some in samples_from_frames(world.texels, world.scene, world.rays, frames, images, part):
+    for some in samples_from_frames(surface, frames, images, part):
         observed.add(some, 0.5)
         done.append(some.frame)
     return done

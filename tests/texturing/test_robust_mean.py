@@ -91,21 +91,21 @@ def test_reading_changes_nothing_and_going_on_gives_the_same_bits():
     values = np.random.default_rng(7).uniform(0, 2, (13, 40, 3))
     whole = _state(values, np.full(13, 0.1))
     head = _state(values[:7], np.full(7, 0.1))
-    before = {name: array.copy() for name, array in head.arrays().items()}
+    before = {name: array.copy() for name, array in head._asdict().items()}
     robust_mean(head)
-    for name, array in head.arrays().items():
+    for name, array in head._asdict().items():
         np.testing.assert_array_equal(array, before[name])
     saved = MeanState(**before)
     footprint = np.tile(np.float32([1, 0, 1]), (40, 1))
     for some in values[7:].astype(np.float32):
         error = np.full(40, 0.1, np.float32)
         update(saved, np.arange(40, dtype=np.int32), some, error, footprint)
-    for name, array in whole.arrays().items():
-        np.testing.assert_array_equal(saved.arrays()[name], array)
+    for name, array in whole._asdict().items():
+        np.testing.assert_array_equal(saved._asdict()[name], array)
 
 
 def test_state_is_132_bytes_per_texel():
-    assert sum(array.nbytes for array in MeanState.empty(1000).arrays().values()) == 132_000
+    assert sum(array.nbytes for array in MeanState.empty(1000)._asdict().values()) == 132_000
 
 
 def test_one_good_sample_beside_bad_ones_keeps_its_error():

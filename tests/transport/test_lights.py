@@ -11,8 +11,8 @@ from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
-from usdbrdf.transport.light_sampling import Picked, PointDraws, Receivers, pick_triangles
 from usdbrdf.transport.lights import GROUP, LightGroups, Lights, TilePicks, weighed_groups
+from usdbrdf.transport.sampling_loops import Picked, PointDraws, Receivers, pick_triangles
 
 
 def _soup(count: int) -> Lights:

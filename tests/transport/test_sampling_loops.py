@@ -10,8 +10,8 @@ from usdbrdf.options import Sampling
 from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
-from usdbrdf.transport.light_sampling import turns
 from usdbrdf.transport.lights import picked
+from usdbrdf.transport.sampling_loops import turns
 from usdbrdf.transport.surface_texture import AHEAD
 from usdbrdf.transport.warps import cosine_direction, in_triangle, on_hemisphere, triangle_point
 

@@ -9,9 +9,7 @@ from pxr import Sdf, Usd
 from tests.fault_injection import inject
 from tests.validation.faults import CHAIR, FAULTS, SURFACE, Types, edited, opinion
 from usdbrdf.errors import EnvironmentFailure, UsageError
-from usdbrdf.validation.cure_layer import write_cures
-from usdbrdf.validation.standard import open_or_finding
-from usdbrdf.validation.validate import own_findings
+from usdbrdf.validation.validate import open_or_finding, own_findings, write_cures
 
 CURABLE = ("CameraExposure", "SpecularColor", "LobeMatchesFit", "LookSelection", "EmitterAlbedo")
 
@@ -114,7 +112,7 @@ def test_a_file_that_appears_meanwhile_is_kept(built, monkeypatch):
         layer.write_text("somebody's")
         return open_or_finding(root_layer)
 
-    monkeypatch.setattr("usdbrdf.validation.cure_layer.open_or_finding", open_late)
+    monkeypatch.setattr("usdbrdf.validation.validate.open_or_finding", open_late)
     with pytest.raises(UsageError, match=r"\[fix\.exists\]"):
         write_cures(built.asset, layer)
     assert layer.read_text() == "somebody's"

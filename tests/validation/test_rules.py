@@ -7,8 +7,7 @@ import pytest
 from pxr import Sdf, Usd
 
 from tests.validation.faults import ALBEDO_TEXTURE, CHAIR, FAULTS, SURFACE, Types, edited, opinion
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Severity
+from usdbrdf.validation.rule import AssetStage, Severity
 from usdbrdf.validation.validate import RULES, own_findings, validate
 
 BY_NAME = {rule.name: rule for rule in RULES}

@@ -1,5 +1,5 @@
 """Everything that reads or writes USD."""
 
-from usdbrdf.asset import schema
+from usdbrdf.asset.properties import register
 
-schema.register()
+register()

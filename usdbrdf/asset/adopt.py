@@ -20,22 +20,28 @@ _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
 
 def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     """Copy edited tool-owned files beside edits.usda and return the copies, for the artist to use.
-
-    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go
-    to a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
-    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it.
-    """
+    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go to
+    a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
+    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it."""
     layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
     others = [path for path in edited if path.suffix not in _LAYER_SUFFIXES]
-    numbers = (n for n in itertools.count(1) if not _is_taken(asset, n))
+    stems = (asset.folder / f"adopted-{n}" for n in itertools.count(1))
+    free = (
+        stem
+        for stem in stems
+        if not (os.path.lexists(stem) or os.path.lexists(stem.with_suffix(".usda")))
+    )
     copies: dict[Path, Path] = {}
     if others:
-        folder = asset.folder / f"adopted-{next(numbers)}"
+        folder = next(free)
         for path in others:
             # The same name may occur in several folders.
-            copies[path] = folder / path.absolute().relative_to(asset.folder)
-            _copy(path, copies[path])
-    adopted = [asset.folder / f"adopted-{next(numbers)}.usda" for _ in layers]
+            target = copies[path] = folder / path.absolute().relative_to(asset.folder)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with temporary_beside(target) as copy:
+                shutil.copyfile(path, copy)
+                os.replace(copy, target)
+    adopted = [next(free).with_suffix(".usda") for _ in layers]
     for path, target in zip(layers, adopted, strict=True):
         _adopt_layer(path, target, asset, copies)
     return [*adopted, *copies.values()]
@@ -82,15 +88,3 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
     with temporary_beside(target) as written:
         text.Export(str(written))
         os.replace(written, target)
-
-
-def _is_taken(asset: Asset, number: int) -> bool:
-    stem = asset.folder / f"adopted-{number}"
-    return os.path.lexists(stem) or os.path.lexists(stem.with_suffix(".usda"))
-
-
-def _copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with temporary_beside(target) as copy:
-        shutil.copyfile(source, copy)
-        os.replace(copy, target)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import posixpath
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,18 +27,23 @@ class Asset:
 
     @staticmethod
     def at(folder: Path) -> Asset:
-        """The asset in a folder: its name is the one it was made with, else the folder's name.
-
-        A folder that was renamed after its making keeps its files' names.
-        """
+        """The asset in a folder: its name is the one it was made with, else the folder's name. A
+        folder that was renamed after its making keeps its files' names."""
         folder = Path(folder).absolute()
         if not is_storable(folder) or "\\" in str(folder):
             raise InputRefused(
                 f"{str(folder)!r}: the name of the folder, or of one above it, holds characters "
                 "that USD cannot store in a path. Choose another folder. [stage.asset_path]"
             )
-        made_with = _default_prim(folder / "layers" / "scan.usdc") or _recorded_name(folder)
-        return Asset(folder, made_with or identifier_from(folder.resolve().name, fallback="asset"))
+        name = ""
+        if (scan := folder / "layers" / "scan.usdc").is_file():
+            with suppress(InputRefused):
+                name = str(open_metadata(scan).defaultPrim)
+        if not name:  # scan.usdc is damaged or gone: what ingest called the root layer
+            stamp = read_stamp(stamp_path(folder, 1, "ingest"))
+            roots = {Path(once) for once in (stamp.once if stamp else ())} - {Path("edits.usda")}
+            name = next((path.stem for path in sorted(roots) if path.parent == Path()), "")
+        return Asset(folder, name or identifier_from(folder.resolve().name, fallback="asset"))
 
     @staticmethod
     def made(place: Path) -> Asset:
@@ -77,8 +83,7 @@ class Asset:
 
     def layer(self, role: str) -> Path:
         """Path of a task's layer; ``role`` is one of ``ROLES``."""
-        suffix = {"scan": ".usdc", "texturing": ".usda", "shading": ".usda", "material": ".usda"}
-        return self.folder / "layers" / f"{role}{suffix[role]}"
+        return self.folder / "layers" / f"{role}.{'usdc' if role == 'scan' else 'usda'}"
 
     def refuse_output(self, output: Path, rule: str) -> None:
         """UsageError for a place inside the folder: what reads an asset leaves it as it is."""
@@ -109,11 +114,9 @@ def is_storable(path: Path) -> bool:
 
 
 def relative_path(target: Path, folder: Path) -> str:
-    """Path from ``folder`` to a file, anchored and with forward slashes.
-
-    Folders are resolved first: ``..`` above a symbolic link would lead elsewhere. The file itself
-    may be a link and stays one.
-    """
+    """Path from ``folder`` to a file, anchored and with forward slashes. Folders are resolved
+    first: ``..`` above a symbolic link would lead elsewhere. The file itself may be a link and
+    stays one."""
     target = Path(os.path.realpath(target.parent)) / target.name
     relative = os.path.relpath(target, os.path.realpath(folder)).replace(os.sep, "/")
     return relative if relative.startswith("../") else f"./{relative}"
@@ -139,19 +142,16 @@ def path_in_asset(layer_relative: str) -> str:
     return posixpath.normpath(posixpath.join("layers", layer_relative))
 
 
-def _default_prim(layer: Path) -> str:
-    """Default prim of a layer file, "" if there is no such file or it cannot be read."""
-    if not layer.is_file():
-        return ""
+def open_metadata(layer: Path) -> Sdf.Layer:
+    """A private copy of a layer's metadata, read from the file as it is now."""
+    refused = InputRefused(
+        f"{layer}: this is not a readable USD layer. Run `usdbrdf convert` again, which makes it "
+        "anew. [stage.unreadable]"
+    )
     try:
         opened = Sdf.Layer.OpenAsAnonymous(str(layer), metadataOnly=True)
-    except Tf.ErrorException:
-        return ""
-    return str(opened.defaultPrim) if opened else ""
-
-
-def _recorded_name(folder: Path) -> str:
-    """The name that ingest gave the root layer, where scan.usdc is damaged or gone."""
-    stamp = read_stamp(stamp_path(folder, 1, "ingest"))
-    roots = {Path(name) for name in (stamp.once if stamp else ())} - {Path("edits.usda")}
-    return next((path.stem for path in sorted(roots) if path.parent == Path()), "")
+    except Tf.ErrorException as error:
+        raise refused from error
+    if not opened:
+        raise refused
+    return opened

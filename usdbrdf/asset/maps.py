@@ -1,7 +1,9 @@
-"""The maps of an asset: opened once, each read when it is first asked for; and their writer."""
+"""The maps of an asset: opened once, each read when it is first asked for; their writer; and
+pictures for people: a map on the surface, as one of the capture's cameras would see it."""
 
 from __future__ import annotations
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,32 +16,87 @@ from pxr import Ar, Usd
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov
-from usdbrdf.asset.readers.frames import frames_from_stage
-from usdbrdf.asset.readers.objects import aov_path
-from usdbrdf.asset.readers.scene import scene_from_stage
+from usdbrdf.asset.readers.scene import aov_path, frames_from_stage, scene_from_stage
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.images import image_size, needs_float, read_exr, write_exr
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
+from usdbrdf.files.images import image_size, needs_float, read_exr, write_exr, write_preview_png
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
 from usdbrdf.model.scene import Scene, SceneObject
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.rays import Hits, RayScene
+from usdbrdf.transport.surface_texture import surface_texture
 
 # Pictures decoded or written at a time.
 _AT_A_TIME = min(4, os.cpu_count() or 1)
+_MAX_WIDTH = 640
+# The camera is chosen among this many frames, by about this many rays through each.
+_CANDIDATES, _RAYS = 64, 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview:
+    """What one camera sees first: the surface behind each pixel of a (height, width) picture."""
+
+    scene: Scene
+    hits: Hits
+    height: int
+    width: int
+
+    def write(
+        self, path: Path, texels: Texels, values: Float, exposure: float | None = None
+    ) -> None:
+        """Per-texel values (T, 3) as an 8-bit sRGB PNG; exposure None: chosen by the picture."""
+        texture = surface_texture(texels, self.scene.face_object, values)
+        shown = texture.at(self.hits.face, self.hits.u, self.hits.v)
+        if exposure is None:
+            exposure = display_exposure(shown[self.hits.face >= 0].mean(axis=1))
+        picture = shown.reshape(self.height, self.width, 3)
+        write_preview_png(path, to_display_srgb8(picture, exposure_scale=exposure))
+
+
+def overview(scene: Scene, rays: RayScene, frames: Frames) -> Overview:
+    """The view of the frame that sees the most objects, at most 640 pixels wide."""
+    chosen = overview_frame(scene, rays, frames)
+    width, height = _reduced(frames, chosen, _MAX_WIDTH / int(frames.resolution[chosen, 0]))
+    hits = camera_hits(rays, frames, chosen, width, height)
+    return Overview(scene=scene, hits=hits, width=width, height=height)
+
+
+def overview_frame(scene: Scene, rays: RayScene, frames: Frames) -> int:
+    """The frame with the most objects in view, the first of equals."""
+    count = min(len(frames), _CANDIDATES)
+    candidates = np.linspace(0, len(frames) - 1, count).round().astype(int).tolist()
+
+    def objects_in_view(i: int) -> int:
+        scale = float(np.sqrt(_RAYS / math.prod(frames.resolution[i].tolist())))
+        hits = camera_hits(rays, frames, i, *_reduced(frames, i, scale))
+        return len(np.unique(scene.face_object[hits.face[hits.face >= 0]]))
+
+    return int(max(candidates, key=objects_in_view))
+
+
+def _reduced(frames: Frames, i: int, scale: float) -> tuple[int, int]:
+    """Width and height of a frame times ``scale``, which enlarges nothing."""
+    width, height = (max(1, round(min(1.0, scale) * n)) for n in frames.resolution[i].tolist())
+    return width, height
+
+
+def camera_hits(rays: RayScene, frames: Frames, i: int, width: int, height: int) -> Hits:
+    """First surfaces behind the frame's pixels, were it ``width`` x ``height`` pixels."""
+    camera = frames.camera(i).at_size(width, height)
+    return rays.closest(*camera.rays(camera.pixels()))
 
 
 class AssetMaps:
-    """The scene of a composed stage, its photographs, and what tasks measured of its texels.
-
-    Each is read when it is first asked for, and every map is decoded at most once; the arrays are
-    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear Rec.709.
-    """
+    """The scene of a composed stage, its photographs, and what tasks measured of its texels. Each
+    is read when it is first asked for, and every map is decoded at most once; the arrays are
+    shared, so nobody writes to them. What is (T,) or (T, C) is per texel, float32, linear
+    Rec.709."""
 
     def __init__(self, stage: Usd.Stage) -> None:
         self.stage = stage

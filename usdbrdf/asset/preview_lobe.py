@@ -36,15 +36,11 @@ def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") 
     return PreviewLobe(math.sqrt(max(0.001, phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
 
 
-def fit_from_preview_surface(roughness: float, ior: float, mapping: str) -> PreviewLobe:
-    """The inverse, for whoever renders with the fitted lobe: the roughness, the ior that has the
-    F0 of the fit, and the factor that the diffuse colour was given.
-
-    Whatever was written over our values is understood as what renderers show of it; so an opinion
-    counts, and what nobody touched comes back as it was fitted.
-    """
-    if mapping != "matched":
-        return PreviewLobe(roughness, ior, 1.0)
+def fit_from_preview_surface(roughness: float, ior: float) -> PreviewLobe:
+    """The inverse of "matched", for whoever renders with the fitted lobe: the roughness, the ior
+    that has the F0 of the fit, and the factor that the diffuse colour was given. Whatever was
+    written over our values is understood as what renderers show of it; so an opinion counts, and
+    what nobody touched comes back as it was fitted."""
     shown = ((ior - 1) / (ior + 1)) ** 2
     psi, diffuse = measured_lobe(roughness**2, shown)
     sqrt_f0 = math.sqrt(0.08 * psi)

@@ -1,18 +1,22 @@
-"""Every attribute ``usdBrdf:*``, said once: the records of an object, whose fields are the rows.
+"""Every attribute ``usdBrdf:*``, said once: the records of an object, whose fields are the rows;
+and the codeless schemas: where they lie, how USD learns of them, and whether it did.
 
 A field that is stored carries a ``Fact``: the schema, the attribute's name, type, fallback and
 range, and its documentation. From these rows are made the schemas (``schemas/generate.py``), what
-the layers say (``layers.author.author_record``), what is read back (``readers.objects``) and what
-is checked (``validation.record_rules``). A new fact is one row here, and whoever measures it.
-"""
+the layers say (``layers.author.author_record``), what is read back (``readers.scene``) and what is
+checked (``validation.record_rules``). A new fact is one row here, and whoever measures it."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
+from pxr import Plug, Usd
+
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
+from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Array, Float
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
@@ -31,21 +35,14 @@ def colour(values: Array) -> Colour:
 
 @dataclass(frozen=True)
 class Schema:
-    """An applied API schema, UsdBrdf<name>API.
-
-    namespace  before the names of its attributes
-    prims      the type of prim that it may be applied to
-    key        the attribute that tells whether somebody measured what the schema is about
-    doc        what it is about; here and below line breaks count as spaces
-    flag       the field of the record that says whether the schema applies; "": it always does
-    """
+    """An applied API schema, UsdBrdf<name>API."""
 
     name: str
-    namespace: str
-    prims: str
-    key: str
-    doc: str
-    flag: str = ""
+    namespace: str  # before the names of its attributes
+    prims: str  # the type of prim that it may be applied to
+    key: str  # the attribute that tells whether somebody measured what the schema is about
+    doc: str  # what it is about; here and below line breaks count as spaces
+    flag: str = ""  # the field of the record that says whether the schema applies; "": always
 
     @property
     def identifier(self) -> str:
@@ -65,35 +62,23 @@ class Schema:
 
 @dataclass(frozen=True)
 class Fact:
-    """How a field of a record is stored.
-
-    type      as USD spells it
-    fallback  of the schema: what an application sees where nothing is authored
-    doc       documentation in the schema, with the unit of numbers
-    tokens    all values that are allowed; () for any
-    low, high  all values that make sense, bounds included, of each component
-    samples   of a sequence with a value per frame: at "every" frame, or where it "changes"
-    varying   may have samples, though we author none
-    when      whether a record has it to say; numbers that are not finite are never authored
-    absent    what the record holds where nothing is authored; None: NaN of a float, else fallback
-    stored, read   from the field's value to the attribute's, and back. Of several facts of a field
-              all are authored, and the first that is there is read
-    """
+    """How a field of a record is stored. Of several facts of a field all are authored, and the
+    first that is there is read. Numbers that are not finite are never authored."""
 
     schema: Schema
     name: str
-    type: str
-    fallback: Any
-    doc: str
-    tokens: tuple[str, ...] = ()
-    low: float = -math.inf
+    type: str  # as USD spells it
+    fallback: Any  # of the schema: what an application sees where nothing is authored
+    doc: str  # documentation in the schema, with the unit of numbers
+    tokens: tuple[str, ...] = ()  # all values that are allowed; () for any
+    low: float = -math.inf  # all values that make sense, bounds included, of each component
     high: float = math.inf
-    samples: Literal["", "every", "changes"] = ""
-    varying: bool = False
-    when: Callable[[Any], bool] = lambda record: True
-    absent: Any = None
-    stored: Callable[[Any], Any] = lambda value: value
-    read: Callable[[Any], Any] = lambda value: value
+    samples: Literal["", "every", "changes"] = ""  # where a sequence with a value per frame has any
+    varying: bool = False  # may have samples, though we author none
+    when: Callable[[Any], bool] = lambda record: True  # whether a record has it to say
+    absent: Any = None  # what a record holds where nothing is authored; None: see ``unknown``
+    stored: Callable[[Any], Any] = lambda value: value  # from the field's value to the attribute's
+    read: Callable[[Any], Any] = lambda value: value  # and back
 
     @property
     def is_uniform(self) -> bool:
@@ -178,13 +163,10 @@ class Photographs:
 
 @dataclass(frozen=True, kw_only=True)
 class Aov:
-    """One map of an object.
+    """One map of an object; ``file`` is relative to the asset folder here, to the layer where it is
+    stored."""
 
-    name  a USD identifier: also the look that shows it
-    file  relative to the asset folder here, to the layer where it is stored
-    """
-
-    name: str
+    name: str  # a USD identifier: also the look that shows it
     file: Annotated[str, Fact(AOV, "file", "asset", "", """The map, an OpenEXR file of linear
         values, a path relative to the layer.""", varying=True, stored=path_in_layer,
         read=path_in_asset)]
@@ -206,12 +188,9 @@ class MeasuredObject:
 
 @dataclass(frozen=True, kw_only=True)
 class TexturedObject(MeasuredObject):
-    """Result of the task texture for one object.
+    """Result of the task texture for one object."""
 
-    corner_uv  (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
-    """
-
-    corner_uv: Float
+    corner_uv: Float  # (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
     texel_size: Annotated[float, Fact(TEXTURING, "texelSize", "float", 0.0, """Edge length of a
         texel on the surface, in metres whatever the stage's units.""", low=0)]
     resolution: Annotated[tuple[int, int], Fact(TEXTURING, "resolution", "int2", (0, 0), """Width
@@ -232,9 +211,7 @@ class TexturedObject(MeasuredObject):
 @dataclass(frozen=True, kw_only=True)
 class ShadedObject(MeasuredObject):
     """Result of the task shade for one object: how it reflects or, of an emitter, how it shines.
-
-    aovs  "albedo" of a reflector, "emission" of an emitter, and others
-    """
+    Maps are "albedo" of a reflector, "emission" of an emitter, and others."""
 
     emitter: bool
     rays_per_texel: Annotated[float, Fact(SHADING, "raysPerTexel", "float", 0.0, """Mean number of
@@ -271,18 +248,11 @@ class ShadedObject(MeasuredObject):
     area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
         object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
 
-    @property
-    def radiance_is_lower_bound(self) -> bool:
-        return self.radiance_status == "lowerBound"
-
 
 @dataclass(frozen=True, kw_only=True)
 class FittedObject(MeasuredObject):
-    """Result of the task fit for one object; NaN where a number is not known.
-
-    aovs        "diffuse", "refined_irradiance" and "base_color", if the fit refined them
-    mean_color  area-weighted base colour, linear
-    """
+    """Result of the task fit for one object; NaN where a number is not known. Maps are "diffuse",
+    "refined_irradiance" and "base_color", if the fit refined them."""
 
     phi: Annotated[float, Fact(FIT, "phi", "float", 0.5, """Roughness parameter: alpha of the GGX
         distribution is max(0.001, phi); 0 to 1, without unit.""", low=0, high=1)]
@@ -320,7 +290,7 @@ class FittedObject(MeasuredObject):
         psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that
         renderers show what the fitted lobe reflects.""", tokens=("measured", "matched"),
         when=lambda fitted: fitted.is_known)] = "measured"
-    mean_color: Colour = (0.0, 0.0, 0.0)
+    mean_color: Colour = (0.0, 0.0, 0.0)  # area-weighted base colour, linear
 
     @property
     def is_known(self) -> bool:
@@ -364,3 +334,57 @@ def known_facts(record: Any) -> Iterator[tuple[Fact, Any]]:
         finite = fact.type != "float" or math.isfinite(value)
         if applies and finite and fact.when(record):
             yield fact, value
+
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_PLUGIN = "usdBrdf"
+# Earlier versions of USD take validators from C++ alone.
+_PYTHON_VALIDATORS = (0, 26, 8)
+
+
+def plugin_path() -> Path:
+    """Folder that holds plugInfo.json: inside the installed package, or beside it in a checkout."""
+    for folder in (_PACKAGE / "schemas", _PACKAGE.parent / "schemas"):
+        if (folder / "plugInfo.json").is_file():
+            return folder
+    raise UsdBrdfError(
+        f"{_PACKAGE}: the folder schemas/ with plugInfo.json is missing from this installation. "
+        "Install usdbrdf again. [schema.missing]"
+    )
+
+
+def validators_path() -> Path:
+    """Folder of the plugInfo.json that announces our validators to USD."""
+    return _PACKAGE / "validation"
+
+
+def register() -> None:
+    """Announce the schemas and the validators to USD; harmless when PXR_PLUGINPATH_NAME has done so
+    already. Asks the schema registry nothing: the first question builds it, and what is registered
+    afterwards, by us or by another package, would stay unknown."""
+    registry = Plug.Registry()
+    if not registry.GetPluginWithName(_PLUGIN):
+        registry.RegisterPlugins(str(plugin_path()))
+    if Usd.GetVersion() >= _PYTHON_VALIDATORS:
+        registry.RegisterPlugins(str(validators_path()))
+
+
+def verify() -> None:
+    """Raise unless USD knows the schemas with their attributes; called before the first write. A
+    plug-in that came too late, or whose resources were not found, still lists the types: only the
+    attributes tell."""
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(FIT.identifier)
+    if not definition or FIT.attribute(FIT.key) not in definition.GetPropertyNames():
+        raise UsdBrdfError(
+            "OpenUSD does not know the usdBrdf schemas: it had built its schema registry before "
+            "usdbrdf was imported. Import usdbrdf before any stage is opened, or set "
+            f"PXR_PLUGINPATH_NAME={plugin_path()}. [schema.unknown]"
+        )
+    # Another installation's, by PXR_PLUGINPATH_NAME.
+    metadata = Plug.Registry().GetPluginWithName(_PLUGIN).metadata
+    version = metadata.get("UsdBrdf", {}).get("schemaVersion")
+    if version != SCHEMA_VERSION:
+        raise UsdBrdfError(
+            f"OpenUSD knows version {version} of the usdBrdf schemas, this usdbrdf writes version "
+            f"{SCHEMA_VERSION}. Set PXR_PLUGINPATH_NAME={plugin_path()}. [schema.version]"
+        )

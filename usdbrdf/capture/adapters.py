@@ -2,18 +2,19 @@
 
 An adapter has ``NAME``, ``DESCRIPTION``, ``matches(path) -> bool`` and
 ``read(path, options) -> Scan``. Packages announce theirs as entry points of the group
-``usdbrdf.adapters``; ours are announced in the same way.
+``usdbrdf.adapters``; ours are announced in the same way. To list ours loads neither NumPy nor
+USD.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from usdbrdf.capture.formats import DESCRIPTIONS, MODULES
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
@@ -21,6 +22,14 @@ from usdbrdf.job.progress import say
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan
     from usdbrdf.options import IngestOptions
+
+
+MODULES = {"transforms": "usdbrdf.capture.transforms", "scanner-app": "usdbrdf.capture.scanner_app"}
+DESCRIPTIONS = {
+    "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
+    "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+}
+
 
 GROUP = "usdbrdf.adapters"
 
@@ -44,7 +53,7 @@ class AdapterModule(Protocol):
 class Adapter:
     """An announced adapter; ``module`` is None and ``problem`` says why if it is broken.
 
-    package  distribution and version that announce it; "" for ours
+    package  distribution and version that announce it, where known; "" for ours
     """
 
     name: str
@@ -55,14 +64,11 @@ class Adapter:
     package: str = ""
 
 
-class _LoadedWhenUsed:
+class _LoadedWhenUsed(ModuleType):
     """A module whose members are there as soon as one of them is asked for."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
-
     def __getattr__(self, member: str) -> Any:
-        return getattr(import_module(self._name), member)
+        return getattr(import_module(self.__name__), member)
 
 
 def list_adapters(*, plugins: bool = True) -> tuple[Adapter, ...]:
@@ -96,80 +102,68 @@ def read_scan(
 def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True) -> Adapter:
     """The named adapter, or the first that recognises the capture."""
     adapters = list_adapters(plugins=plugins)
+    sound = [adapter for adapter in adapters if adapter.module is not None]
     if name is not None:
-        return _named(name, adapters)
+        for adapter in adapters:
+            if adapter.name == name:
+                if adapter.module is None:
+                    raise UsageError(
+                        f"adapter {name!r} is broken: {adapter.problem}. [adapter.load]"
+                    )
+                return adapter
+        known = ", ".join(adapter.name for adapter in sound)
+        raise UsageError(
+            f"adapter {name!r} is not installed. Use one of {known}. [adapter.unknown]"
+        )
     if not path.exists():
         raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
-    return _recognising(path, adapters)
-
-
-def _loaded(point: EntryPoint) -> Adapter:
-    module, problem = _imported(point)
-    if problem:
-        say(
-            f"warning: adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]"
-        )
-        return Adapter(
-            name=point.name, description="", origin=point.value, module=None, problem=problem
-        )
-    return Adapter(
-        name=point.name,
-        description=module.DESCRIPTION,
-        origin=point.value,
-        module=cast(AdapterModule, module),
-        package="" if point.dist is None else _name_of(point.dist),
-    )
-
-
-def _imported(point: EntryPoint) -> tuple[Any, str]:
-    """Another package's module and "", or None and why it cannot be used."""
-    # The list of adapters, where there are no others, is not to wait for numpy.
-    from usdbrdf.untrusted.bounds import problem_of_plugin
-
-    if problem := problem_of_plugin(point):
-        return None, problem
-    try:
-        module = point.load()
-    # What went well in a child may still raise here, SystemExit included.
-    except (Exception, SystemExit) as error:
-        return None, f"{type(error).__name__}: {error}"
-    missing = [
-        name
-        for name, kind in (("NAME", str), ("DESCRIPTION", str))
-        if not isinstance(getattr(module, name, None), kind)
-    ] + [name for name in ("matches", "read") if not callable(getattr(module, name, None))]
-    return module, f"it has no {', '.join(missing)}" if missing else ""
-
-
-def _name_of(package: Distribution) -> str:
-    return f"{package.metadata['Name']} {package.version}"
-
-
-def _named(name: str, adapters: tuple[Adapter, ...]) -> Adapter:
-    for adapter in adapters:
-        if adapter.name == name:
-            if adapter.module is None:
-                raise UsageError(f"adapter {name!r} is broken: {adapter.problem}. [adapter.load]")
-            return adapter
-    known = ", ".join(a.name for a in adapters if a.module is not None)
-    raise UsageError(f"adapter {name!r} is not installed. Use one of {known}. [adapter.unknown]")
-
-
-def _recognising(path: Path, adapters: tuple[Adapter, ...]) -> Adapter:
-    for adapter in adapters:
-        if adapter.module is None:
-            continue
+    for adapter in sound:
         try:
-            if adapter.module.matches(path):
+            if adapter.module and adapter.module.matches(path):
                 return adapter
         except Exception as error:
             if adapter.name in MODULES:
                 raise
             say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
-    known = "; ".join(f"{a.name}: {a.description}" for a in adapters if a.module is not None)
+    known = "; ".join(f"{adapter.name}: {adapter.description}" for adapter in sound)
     raise InputRefused(
         f"{path}: not a capture that any adapter recognises ({known}). Name the folder that holds "
         "the capture, or choose with --adapter. [adapter.none]"
+    )
+
+
+def _loaded(point: EntryPoint) -> Adapter:
+    """Another package's adapter, loaded; or why it cannot be used."""
+    # The list of adapters, where there are no others, is not to wait for numpy.
+    from usdbrdf.untrusted.bounds import problem_of_plugin
+
+    module: Any = None
+    problem = problem_of_plugin(point)
+    if not problem:
+        try:
+            module = point.load()
+        # What went well in a child may still raise here, SystemExit included.
+        except (Exception, SystemExit) as error:
+            problem = f"{type(error).__name__}: {error}"
+        else:
+            missing = [
+                *(n for n in ("NAME", "DESCRIPTION") if not isinstance(getattr(module, n, 0), str)),
+                *(n for n in ("matches", "read") if not callable(getattr(module, n, None))),
+            ]
+            problem = f"it has no {', '.join(missing)}" if missing else ""
+    if problem:
+        say(
+            f"warning: adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]"
+        )
+        module = None
+    package = f"{point.dist.metadata['Name']} {point.dist.version}" if point.dist else ""
+    return Adapter(
+        name=point.name,
+        description=module.DESCRIPTION if module else "",
+        origin=point.value,
+        module=module,
+        problem=problem,
+        package=package,
     )
 
 

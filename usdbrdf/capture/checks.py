@@ -26,14 +26,10 @@ from usdbrdf.transport.rays import RayScene
 class FrameRecord:
     """The row of ``Frames`` that one photograph becomes.
 
-    name                  as the capture calls it, for messages
-    image_path            absolute
-    world_from_camera     (4, 4) float64, OpenGL axes, not yet known to be rigid
-    intrinsics            fx, fy, cx, cy in pixels, first pixel's centre at (0.5, 0.5)
-    resolution            width, height that the intrinsics belong to
-    exposure_time         seconds; 1 where unknown
-    saturation_radiance   infinite where unknown
-    noise_floor_radiance  0 where unknown
+    name               as the capture calls it, for messages
+    image_path         absolute
+    world_from_camera  (4, 4) float64, OpenGL axes, not yet known to be rigid
+    resolution         width, height that the intrinsics belong to
     """
 
     name: str
@@ -49,7 +45,6 @@ class FrameRecord:
 def frames_from_records(
     records: Sequence[FrameRecord], *, encoding: str, radiometric: bool
 ) -> Frames:
-    """The records side by side."""
     return Frames(
         image_paths=tuple(r.image_path for r in records),
         world_from_camera=np.array([r.world_from_camera for r in records]).reshape(-1, 4, 4),
@@ -79,7 +74,7 @@ _CURES = {
 
 
 class DroppedFrame(NamedTuple):
-    """One frame that cannot be used: its name, a clause that says why, and the rule."""
+    """One frame that cannot be used; reason is a clause."""
 
     name: str
     reason: str
@@ -215,10 +210,8 @@ def rigid_records(
         elif not _is_lens(record):
             lens = ", ".join(f"{number:g}" for number in record.intrinsics)
             size = " x ".join(map(str, record.resolution))
-            findings.drop(
-                record.name, f"fx, fy, cx, cy = {lens} make no lens for {size} pixels",
-                "capture.camera",
-            )  # fmt: skip
+            said = f"fx, fy, cx, cy = {lens} make no lens for {size} pixels"
+            findings.drop(record.name, said, "capture.camera")
         else:
             axes = pose[:3, :3] / (pose_scale or 1.0)
             worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
@@ -245,12 +238,10 @@ def is_camera_matrix(pose: Double) -> bool:
 def _is_lens(record: FrameRecord) -> bool:
     if min(record.resolution) < 1 or max(record.resolution) > MAX_SIDE:
         return False
-    focal = np.array(record.intrinsics[:2]) / record.resolution
-    centre = np.array(record.intrinsics[2:]) / record.resolution
+    focal, centre = np.reshape(record.intrinsics, (2, 2)) / record.resolution
     low, high = _FOCAL_LENGTHS
-    return bool(
-        ((focal >= low) & (focal <= high)).all() and (np.abs(centre) <= _FARTHEST_CENTRE).all()
-    )
+    near = np.abs(centre) <= _FARTHEST_CENTRE
+    return bool(((focal >= low) & (focal <= high) & near).all())
 
 
 def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:
@@ -321,15 +312,11 @@ def at_image_size(
 def check_frames(
     frames: Frames, names: Sequence[str], findings: Findings, *, max_nonfinite: float
 ) -> list[int]:
-    """Indices of the frames that can be used; the others are noted in ``findings``.
-
-    names          N names for messages
-    max_nonfinite  share of unknown pixels above which a frame is dropped
-    """
+    """Indices of the frames that can be used; the others are noted in ``findings`` by their
+    ``names``. max_nonfinite is the share of unknown pixels above which a frame is dropped."""
     usable: list[int] = []
     name_of: dict[str, str] = {}
-    numbers = progress(range(len(frames)), total=len(frames), label="images", unit="frames")
-    for i in numbers:
+    for i in progress(range(len(frames)), total=len(frames), label="images", unit="frames"):
         path = frames.image_paths[i]
         try:
             pixels = read_frame(frames, i)
@@ -356,11 +343,9 @@ def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] |
     """Why a frame says nothing, and the rule; None if it does say something."""
     unknown = float(pixels.unknown.mean())
     if unknown > max_nonfinite:
-        return (
-            f"{unknown:.0%} of the pixels are NaN, infinite or negative (limit "
-            f"{max_nonfinite:.0%})",
-            "capture.nonfinite",
-        )
+        limit = f"(limit {max_nonfinite:.0%})"
+        text = f"{unknown:.0%} of the pixels are NaN, infinite or negative {limit}"
+        return text, "capture.nonfinite"
     known = ~pixels.unknown
     if float((known & ~pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
         return "all of its pixels are saturated", "capture.saturated"
@@ -373,8 +358,7 @@ def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] |
 
 def clause_of(error: ImageRefused, path: Path) -> str:
     """The reader's sentence without path and rule, which the summary adds."""
-    text = str(error).removeprefix(f"{path}: ")
-    return text.rsplit(" [", 1)[0].rstrip(".")
+    return str(error).removeprefix(f"{path}: ").rsplit(" [", 1)[0].rstrip(".")
 
 
 def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> None:
@@ -416,13 +400,12 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
 
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
     count = min(len(frames), _PROBED_FRAMES)
-    hits = rays = 0
+    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    hits = 0
     for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
-        steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
-        x, y = np.meshgrid(steps * frames.resolution[i, 0], steps * frames.resolution[i, 1])
-        pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
         camera = frames.camera(i)
         camera = replace(camera, world_from_camera=read(camera.world_from_camera))
-        hits += int((scene.closest(*camera.rays(pixels)).face >= 0).sum())
-        rays += len(pixels)
-    return hits / rays
+        rays = camera.rays(grid * frames.resolution[i])
+        hits += int((scene.closest(*rays).face >= 0).sum())
+    return hits / (count * len(grid))

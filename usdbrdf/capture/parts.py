@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,
@@ -19,41 +20,138 @@ from usdbrdf.capture.checks import (
     refuse_without_parallax,
     rigid_records,
 )
-from usdbrdf.capture.labels import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import known_encodings
+from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras
-from usdbrdf.model.arrays import Bool
+from usdbrdf.geometry.unwrap import connected_triangles
+from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Frames, Scan
-from usdbrdf.model.mesh import ObjectLabel, ScanMesh
+from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
 from usdbrdf.options import IngestOptions
-from usdbrdf.untrusted.mesh_files import mesh_from_file
-from usdbrdf.untrusted.usd_files import meshes_from_usd
+from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
+
+_MAX_OBJECTS = 65_535
+_OPEN = calibration.number("surroundings.least_share")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScanGeometry:
-    """Mesh and objects as in ``Scan``, the faces wound as they came.
+class LabelTable(NamedTuple):
+    """What objects.json says: label and class of each id, and optionally an id per face."""
 
-    has_normals                    (F,) bool: the file gives the face's normals; None: it gives none
-    usd_geometry, object_prims     set if the file is USD and is to be referenced, not copied
-    meters_per_unit, up_axis       None where the file does not say
+    entries: Mapping[int, tuple[str, str]]
+    face_id: Long | None
+
+
+class Segmentation(NamedTuple):
+    """face_object (F,) int32, index into ``labels``, which are (label, class name)."""
+
+    face_object: Int
+    labels: tuple[tuple[str, str], ...]
+
+
+def label_table(path: Path) -> LabelTable:
+    """Read ``{"objects": [{"id", "name", "class_name"}], "face_object_id": [...]}``."""
+    document = read_json(path)
+    rows = document.get("objects") if isinstance(document, dict) else None
+    if not isinstance(rows, list):
+        raise InputRefused(f'{path}: no list "objects". See the example capture. [objects.format]')
+    entries: dict[int, tuple[str, str]] = {}
+    for row in rows:
+        number = row.get("id") if isinstance(row, dict) else None
+        if not isinstance(number, int) or isinstance(number, bool):
+            raise InputRefused(
+                f"{path}: the object {str(row)[:80]!r} has no whole number as id. Give every "
+                "object an id. [objects.format]"
+            )
+        if number in entries:
+            raise InputRefused(f"{path}: the id {number} occurs twice. Keep one. [objects.format]")
+        names = [row.get(key) or "" for key in ("name", "class_name")]
+        if not all(isinstance(name, str) for name in names):
+            raise InputRefused(
+                f"{path}: name and class_name of object {number} must be strings. [objects.format]"
+            )
+        entries[number] = (names[0] or f"object_{number}", names[1])
+    ids = document.get("face_object_id")
+    if ids is not None and not (isinstance(ids, list) and all(type(n) is int for n in ids)):
+        raise InputRefused(
+            f'{path}: "face_object_id" is not a list of whole numbers. [objects.format]'
+        )
+    return LabelTable(entries, None if ids is None else np.array(ids, np.int64))
+
+
+def segmentation(
+    mesh: FileMesh, table: LabelTable | None, *, table_path: Path | None, min_area: float
+) -> Segmentation:
+    """Objects of a mesh: by the table's or the file's labels, else by connected parts.
+
+    Ids without an entry are called ``object_<id>``; negative ids mean unlabelled. Parts smaller
+    than ``min_area`` (scene units squared) are gathered in one object, ``rest``.
     """
+    face_id = mesh.face_label
+    if table is not None and table.face_id is not None:
+        kept = mesh.kept if mesh.kept is not None else np.ones(len(mesh.triangles), np.bool_)
+        if len(table.face_id) != len(kept):
+            raise InputRefused(
+                f"{table_path}: {len(table.face_id)} face labels for a mesh of {len(kept)} "
+                "triangles. Write one object id per triangle of this mesh. [objects.count]"
+            )
+        face_id = table.face_id[kept]
+    if face_id is None:
+        return _connected_parts(mesh, min_area)
+    face_id = np.where(face_id < 0, -1, face_id)
+    ids, face_object = np.unique(face_id, return_inverse=True)
+    if len(ids) > _MAX_OBJECTS:
+        raise InputRefused(
+            f"{table_path or 'the mesh'}: {len(ids)} different object ids (limit {_MAX_OBJECTS}). "
+            "These do not look like objects. [objects.limit]"
+        )
+    entries = table.entries if table is not None else {}
+    names = dict(enumerate(mesh.label_names))
+    labels = [
+        ("unlabelled", "")
+        if number < 0
+        else entries.get(number, (names.get(number, f"object_{number}"), ""))
+        for number in ids.tolist()
+    ]
+    return Segmentation(face_object.astype(np.int32), tuple(labels))
 
-    mesh: ScanMesh
-    objects: tuple[ObjectLabel, ...]
-    has_normals: Bool | None = None
-    usd_geometry: Path | None = None
-    object_prims: tuple[str, ...] = ()
-    meters_per_unit: float | None = None
-    up_axis: str | None = None
+
+def _connected_parts(mesh: FileMesh, min_area: float) -> Segmentation:
+    """Parts joined by position, largest first; one object where no second one is large enough."""
+    connected = connected_triangles(welded_ids(mesh.points)[mesh.triangles])
+    parts, part_of_face = np.unique(connected, return_inverse=True)
+    area = np.bincount(
+        part_of_face, weights=doubled_areas(mesh.points, mesh.triangles) / 2, minlength=len(parts)
+    )
+    order = np.argsort(-area, kind="stable")
+    large = order[area[order] >= min_area][:_MAX_OBJECTS]
+    if len(large) < 2:
+        return Segmentation(np.zeros(len(mesh.triangles), np.int32), (("scan", ""),))
+    object_of_part = np.full(len(parts), len(large), np.int32)
+    object_of_part[large] = np.arange(len(large), dtype=np.int32)
+    labels = [(f"part_{i + 1:03d}", "") for i in range(len(large))]
+    if len(large) < len(parts):
+        labels.append(("rest", ""))
+    return Segmentation(object_of_part[part_of_face], tuple(labels))
 
 
-USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
+def objects_with_faces(
+    face_object: Int, labels: tuple[tuple[str, str], ...]
+) -> tuple[Int, tuple[ObjectLabel, ...]]:
+    """Objects that still own a triangle, with unique identifiers, and the renumbered faces."""
+    used, renumbered = np.unique(face_object, return_inverse=True)
+    kept = [labels[i] for i in used.tolist()]
+    identifiers = unique_identifiers([label for label, _ in kept])
+    objects = tuple(
+        ObjectLabel(identifier=identifier, label=label, class_name=class_name)
+        for identifier, (label, class_name) in zip(identifiers, kept, strict=True)
+    )
+    return renumbered.astype(np.int32), objects
 
 
 def geometry_from_usd(
@@ -70,28 +168,14 @@ def geometry_from_usd(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
     found = meshes_from_usd(path, allow=(capture_root, *options.allow_outside))
-    for sentence in found.warnings:
-        findings.warn(sentence)
+    findings.warnings += found.warnings
     mesh = found.mesh
     missing = np.isnan(mesh.corner_normals[:, 0, 0])
     if missing.any():
         mesh.corner_normals[missing] = corner_normals(
             mesh.points, mesh.triangles[missing], options.crease_angle_deg
         )
-    return ScanGeometry(
-        mesh=mesh,
-        has_normals=~missing,
-        objects=tuple(
-            ObjectLabel(identifier=identifier, label=label)
-            for identifier, label in zip(
-                unique_identifiers(found.labels), found.labels, strict=True
-            )
-        ),
-        usd_geometry=path.resolve(),
-        object_prims=found.object_prims,
-        meters_per_unit=found.meters_per_unit,
-        up_axis=found.up_axis,
-    )
+    return replace(found, has_normals=~missing, usd_geometry=path.resolve())
 
 
 def geometry_from_file(
@@ -107,7 +191,7 @@ def geometry_from_file(
 
     objects_path     objects.json, or None
     capture_root     folder inside which a USD file may refer to others
-    meters_per_unit  of the adapter, for areas in square metres
+    meters_per_unit  of the adapter, for areas in square metres; the options' comes first
     """
     if mesh_path.suffix.lower() in USD_SUFFIXES:
         return geometry_from_usd(mesh_path, options, findings, capture_root=capture_root)
@@ -124,7 +208,7 @@ def geometry_from_file(
         mesh,
         table,
         table_path=objects_path,
-        min_area=options.min_component_area_m2 / meters_per_unit**2,
+        min_area=options.min_component_area_m2 / (options.meters_per_unit or meters_per_unit) ** 2,
     )
     if mesh.face_label is None and (table is None or table.face_id is None):
         findings.warn(
@@ -174,7 +258,14 @@ def scan_from_parts(
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
-    _refuse_same_image_twice(records, source)
+    known: set[Path] = set()
+    for record in records:
+        if record.image_path in known:
+            raise InputRefused(
+                f"{source}: the frame {record.name!r} is listed twice. Keep one entry. "
+                "[capture.duplicate]"
+            )
+        known.add(record.image_path)
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
     rigid = at_image_size(rigid, findings, source)
     findings.refuse_too_few_frames(source, total)
@@ -204,6 +295,7 @@ def scan_from_parts(
         usd_geometry=geometry.usd_geometry,
         object_prims=geometry.object_prims,
         turned_faces=sides.turned,
+        is_open=1 - hit_share > _OPEN,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )
@@ -265,14 +357,3 @@ def radiance_encoding(options: IngestOptions, *, photographs: bool) -> str:
             f"--encoding {encoding}: the images are {kind}. Leave the option out. [usage.option]"
         )
     return encoding
-
-
-def _refuse_same_image_twice(records: Sequence[FrameRecord], source: Path) -> None:
-    known: set[Path] = set()
-    for record in records:
-        if record.image_path in known:
-            raise InputRefused(
-                f"{source}: the frame {record.name!r} is listed twice. Keep one entry. "
-                "[capture.duplicate]"
-            )
-        known.add(record.image_path)

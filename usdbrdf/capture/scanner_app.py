@@ -7,6 +7,7 @@ photograph. Pixels are sRGB, 8 bit, so nothing that comes of them is radiometric
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
-from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -43,20 +44,17 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, options: IngestOptions) -> Scan:
-    """Read and check the capture."""
     folder = path.resolve()
     findings = Findings()
     encoding = radiance_encoding(options, photographs=True)
-    records = as_photographs(_records(folder, options, findings), findings, folder)
     return scan_from_parts(
-        records,
+        as_photographs(_records(folder, options, findings), findings, folder),
         lambda: geometry_from_file(
             options.mesh or _mesh(folder, options),
             options.objects,
             options,
             findings,
             capture_root=folder,
-            meters_per_unit=options.meters_per_unit or 1.0,
         ),
         options,
         findings,
@@ -108,15 +106,20 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
         raise InputRefused(
             f"{path}: no intrinsics of 9 numbers with focal lengths. Export again. [capture.camera]"
         )
+    # The size of the image that the intrinsics belong to is told by the OpenGL projection.
+    projection = _numbers(document, "projectionMatrix", 16)
     try:
-        resolution = _resolution(document, camera, photograph)
+        if projection is not None and projection[0] > 0 and projection[5] > 0:
+            resolution = round(2 * camera[0] / projection[0]), round(2 * camera[4] / projection[5])
+        else:
+            resolution = image_size(photograph)[:2]
     except ImageRefused as error:
         findings.drop(name, clause_of(error, photograph), "capture.image")
         return None
     exposure = document.get("exposureDuration")
-    known = isinstance(exposure, int | float) and exposure > 0
-    if not known:
+    if not (isinstance(exposure, int | float) and exposure > 0):
         findings.count("frames_without_exposure", 1)
+        exposure = 1.0
     return FrameRecord(
         name=name,
         image_path=photograph,
@@ -124,28 +127,16 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
         # The first pixel's centre is (0, 0) there and (0.5, 0.5) here.
         intrinsics=(camera[0], camera[4], camera[2] + 0.5, camera[5] + 0.5),
         resolution=resolution,
-        exposure_time=float(exposure) if known and exposure is not None else 1.0,
+        exposure_time=float(exposure),
     )
-
-
-def _resolution(
-    document: Mapping[str, Any], camera: list[float], photograph: Path
-) -> tuple[int, int]:
-    """Size of the image that the intrinsics belong to, which the OpenGL projection tells."""
-    projection = _numbers(document, "projectionMatrix", 16)
-    if projection is not None and projection[0] > 0 and projection[5] > 0:
-        return round(2 * camera[0] / projection[0]), round(2 * camera[4] / projection[5])
-    width, height, _ = image_size(photograph)
-    return width, height
 
 
 def _numbers(document: Mapping[str, Any], key: str, count: int) -> list[float] | None:
     values = document.get(key)
     if not isinstance(values, list) or len(values) != count:
         return None
-    if any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
-        return None
-    return [float(v) for v in values] if np.isfinite(values).all() else None
+    sound = all(type(v) in (int, float) and math.isfinite(v) for v in values)
+    return [float(v) for v in values] if sound else None
 
 
 def _mesh(folder: Path, options: IngestOptions) -> Path:

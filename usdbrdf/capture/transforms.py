@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import (
     LARGEST_OF_POSE,
     Findings,
@@ -20,7 +21,6 @@ from usdbrdf.capture.checks import (
     is_camera_matrix,
     refuse_photographs,
 )
-from usdbrdf.capture.formats import DESCRIPTIONS
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -67,20 +67,24 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, options: IngestOptions) -> Scan:
-    """Read and check the capture."""
     path = path.resolve()
     source = path / "transforms.json" if path.is_dir() else path
-    capture = _Capture(source=source, document=_document(source), options=options)
     findings = Findings()
-    records = _records(capture, findings)
+    capture, records = _captured(source, options, findings)
     photographs = refuse_photographs(
         [r.image_path for r in records], assume_srgb=options.assume_srgb
     )
     encoding = radiance_encoding(options, photographs=photographs)
     if photographs:
         records = as_photographs(records, findings, source)
-    else:
-        _warn_of_missing_exposure(capture, records, findings)
+    elif unknown := sum(math.isinf(r.saturation_radiance) for r in records):
+        findings.warn(
+            f"{source.name}: {unknown} of {len(records)} frames state no saturation_radiance, so "
+            "clipped pixels pass for radiance. [capture.saturation]"
+        )
+    masks = sum("mask_path" in frame for frame in capture.document["frames"])
+    if masks and not photographs:
+        findings.warn(f"{source.name}: {masks} mask_path are not used. [capture.mask]")
     return scan_from_parts(
         records,
         lambda: geometry_from_file(
@@ -89,7 +93,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
             options,
             findings,
             capture_root=source.parent,
-            meters_per_unit=options.meters_per_unit or 1.0,
         ),
         options,
         findings,
@@ -110,8 +113,7 @@ def frame_records(
     ``images`` no file is asked for where the document itself states width and height.
     """
     source = source.resolve()
-    capture = _Capture(source=source, document=_document(source), options=options, images=images)
-    records = _records(capture, findings)
+    _, records = _captured(source, options, findings, images=images)
     return at_image_size(records, findings, source) if images else records
 
 
@@ -154,7 +156,10 @@ class _Capture:
         return None if value is None else int(value)
 
 
-def _document(source: Path) -> Mapping[str, Any]:
+def _captured(
+    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+) -> tuple[_Capture, list[FrameRecord]]:
+    """The document and its frames, but for those without pose or file."""
     # A camera that could not be placed costs its frame, not the capture.
     document = read_json(source, nonfinite_below=("transform_matrix",))
     frames = document.get("frames") if isinstance(document, dict) else None
@@ -163,11 +168,8 @@ def _document(source: Path) -> Mapping[str, Any]:
             f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
             "capture's own document. [capture.format]"
         )
-    return document  # type: ignore[no-any-return]
-
-
-def _records(capture: _Capture, findings: Findings) -> list[FrameRecord]:
-    return [r for f in capture.document["frames"] if (r := _record(capture, f, findings))]
+    capture = _Capture(source=source, document=document, options=options, images=images)
+    return capture, [r for frame in frames if (r := _record(capture, frame, findings))]
 
 
 def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
@@ -234,13 +236,9 @@ def _intrinsics(
     capture: _Capture, frame: Mapping[str, Any], name: str, width: float, height: float
 ) -> tuple[float, float, float, float]:
     fx, fy = capture.positive(frame, "fl_x"), capture.positive(frame, "fl_y")
-    across, up = (
-        capture.positive(frame, "camera_angle_x"),
-        capture.positive(frame, "camera_angle_y"),
-    )
-    if fx is None and across is not None:
+    if fx is None and (across := capture.positive(frame, "camera_angle_x")) is not None:
         fx = width / (2 * math.tan(across / 2))
-    if fy is None and up is not None:
+    if fy is None and (up := capture.positive(frame, "camera_angle_y")) is not None:
         fy = height / (2 * math.tan(up / 2))
     if fx is None or not fx > 0:
         raise capture.refuse(
@@ -254,26 +252,23 @@ def _intrinsics(
 
 def _why_of_another_size(
     capture: _Capture, frame: Mapping[str, Any], width: int, height: int
-) -> str | None:
-    """Why intrinsics without a stated size do not belong to an image of this one, if so."""
-    image = f"the image is {width} x {height} pixels, but its "
+) -> str:
+    """Why intrinsics without a stated size do not belong to an image of this one, "" if they do."""
+    said = ""
     for key, size in (("cx", width), ("cy", height)):
         centre = capture.number(frame, key)
-        if centre is not None and abs(centre - size / 2) > _OFF_CENTRE * size:
-            return (
-                f"{image}{key} is {centre:g}, as of an image of about {2 * centre:.0f} pixels: "
-                "either the images were scaled or the intrinsics"
-            )
+        if not said and centre is not None and abs(centre - size / 2) > _OFF_CENTRE * size:
+            said = f"{key} is {centre:g}, as of an image of about {2 * centre:.0f} pixels"
     for key, angle, size in (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height)):
         focal, across = capture.positive(frame, key), capture.positive(frame, angle)
-        if focal is not None and across is not None:
+        if not said and focal is not None and across is not None:
             stated = 2 * focal * math.tan(across / 2)
             if abs(stated - size) > _OFF_CENTRE * size:
-                return (
-                    f"{image}{key} and {angle} are those of an image of about {stated:.0f} pixels: "
-                    "either the images were scaled or the intrinsics"
-                )
-    return None
+                said = f"{key} and {angle} are those of an image of about {stated:.0f} pixels"
+    return said and (
+        f"the image is {width} x {height} pixels, but its {said}: either the images were scaled or "
+        "the intrinsics"
+    )
 
 
 def _refuse_distortion(capture: _Capture, frame: Mapping[str, Any], name: str) -> None:
@@ -326,17 +321,3 @@ def _objects(capture: _Capture) -> Path | None:
         return capture.options.objects
     path = _beside(capture, "objects", "objects.json")
     return path if "objects" in capture.document or path.is_file() else None
-
-
-def _warn_of_missing_exposure(
-    capture: _Capture, records: list[FrameRecord], findings: Findings
-) -> None:
-    unknown = sum(math.isinf(r.saturation_radiance) for r in records)
-    if unknown:
-        findings.warn(
-            f"{capture.source.name}: {unknown} of {len(records)} frames state no "
-            "saturation_radiance, so clipped pixels pass for radiance. [capture.saturation]"
-        )
-    masks = sum("mask_path" in frame for frame in capture.document["frames"])
-    if masks:
-        findings.warn(f"{capture.source.name}: {masks} mask_path are not used. [capture.mask]")

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual.material import PBRMaterial
@@ -69,8 +68,11 @@ def write_glb(
     scene = trimesh.Scene()
     materials: dict[str, GltfMaterial] = {}
     for surface in surfaces:
-        name = _free_name(surface.name.rsplit("/", 1)[-1], materials)
-        materials[name] = gltf_material(surface, max_size, partial(_told, warn, surface.name))
+        stem = name = surface.name.rsplit("/", 1)[-1]
+        number = 2
+        while name in materials:
+            name, number = f"{stem}_{number}", number + 1
+        materials[name] = gltf_material(surface, max_size, warn)
         pictures = {key: Image.fromarray(p) for key, p in materials[name].pictures.items()}
         dressed = _NamedMaterial(name=name, **pictures)
         scene.add_geometry(_mesh(surface, dressed), geom_name=name, node_name=name)
@@ -87,13 +89,12 @@ def gltf_material(
     surface: Surface, max_size: int | None, warn: Callable[[str], None]
 ) -> GltfMaterial:
     """The material of a surface; ``warn`` is told what glTF cannot say."""
-    material = surface.material
+    material, said = surface.material, f"<{surface.name}>: in .glb"
     base = material.diffuse if material.base is None else material.base
     colour = np.ones(3)
     if surface.corner_colour is not None:
         colour = surface.corner_colour.mean(axis=(0, 1))
-        warn("its display colours become their mean.")
-    pbr: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+        warn(f"{said} its display colours become their mean.")
     pictures: dict[str, Byte] = {}
     if base.shape[:2] == (1, 1):
         colour = colour * base[0, 0]
@@ -101,56 +102,49 @@ def gltf_material(
         # glTF's factors end at 1, and so does what a surface can reflect.
         small = np.minimum(_small(base, max_size), np.float32(1))
         pictures["baseColorTexture"], _, _ = encoded_colour(small)
-    pbr["baseColorFactor"] = [*_numbers(np.clip(colour, 0, 1)), 1.0]
-    _add_roughness(material, max_size, pbr, pictures)
-    numbers: dict[str, Any] = {"pbrMetallicRoughness": pbr, "doubleSided": surface.two_sided}
-    numbers["extensions"] = {IOR: {"ior": _ior(material, warn)}}
+    ior = 1.5  # of metals; of others F0 = ((ior - 1) / (ior + 1))^2
+    if material.metallic is None:
+        if np.ptp(material.f0) > 1e-4:
+            warn(f"{said} its specular colour becomes one index of refraction.")
+        root = math.sqrt(min(float(material.f0.mean()), 0.99))
+        ior = round((1 + root) / (1 - root), 6)
+    factors, packed = _roughness(material, max_size)
+    if packed is not None:
+        pictures["metallicRoughnessTexture"] = packed
+    numbers: dict[str, Any] = {
+        "pbrMetallicRoughness": {
+            **factors,
+            "baseColorFactor": [*map(float, np.clip(colour, 0, 1)), 1.0],
+        },
+        "doubleSided": surface.two_sided,
+        "extensions": {IOR: {"ior": ior}},
+    }
     if material.emits:
-        _add_emission(material.emission, max_size, numbers, pictures)
+        # A colour of at most 1 and its strength: radiance = strength * factor * texture.
+        emission = _small(material.emission, max_size)
+        strength = float(emission.max())
+        factor = np.ones(3)
+        if emission.shape[:2] == (1, 1):
+            factor = emission[0, 0] / strength
+        else:
+            pictures["emissiveTexture"], _, _ = encoded_colour(emission / np.float32(strength))
+        numbers["emissiveFactor"] = [float(value) for value in factor]
+        numbers["extensions"][STRENGTH] = {"emissiveStrength": strength}
     return GltfMaterial(numbers=numbers, pictures=pictures, wrap=material.wrap)
 
 
-def _add_roughness(
-    material: Material, max_size: int | None, pbr: dict[str, Any], pictures: dict[str, Byte]
-) -> None:
-    """glTF's texture: roughness in green, metalness in blue."""
+def _roughness(material: Material, max_size: int | None) -> tuple[dict[str, float], Byte | None]:
+    """glTF's factors, and its texture if one is needed: roughness in green, metalness in blue."""
     metallic = np.zeros((1, 1, 1), np.float32) if material.metallic is None else material.metallic
     if material.roughness.size == 1 and metallic.size == 1:
-        pbr["roughnessFactor"] = float(np.clip(material.roughness.flat[0], 0, 1))
-        pbr["metallicFactor"] = float(np.clip(metallic.flat[0], 0, 1))
-        return
+        factors = {"metallicFactor": metallic, "roughnessFactor": material.roughness}
+        return {key: float(np.clip(x.flat[0], 0, 1)) for key, x in factors.items()}, None
     height, width = np.maximum(material.roughness.shape[:2], metallic.shape[:2])
     size = size_within(int(width), int(height), max_size)
     channels = [np.ones((size[1], size[0], 1), np.float32)]
     channels += [resized(channel, *size)[..., :1] for channel in (material.roughness, metallic)]
     packed = np.clip(np.concatenate(channels, axis=2), 0, 1)
-    pictures["metallicRoughnessTexture"] = encoded_data(packed)[0]
-    pbr["metallicFactor"] = 1.0
-
-
-def _add_emission(
-    emission: Float, max_size: int | None, numbers: dict[str, Any], pictures: dict[str, Byte]
-) -> None:
-    """A colour of at most 1 and its strength: radiance = strength * factor * texture."""
-    if emission.shape[:2] == (1, 1):
-        strength = float(emission.max())
-        numbers["emissiveFactor"] = _numbers(emission[0, 0] / strength)
-    else:
-        small = _small(emission, max_size)
-        strength = float(small.max())
-        numbers["emissiveFactor"] = [1.0, 1.0, 1.0]
-        pictures["emissiveTexture"], _, _ = encoded_colour(small / np.float32(strength))
-    numbers["extensions"][STRENGTH] = {"emissiveStrength": strength}
-
-
-def _ior(material: Material, warn: Callable[[str], None]) -> float:
-    """F0 = ((ior - 1) / (ior + 1))^2, of what is no metal."""
-    if material.metallic is not None:
-        return 1.5
-    if np.ptp(material.f0) > 1e-4:
-        warn("its specular colour becomes one index of refraction.")
-    root = math.sqrt(min(float(material.f0.mean()), 0.99))
-    return round((1 + root) / (1 - root), 6)
+    return {"metallicFactor": 1.0, "roughnessFactor": 1.0}, encoded_data(packed)[0]
 
 
 def _mesh(surface: Surface, material: PBRMaterial) -> Any:
@@ -183,44 +177,30 @@ def _finish(tree: dict[str, Any], *, materials: dict[str, GltfMaterial]) -> None
     samplers: list[dict[str, int]] = []
     for stored in tree["materials"]:
         ours = materials[stored["name"]]
-        textures = {k: v for k, v in stored.items() if k.endswith("Texture")}
-        pbr = stored.get("pbrMetallicRoughness", {})
-        inner = {k: v for k, v in pbr.items() if k.endswith("Texture")}
-        numbers = ours.numbers
-        numbers["pbrMetallicRoughness"] = {**numbers["pbrMetallicRoughness"], **inner}
-        name = stored["name"]
-        stored.clear()
-        stored.update({"name": name, **numbers, **textures})
-        used.update(numbers["extensions"])
+        used.update(ours.numbers["extensions"])
+        inner = _textures(stored.get("pbrMetallicRoughness", {}))
+        finished = {"name": stored["name"], **ours.numbers, **_textures(stored)}
+        finished["pbrMetallicRoughness"] = {**ours.numbers["pbrMetallicRoughness"], **inner}
         mode = _WRAP[ours.wrap]
         sampler = {
             "magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP, "wrapS": mode, "wrapT": mode,
         }  # fmt: skip
-        for reference in (*textures.values(), *inner.values()):
+        for reference in (*_textures(stored).values(), *inner.values()):
             if sampler not in samplers:
                 samplers.append(sampler)
             tree["textures"][reference["index"]]["sampler"] = samplers.index(sampler)
+        stored.clear()
+        stored.update(finished)
     if samplers:
         tree["samplers"] = samplers
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), *used})
+
+
+def _textures(stored: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in stored.items() if key.endswith("Texture")}
 
 
 def _small(image: Float, max_size: int | None) -> Float:
     height, width = image.shape[:2]
     size = size_within(width, height, max_size)
     return image if size == (width, height) else resized(image, *size)
-
-
-def _free_name(name: str, taken: dict[str, GltfMaterial]) -> str:
-    number, free = 2, name
-    while free in taken:
-        free, number = f"{name}_{number}", number + 1
-    return free
-
-
-def _told(warn: Callable[[str], None], name: str, sentence: str) -> None:
-    warn(f"<{name}>: in .glb {sentence}")
-
-
-def _numbers(values: npt.NDArray[Any]) -> list[float]:
-    return [float(value) for value in values]

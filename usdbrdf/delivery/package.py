@@ -1,53 +1,221 @@
-"""Asset folder in, one file out."""
+"""Asset folder in, one file out: the asset composed in one look becomes one layer that needs no
+other, and is packed with its pictures.
+
+What is kept: geometry, the materials bound in that look with their UsdPreviewSurface networks,
+lights, cameras, and the numbers measured. What goes: the other looks, the maps behind them, render
+settings, the photographs, and every path of this machine."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
+from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
+from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
+from usdbrdf.asset.layers.looks import VARIANT_SET as LIGHTS
+from usdbrdf.asset.layers.task_layers import EMISSIVE
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import in_one_line
+from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
-from usdbrdf.delivery.flat_stage import (
-    fit_for_arkit,
-    flattened,
-    lights_of,
-    look_of,
-    stage_in_look,
-    take_materials_literally,
-)
 from usdbrdf.delivery.glb import write_glb
 from usdbrdf.delivery.packaged_files import (
     EXR,
-    PNG,
     NewTexture,
-    PictureOptions,
     add_file,
     add_texture,
     file_in_asset,
-    other_files,
-    replace_files,
     texture_uses,
     use_texture,
 )
-from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsageError, UsdBrdfError
+from usdbrdf.errors import (
+    EnvironmentFailure,
+    InputRefused,
+    OwnershipConflict,
+    UsageError,
+    UsdBrdfError,
+)
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.job.progress import warn
+from usdbrdf.job.stamp import code_version
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions
 
+_PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
+# Properties and schemas that name files of the capture or of other looks.
+_LEFT_OUT = ("usdBrdf:aov:", "usdBrdf:capture:image", "backPlate:")
+_MAPPING = "usdBrdf:fit:mapping"
+_LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", "BackPlateAPI:")
 USDZ, GLB = ".usdz", ".glb"
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
 _PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)
 ARKIT = "arkit"
+
+
+def stage_in_look(asset: Asset, look: str | None = None) -> Usd.Stage:
+    """The asset as everybody opens it, edits included, with a look selected; nothing is written.
+
+    look  None: the one that it opens in, or ``shaded`` where that is no look of the asset
+
+    Raises UsageError for a look that it has not, and InputRefused for layers that lie elsewhere
+    than in the asset's folder, but for the captured geometry that the scan layer refers to.
+    """
+    stage = open_edited(asset)
+    captured = open_weaker(asset, "texturing")  # its layers are valid only as long as it is held
+    known = {os.path.realpath(layer.realPath) for layer in captured.GetUsedLayers()}
+    for layer in (layer for layer in stage.GetUsedLayers() if not layer.anonymous):
+        place = os.path.realpath(layer.realPath)
+        if place not in known and not Path(place).is_relative_to(os.path.realpath(asset.folder)):
+            raise InputRefused(
+                f"{asset.folder}: the layer {place} lies outside of the asset. Copy it into the "
+                "folder, or take it out of edits.usda. [package.outside]"
+            )
+    looks = stage.GetDefaultPrim().GetVariantSet(VARIANT_SET)
+    names = looks.GetVariantNames()
+    if not names:
+        raise InputRefused(
+            f"{asset.folder}: the asset has no look yet. Run usdbrdf convert, which measures its "
+            "textures and materials, first. [package.look]"
+        )
+    if look is not None and look not in names:
+        raise UsageError(f"--look {look}: the asset has {', '.join(names)}. [package.look]")
+    chosen = (look, looks.GetVariantSelection(), SHADED, *names)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    looks.SetVariantSelection(next(name for name in chosen if name in names))
+    return stage
+
+
+def look_of(stage: Usd.Stage) -> str:
+    """The look that is selected in a stage of ``stage_in_look``."""
+    return str(stage.GetDefaultPrim().GetVariantSet(VARIANT_SET).GetVariantSelection())
+
+
+def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Usd.Stage:
+    """All that the stage composes to, as a new stage of one anonymous layer; its asset paths are
+    absolute and have still to be replaced.
+
+    with_lights  False where the package can hold none: then lamps glow by their material, also
+                 where the artist selected lights in their place
+    """
+    # Instances become prims of their own, in the session layer: flattened, prototypes would lie
+    # beside the default prim, and what is bound to an instance would be seen by nobody.
+    while instances := [prim for prim in stage.TraverseAll() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    if not with_lights:
+        prims = stage.TraverseAll()
+        sets = [(prim.GetPath(), prim.GetVariantSet(LIGHTS).GetVariantNames()) for prim in prims]
+        for path in (path for path, names in sets if EMISSIVE in names):
+            if prim := stage.GetPrimAtPath(path):  # the choice above it may have taken it away
+                prim.GetVariantSet(LIGHTS).SetVariantSelection(EMISSIVE)
+    layer = stage.Flatten(addSourceFileComment=False)
+    flat = Usd.Stage.Open(layer)
+    root = flat.GetDefaultPrim()
+    layer.documentation = ""
+    layer.customLayerData = {
+        "usdbrdf": {"role": "package", "version": code_version(), "look": look_of(stage)}
+    }
+    if layer.pseudoRoot.HasInfo("renderSettingsPrimPath"):
+        layer.pseudoRoot.ClearInfo("renderSettingsPrimPath")
+    flat.RemovePrim(Scopes.of(asset).path("render"))
+    info = dict(root.GetAssetInfo())
+    info.pop("identifier", None)  # of the asset in its folder
+    root.SetMetadata("assetInfo", info)
+    _keep_bound_materials(flat)
+    for prim in flat.TraverseAll():
+        for name in [*prim.GetAuthoredPropertyNames()]:
+            if name.startswith(_LEFT_OUT):
+                prim.RemoveProperty(name)
+        schemas = prim.GetMetadata("apiSchemas")
+        if schemas is not None:
+            # A flattened layer has one explicit list.
+            listed = (*schemas.explicitItems, *schemas.prependedItems, *schemas.appendedItems)
+            kept = [name for name in listed if not name.startswith(_LEFT_OUT_SCHEMAS)]
+            prim.SetMetadata("apiSchemas", Sdf.TokenListOp.Create(prependedItems=kept))
+    return flat
+
+
+def lights_of(flat: Usd.Stage) -> list[Usd.Prim]:
+    """All UsdLux lights."""
+    return [prim for prim in flat.TraverseAll() if prim.HasAPI(UsdLux.LightAPI)]
+
+
+def fit_for_arkit(flat: Usd.Stage, warn: Callable[[str], None]) -> None:
+    """Y up, and only what AR Quick Look takes: no cameras, no lights."""
+    root = flat.GetDefaultPrim()
+    lights = lights_of(flat)
+    if lights:
+        warn(f"the ARKit profile holds no lights; left out: {paths_of(lights)}.")
+    cameras = [prim for prim in flat.TraverseAll() if prim.IsA(UsdGeom.Camera)]
+    for path in sorted((prim.GetPath() for prim in [*cameras, *lights]), reverse=True):
+        flat.RemovePrim(path)
+    _remove_empty_scopes(flat)
+    if UsdGeom.GetStageUpAxis(flat) != UsdGeom.Tokens.y:
+        xform = UsdGeom.Xformable(root)
+        if not xform:
+            raise InputRefused(
+                f"<{root.GetPath()}>: the default prim is no Xform, so the scene cannot be turned "
+                "to y up. Wrap it in one. [package.up_axis]"
+            )
+        UsdGeom.SetStageUpAxis(flat, UsdGeom.Tokens.y)
+        # By -90 degrees about x, before all that it does itself.
+        order, reset = xform.GetOrderedXformOps(), xform.GetResetXformStack()
+        turn = xform.AddTransformOp(opSuffix="yUp")
+        turn.Set(Gf.Matrix4d(1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1))
+        xform.SetXformOpOrder([turn, *order], reset)
+
+
+def _keep_bound_materials(flat: Usd.Stage) -> None:
+    """Delete materials that nothing is bound to, and nodes that no UsdPreviewSurface needs."""
+    surfaces = [p for p in flat.TraverseAll() if p.IsA(UsdGeom.Gprim) or p.IsA(UsdGeom.Subset)]
+    found = (
+        UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
+        for prim in surfaces
+        for purpose in _PURPOSES
+    )
+    bound = {material.GetPath() for material in found if material}
+    for prim in list(flat.TraverseAll()):
+        if prim and prim.IsA(UsdShade.Material):
+            if prim.GetPath() in bound:
+                _keep_surface(flat, UsdShade.Material(prim))
+            else:
+                flat.RemovePrim(prim.GetPath())
+    _remove_empty_scopes(flat)
+
+
+def _keep_surface(flat: Usd.Stage, material: UsdShade.Material) -> None:
+    for output in material.GetOutputs():
+        if output.GetFullName() != "outputs:surface":
+            material.GetPrim().RemoveProperty(output.GetFullName())
+    needed: set[Sdf.Path] = set()
+    surface = material.ComputeSurfaceSource()[0]
+    waiting = [surface.GetPrim()] if surface else []
+    while waiting:
+        prim = waiting.pop()
+        needed.update(prim.GetPath().GetPrefixes())
+        for wanted in UsdShade.ConnectableAPI(prim).GetInputs():
+            for source in wanted.GetValueProducingAttributes():
+                if source.GetPrim().GetPath() not in needed:
+                    waiting.append(source.GetPrim())
+    for prim in list(Usd.PrimRange(material.GetPrim(), Usd.PrimAllPrimsPredicate)):
+        if prim and prim.GetPath() not in needed and prim != material.GetPrim():
+            flat.RemovePrim(prim.GetPath())
+
+
+def _remove_empty_scopes(flat: Usd.Stage) -> None:
+    root = flat.GetDefaultPrim()
+    paths = [p.GetPath() for p in flat.TraverseAll() if p.GetTypeName() == "Scope" and p != root]
+    for path in sorted(paths, reverse=True):  # children before their parents
+        if not flat.GetPrimAtPath(path).GetAllChildren():
+            flat.RemovePrim(path)
 
 
 def package(folder: Path, output: Path, options: PackageOptions | None = None) -> dict[str, Any]:
@@ -61,49 +229,57 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     """
     options = options or PackageOptions()
     asset = Asset.made(folder)
-    textures = _texture_options(output, asset, options)
+    options = replace(options, textures=_texture_format(output, asset, options))
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
     with environment_failures(str(output)), _folder_of(output):
         if glb:
-            summary = _write_glb(output, flat, asset, textures)
+            texture_uses(flat, asset)  # refuses what lies outside
+            # Our own reader is to return what renderers are told, not the lobe that is meant by it.
+            for prim in flat.TraverseAll():
+                if prim.HasAttribute(_MAPPING):
+                    prim.RemoveProperty(_MAPPING)
+            turn, subject = turned_up(str(UsdGeom.GetStageUpAxis(flat)), "Y"), asset.root_layer
+            if lights := lights_of(flat):
+                warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
+            surfaces = surfaces_from_stage(flat, Usd.TimeCode.EarliestTime(), warn, subject)
+            moved = [surface.moved(turn) for surface in surfaces]
+            summary = write_glb(output, moved, options.max_size, warn)
         else:
-            summary = _write_usdz(output, flat, asset, textures, options)
+            count = _write_usdz(output, flat, asset, options)
+            summary = {"textures": count, "format": options.textures, "profile": options.profile}
         size = output.stat().st_size
     return {"output": str(output), "look": look_of(stage), "bytes": size, **summary}
 
 
-def _write_usdz(
-    output: Path, flat: Usd.Stage, asset: Asset, textures: PictureOptions, options: PackageOptions
-) -> dict[str, Any]:
+def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOptions) -> int:
+    """Returns the number of textures."""
     if options.profile == ARKIT:
         fit_for_arkit(flat, warn)
     with TemporaryDirectory(prefix="usdbrdf-package-") as name:
         folder = Path(name)
-        packed = _add_textures(flat, asset, folder, textures)
+        textures: dict[tuple[Any, ...], NewTexture] = {}
+        packed: set[str] = set()
+        for use in texture_uses(flat, asset):
+            # Each once, however many nodes read it in the same way.
+            key = (use.file, use.space, use.colour, use.reads_alpha)
+            if key not in textures:
+                form = str(options.textures)
+                textures[key] = add_texture(use, folder, packed, form, options.max_size)
+                packed.add(textures[key].path)
+            use_texture(flat, use, textures[key])
         others: dict[str, str] = {}
-        for path in other_files(flat, packed):
+        for path in sorted(named_files(flat.GetRootLayer()) - {f"./{path}" for path in packed}):
             file, taken = file_in_asset(path, asset), {*packed, *others.values()}
             others[path] = add_file(file, asset.folder.resolve(), folder, taken)
-        replace_files(flat, others)
+        UsdUtils.ModifyAssetPaths(
+            flat.GetRootLayer(), lambda path: f"./{others[path]}" if path in others else path
+        )
         root = f"{asset.name}.usdc"
         export(flat.GetRootLayer(), folder / root, folder=folder)
         write_usdz(output, folder, [root, *sorted({*packed, *others.values()})])
-    return {"textures": len(packed), "format": textures.format, "profile": options.profile}
-
-
-def _write_glb(
-    output: Path, flat: Usd.Stage, asset: Asset, textures: PictureOptions
-) -> dict[str, Any]:
-    texture_uses(flat, asset)  # refuses what lies outside
-    take_materials_literally(flat)
-    turn = turned_up(str(UsdGeom.GetStageUpAxis(flat)), "Y")
-    subject = asset.root_layer
-    if lights := lights_of(flat):
-        warn(f"{subject}: .glb packages hold no lights; left out: {paths_of(lights)}.")
-    surfaces = surfaces_from_stage(flat, Usd.TimeCode.EarliestTime(), warn, subject)
-    return write_glb(output, [s.moved(turn) for s in surfaces], textures.max_size, warn)
+    return len(packed)
 
 
 @contextmanager
@@ -119,20 +295,8 @@ def _folder_of(output: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _add_textures(flat: Usd.Stage, asset: Asset, folder: Path, options: PictureOptions) -> set[str]:
-    """Write each texture once, however many nodes read it in the same way; returns their paths."""
-    done: dict[tuple[Any, ...], NewTexture] = {}
-    for use in texture_uses(flat, asset):
-        key = (use.file, use.space, use.colour, use.reads_alpha)
-        if key not in done:
-            taken = {new.path for new in done.values()}
-            done[key] = add_texture(use, folder, taken, options)
-        use_texture(flat, use, done[key])
-    return {new.path for new in done.values()}
-
-
-def _texture_options(output: Path, asset: Asset, options: PackageOptions) -> PictureOptions:
-    """Everything that can be refused before the asset is opened."""
+def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Literal["exr", "png"]:
+    """Refuses what can be refused before the asset is opened."""
     suffix = output.suffix.lower()
     if suffix not in (USDZ, GLB):
         raise UsageError(f"{output}: packages are {USDZ} or {GLB} files. [package.format]")
@@ -147,8 +311,7 @@ def _texture_options(output: Path, asset: Asset, options: PackageOptions) -> Pic
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")
     asset.refuse_output(output, "package.output")
-    chosen = options.textures or (PNG if eight_bit else EXR)
-    return PictureOptions(format=chosen, max_size=options.max_size)
+    return options.textures or ("png" if eight_bit else "exr")
 
 
 def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
@@ -158,6 +321,8 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
     """
     pinned = time.mktime(_PINNED_TIME)
     with temporary_beside(path) as staged:
+        failed = f"{path}: the package could not be written"
+        remedy = "Free disk space or correct the permission. [package.write]"
         try:
             writer = Sdf.ZipFileWriter.CreateNew(str(staged))
             for member in members:
@@ -165,29 +330,18 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
                 writer.AddFile(str(folder / member), member)
             done = writer.Save()
         except Tf.ErrorException as error:
-            raise EnvironmentFailure(
-                f"{path}: the package could not be written ({in_one_line(error)}). Free disk space "
-                "or correct the permission. [package.write]"
-            ) from error
+            raise EnvironmentFailure(f"{failed} ({in_one_line(error)}). {remedy}") from error
         if not done or not staged.is_file():
-            raise EnvironmentFailure(
-                f"{path}: the package could not be written. Free disk space or correct the "
-                "permission. [package.write]"
-            )
-        _check_package(staged, path)
-        publish(staged, path)
-
-
-def _check_package(staged: Path, path: Path) -> None:
-    stage = Usd.Stage.Open(str(staged))
-    problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
-    for prim in stage.TraverseAll():
-        for attribute in prim.GetAuthoredAttributes():
+            raise EnvironmentFailure(f"{failed}. {remedy}")
+        stage = Usd.Stage.Open(str(staged))
+        problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
+        for attribute in (a for prim in stage.TraverseAll() for a in prim.GetAuthoredAttributes()):
             value = attribute.Get()
             if isinstance(value, Sdf.AssetPath) and value.path and not value.resolvedPath:
                 problems.append(f"<{attribute.GetPath()}> finds no {value.path}")
-    if problems:
-        raise UsdBrdfError(
-            f"{path}: the package does not compose: {problems[0]}. This is a defect of usdbrdf; "
-            "please report it. [package.composition]"
-        )
+        if problems:
+            raise UsdBrdfError(
+                f"{path}: the package does not compose: {problems[0]}. This is a defect of "
+                "usdbrdf; please report it. [package.composition]"
+            )
+        publish(staged, path)

@@ -6,24 +6,23 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdShade, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import named_files
-from usdbrdf.asset.readers.materials import is_srgb, read_texture
+from usdbrdf.asset.readers.surfaces import is_srgb, read_texture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
 from usdbrdf.model.arrays import Byte, Float
 
 Types = Sdf.ValueTypeNames
-EXR, PNG = "exr", "png"
+EXR = "exr"
 # What a package may hold as it is; of these, what has 8 bits already.
 EIGHT_BIT = frozenset({".png", ".jpg", ".jpeg"})
 IMAGES = EIGHT_BIT | {".exr"}
@@ -75,59 +74,51 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
             continue
         value = _produced(shader, "file")
         if isinstance(value, Sdf.AssetPath) and value.path:
-            inputs, outputs = _fed(flat, prim)
+            fed = _fed(prim)
             uses.append(
                 TextureUse(
                     prim_path=str(prim.GetPath()),
                     file=file_in_asset(value.path, asset),
                     space=str(_produced(shader, "sourceColorSpace") or "auto"),
-                    colour=bool(inputs & _COLOURS),
-                    reads_alpha="a" in outputs,
+                    colour=any(name in _COLOURS for name, _ in fed),
+                    reads_alpha=any(output == "a" for _, output in fed),
                 )
             )
     return uses
 
 
-@dataclass(frozen=True, kw_only=True)
-class PictureOptions:
-    """format: "exr" keeps files as they are, "png" makes 8 bits of floats; max_size: of the longer
-    side in pixels, None for any."""
-
-    format: str = EXR
-    max_size: int | None = None
-
-
 def add_texture(
-    use: TextureUse, folder: Path, taken: Collection[str], options: PictureOptions
+    use: TextureUse, folder: Path, taken: Collection[str], format: str, max_size: int | None
 ) -> NewTexture:
     """Write the texture of a node below ``folder``; returns where, and how to read it.
 
-    taken  paths that the package has already
+    taken     paths that the package has already
+    format    "exr" keeps files as they are, "png" makes 8 bits of floats
+    max_size  of the longer side in pixels, None for any
     """
-    _check_is_image(use.file)
+    width, height, channels = _checked_size(use.file)
     source = use.file.suffix.lower()
-    width, height, _ = image_size(use.file)
-    smaller = size_within(width, height, options.max_size)
+    smaller = size_within(width, height, max_size)
     fits = smaller == (width, height)
-    as_it_is = source in EIGHT_BIT or (options.format == EXR and source not in CONVERTED)
+    as_it_is = source in EIGHT_BIT or (format == EXR and source not in CONVERTED)
     if as_it_is and (fits or use.reads_alpha):
-        path = _free(f"textures/{use.file.stem}{source}", taken)
-        _place(folder / path)
+        path = _free(f"textures/{use.file.stem}{source}", taken, folder)
         shutil.copyfile(use.file, folder / path)
         return NewTexture(path=path, space="sRGB" if is_srgb(use.file, use.space) else "raw")
-    if use.reads_alpha and options.format != EXR:
+    if use.reads_alpha and format != EXR:
         raise InputRefused(
             f"{use.file}: its alpha is used, and 8-bit packages keep alpha of PNG files only. Save "
             "it as PNG. [package.alpha]"
         )
     pixels = read_texture(use.file, use.space)
-    if use.reads_alpha:
-        pixels = _with_alpha(pixels, use.file)
+    names = [name.upper() for name in channels]
+    if use.reads_alpha and "A" in names:  # readers take it for 1 where the file has none
+        alpha = np.nan_to_num(read_exr(use.file)[..., names.index("A"), None])
+        pixels = np.concatenate([pixels, alpha], axis=2)
     if not fits:
         pixels = resized(pixels, *smaller)
-    path = _free(f"textures/{use.file.stem}.{options.format}", taken)
-    _place(folder / path)
-    if options.format == EXR:
+    path = _free(f"textures/{use.file.stem}.{format}", taken, folder)
+    if format == EXR:
         write_exr(folder / path, pixels)
         return NewTexture(path=path, space="raw")
     stored, scale, bias = encoded_colour(pixels) if use.colour else encoded_data(pixels)
@@ -138,11 +129,10 @@ def add_texture(
 def add_file(file: Path, below: Path, folder: Path, taken: Collection[str]) -> str:
     """Add a picture that is no texture of a material, such as a dome light's; returns its path in
     the package, which is the one that it has below ``below`` if that is free."""
-    _check_is_image(file)
+    _checked_size(file)
     convert = file.suffix.lower() in CONVERTED
     place = file.relative_to(below)
-    path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken)
-    _place(folder / path)
+    path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken, folder)
     if convert:
         write_exr(folder / path, read_texture(file, "auto"))
     else:
@@ -171,38 +161,26 @@ def size_within(width: int, height: int, max_size: int | None) -> tuple[int, int
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def _with_alpha(colour: Float, file: Path) -> Float:
-    """(H, W, 4), or the colour alone where the file has no alpha: readers take it for 1."""
-    names = [name.upper() for name in image_size(file)[2]]
-    if "A" not in names:
-        return colour
-    alpha = np.nan_to_num(read_exr(file)[..., names.index("A"), None])
-    return np.concatenate([colour, alpha], axis=2)
-
-
-def _check_is_image(file: Path) -> None:
+def _checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
     if file.suffix.lower() not in IMAGES | CONVERTED:
         known = ", ".join(sorted(IMAGES | CONVERTED))
         raise InputRefused(
             f"{file}: packages are made of {known} only. Convert it, or take it out of edits.usda. "
             "[package.format]"
         )
-    image_size(file)  # refuses what only has the name of a picture
+    return image_size(file)  # refuses what only has the name of a picture
 
 
-def _free(path: str, taken: Collection[str]) -> str:
-    """The path, numbered where it is taken; names that differ in case only count as equal."""
+def _free(path: str, taken: Collection[str], folder: Path) -> str:
+    """The path, numbered where it is taken, with the folders above it made below ``folder``; names
+    that differ in case only count as equal."""
     used = {name.lower() for name in taken}
     stem, dot, suffix = path.rpartition(".")
     number, free = 2, path
     while free.lower() in used:
-        free = f"{stem}_{number}{dot}{suffix}"
-        number += 1
+        free, number = f"{stem}_{number}{dot}{suffix}", number + 1
+    (folder / free).parent.mkdir(parents=True, exist_ok=True)
     return free
-
-
-def _place(path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
@@ -222,18 +200,6 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
         if fallback is not None:
             stored = [(fallback[i] - new.bias) / new.scale for i in range(3)]
             _set(shader, "fallback", Types.Float4, Gf.Vec4f(*stored, fallback[3]))
-
-
-def other_files(flat: Usd.Stage, done: Collection[str]) -> list[str]:
-    """All asset paths of the stage, in attributes and metadata, but for those in ``done``."""
-    return sorted(named_files(flat.GetRootLayer()) - {f"./{path}" for path in done})
-
-
-def replace_files(flat: Usd.Stage, new: Mapping[str, str]) -> None:
-    """Give asset paths other values: paths inside the package."""
-    UsdUtils.ModifyAssetPaths(
-        flat.GetRootLayer(), lambda path: f"./{new[path]}" if path in new else path
-    )
 
 
 def file_in_asset(path: str, asset: Asset) -> Path:
@@ -272,17 +238,16 @@ def _set(shader: UsdShade.Shader, name: str, type_name: Sdf.ValueTypeName, value
     own.Set(value)
 
 
-def _fed(flat: Usd.Stage, texture: Usd.Prim) -> tuple[set[str], set[str]]:
-    """Inputs of surfaces in the same material that the texture feeds, and which of its outputs."""
-    inputs, outputs = set(), set()
+def _fed(texture: Usd.Prim) -> list[tuple[str, str]]:
+    """Inputs in the same material that the texture feeds, each with which of its outputs."""
     material = texture.GetParent()
     while material.GetParent() and not material.IsA(UsdShade.Material):
         material = material.GetParent()
-    for prim in Usd.PrimRange(material):
-        shader = UsdShade.Shader(prim)
-        for wanted in shader.GetInputs() if shader else []:
-            for source in wanted.GetValueProducingAttributes():
-                if source.GetPrim() == texture:
-                    inputs.add(wanted.GetBaseName())
-                    outputs.add(source.GetName().split(":")[-1])
-    return inputs, outputs
+    shaders = [UsdShade.Shader(prim) for prim in Usd.PrimRange(material)]
+    inputs = [each for shader in shaders if shader for each in shader.GetInputs()]
+    return [
+        (wanted.GetBaseName(), source.GetName().split(":")[-1])
+        for wanted in inputs
+        for source in wanted.GetValueProducingAttributes()
+        if source.GetPrim() == texture
+    ]

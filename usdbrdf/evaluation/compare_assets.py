@@ -5,20 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.previews import camera_hits
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.maps import AssetMaps, camera_hits
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.errors import InputRefused
-from usdbrdf.evaluation.metrics import MapError, map_error
+from usdbrdf.evaluation.evaluate_views import measured_atlas
+from usdbrdf.evaluation.metrics import MIN_SAMPLES, MapError, map_error
 from usdbrdf.evaluation.report import FILES, Row, files_of, magma, output_folder, sheet, table_text
-from usdbrdf.evaluation.truth import MIN_SAMPLES
-from usdbrdf.evaluation.viewed_asset import measured_atlas
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.documents import write_json
@@ -26,7 +23,7 @@ from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Bool, Byte, Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.scene import Scene, SceneObject
+from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -42,18 +39,11 @@ _CAMERAS, _MAX_WIDTH = 4, 480
 _FULL_ERROR = 0.25
 
 
-class MapNames(NamedTuple):
-    """Which maps are the diffuse radiance, the irradiance and the albedo."""
-
-    radiance: str
-    irradiance: str
-    albedo: str
-
-
-# As textured, and after the specular light was taken out of it.
+# As textured, and after the specular light was taken out of it: the maps of the diffuse radiance,
+# the irradiance and the albedo.
 _SETS = {
-    "lit": MapNames(radiance="lit", irradiance="irradiance", albedo="albedo"),
-    "diffuse": MapNames(radiance="diffuse", irradiance="refined_irradiance", albedo="base_color"),
+    "lit": ("lit", "irradiance", "albedo"),
+    "diffuse": ("diffuse", "refined_irradiance", "base_color"),
 }
 
 
@@ -71,7 +61,6 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
     """
     (place_a, a), (place_b, b) = measured_atlas(Path(first)), measured_atlas(Path(second))
     with output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
-        sets = {key: maps for key, maps in _SETS.items() if _in_both(a, b, maps)}
         forth, back = matched(a, b), matched(b, a)
         if not (forth[1].any() and back[1].any()):
             raise InputRefused(
@@ -87,13 +76,15 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
             "missing": [list(forth[0].missing), list(back[0].missing)],
         }
         rows: list[Row] = []
-        for key, maps in sets.items():
-            pair = relit(a, b, *forth, maps), relit(b, a, *back, maps)
+        for key, maps in _SETS.items():
+            if not all(atlas.has(name) for atlas in (a, b) for name in maps):
+                continue
+            pair = relit(a, b, forth, maps), relit(b, a, back, maps)
             errors = _errors(*pair, forth[1], back[1])
             found[key] = {name: error._asdict() for name, error in errors.items()}
             rows += _object_rows(key, *pair)
         write_text_atomic(work / "comparison.csv", table_text(rows))
-        write_pictures(work / "pictures", *pair, frames_from_stage(a.stage))
+        _write_pictures(work / "pictures", *pair, frames_from_stage(a.stage))
         found["objects"] = rows
         found[FILES] = [*files_of(work), DOCUMENT]
         write_json(work / DOCUMENT, found)
@@ -104,11 +95,11 @@ def comparison_line(found: dict[str, Any]) -> str:
     """One line for people, of the last set of maps."""
     key = next(key for key in reversed(_SETS) if key in found)
     titles = {"albedo": "albedo", "relit_a": "S_A rho_B", "relit_b": "S_B rho_A"}
-    parts = [
-        f"{title} {_percent(found[key][name]['nrmse'])} "
-        f"(median {_percent(found[key][name]['median_abs_relative'])})"
-        for name, title in titles.items()
-    ]
+    parts = []
+    for name, title in titles.items():
+        values = (found[key][name][figure] for figure in ("nrmse", "median_abs_relative"))
+        whole, median = ("unknown" if x is None else f"{100 * x:.2f} %" for x in values)
+        parts.append(f"{title} {whole} (median {median})")
     return f"{found['texels']:,} texels, NRMSE of {key}: {', '.join(parts)}"
 
 
@@ -117,20 +108,13 @@ def figures(found: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key not in ("objects", FILES)}
 
 
-def _percent(value: float | None) -> str:
-    return "unknown" if value is None else f"{100 * value:.2f} %"
-
-
-def _in_both(a: AssetMaps, b: AssetMaps, maps: MapNames) -> bool:
-    return all(x.has(name) for x in (a, b) for name in maps)
-
-
 def _errors(forth: Relit, back: Relit, own: Bool, theirs: Bool) -> dict[str, MapError]:
     """Over some texels of A (T,), and of B (T',)."""
+    area, other_area = forth.atlas.texels.area, back.atlas.texels.area
     return {
-        "albedo": forth.albedo_error(own),
-        "relit_a": forth.radiance_error(own),
-        "relit_b": back.radiance_error(theirs),
+        "albedo": map_error(forth.other_albedo, forth.albedo, area, own),
+        "relit_a": map_error(forth.predicted, forth.measured, area, own),
+        "relit_b": map_error(back.predicted, back.measured, other_area, theirs),
     }
 
 
@@ -163,49 +147,42 @@ class Relit:
     other_albedo: Float
     scored: Bool
 
-    def albedo_error(self, part: Bool) -> MapError:
-        """Of the other asset's albedo against this one's, over the texels of ``part``."""
-        return map_error(self.other_albedo, self.albedo, self.atlas.texels.area, part)
-
-    def radiance_error(self, part: Bool) -> MapError:
-        """Of the predicted radiance against the measured one, over the texels of ``part``."""
-        return map_error(self.predicted, self.measured, self.atlas.texels.area, part)
-
 
 def matched(atlas: AssetMaps, other: AssetMaps) -> tuple[Correspondence, Bool]:
     """The other asset's texels on those of ``atlas``, and which are compared: (T,) bool, seen at
     least three times, inside a triangle and without emission, in both."""
-    same = correspondence(atlas.scene, atlas.texels, other.scene, other.texels)
-    there = np.asarray(same.nearest(_comparable(other)), np.bool_)
-    return same, _comparable(atlas) & there & same.known()
+    comparable = []
+    for each in (atlas, other):
+        seen = each.map("samples")[:, 0] >= MIN_SAMPLES
+        emits = (each.map_where_present("emission", 3) > 0).any(axis=1)
+        comparable.append(seen & ~emits & each.texels.interior)
+    same = correspondence(atlas, other)
+    scored = comparable[0] & comparable[1][np.maximum(same.texel, 0)] & (same.texel >= 0)
+    return same, np.asarray(scored, np.bool_)
 
 
 def relit(
-    atlas: AssetMaps, other: AssetMaps, same: Correspondence, scored: Bool, maps: MapNames
+    atlas: AssetMaps, other: AssetMaps, match: tuple[Correspondence, Bool], maps: tuple[str, ...]
 ) -> Relit:
-    """Predict the radiance of ``atlas`` with the albedo of ``other``."""
-    theirs = same.interpolated(other.map_where_present(maps.albedo, 3))
-    measured = atlas.map_where_present(maps.radiance, 3)
-    reflected = atlas.map(maps.irradiance) * theirs / np.pi
+    """Predict the radiance of ``atlas`` with the albedo of ``other`` where they are ``matched``;
+    maps: of ``_SETS``."""
+    (same, scored), (radiance, irradiance, albedo) = match, maps
+    theirs = same.interpolated(other.map_where_present(albedo, 3))
+    measured = atlas.map_where_present(radiance, 3)
+    reflected = atlas.map(irradiance) * theirs / np.pi
     # Lamps are given: what is predicted is what they light.
     emits = atlas.map_where_present("emission", 3).any(axis=1, keepdims=True)
     return Relit(
         atlas=atlas,
         measured=measured,
         predicted=np.where(emits, measured, reflected).astype(np.float32),
-        albedo=atlas.map_where_present(maps.albedo, 3),
+        albedo=atlas.map_where_present(albedo, 3),
         other_albedo=theirs,
         scored=scored,
     )
 
 
-def _comparable(atlas: AssetMaps) -> Bool:
-    seen = atlas.map("samples")[:, 0] >= MIN_SAMPLES
-    emits = (atlas.map_where_present("emission", 3) > 0).any(axis=1)
-    return np.asarray(seen & ~emits & atlas.texels.interior, np.bool_)
-
-
-def write_pictures(folder: Path, forth: Relit, back: Relit, frames: Frames) -> None:
+def _write_pictures(folder: Path, forth: Relit, back: Relit, frames: Frames) -> None:
     """A sheet for each of four cameras spread over ``frames``. Its rows: radiance of asset A
     measured, predicted, error; the same of asset B; albedo of A, of B, difference."""
     folder.mkdir()
@@ -218,11 +195,10 @@ def write_pictures(folder: Path, forth: Relit, back: Relit, frames: Frames) -> N
         size = max(1, round(scale * width)), max(1, round(scale * height))
         hits = [camera_hits(rays, frames, int(i), *size) for rays in scenes]
         rows = [
-            _row(relit, seen, size, (relit.measured, relit.predicted), exposure)
-            for relit, seen, exposure in zip((forth, back), hits, shown, strict=True)
+            _row(forth, hits[0], size, (forth.measured, forth.predicted), shown[0]),
+            _row(back, hits[1], size, (back.measured, back.predicted), shown[1]),
+            _row(forth, hits[0], size, (forth.albedo, forth.other_albedo), 1.0),
         ]
-        albedos = forth.albedo, forth.other_albedo
-        rows.append(_row(forth, hits[0], size, albedos, 1.0))
         write_preview_png(folder / f"{int(i):04d}.png", sheet(rows))
 
 
@@ -230,82 +206,73 @@ def _row(
     relit: Relit, hits: Hits, size: tuple[int, int], maps: tuple[Float, Float], exposure: float
 ) -> list[Byte]:
     """Reference, what is compared with it, and the error relative to the reference."""
-    width, height = size
-    reference, values = (_seen(relit, hits, m).reshape(height, width, 3) for m in maps)
     scored = np.repeat(relit.scored[:, None], 3, axis=1).astype(np.float32)
-    counted = _seen(relit, hits, scored)[:, 0].reshape(height, width) > 0.5
+    texels, owner = relit.atlas.texels, relit.atlas.scene.face_object
+    textures = (surface_texture(texels, owner, values) for values in (*maps, scored))
+    seen = (texture.at(hits.face, hits.u, hits.v) for texture in textures)
+    reference, values, share = (each.reshape(*size[::-1], 3) for each in seen)
+    counted = share[..., 0] > 0.5
     error = np.abs(values - reference).mean(axis=2)
     relative = error / np.maximum(reference.mean(axis=2), 1e-6)
     pictures = [to_display_srgb8(m, exposure_scale=exposure) for m in (reference, values)]
     return [*pictures, magma((relative / _FULL_ERROR).astype(np.float32), counted)]
 
 
-def _seen(relit: Relit, hits: Hits, values: Float) -> Float:
-    texture = surface_texture(relit.atlas.texels, relit.atlas.scene.face_object, values)
-    return texture.at(hits.face, hits.u, hits.v)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Correspondence:
     """For each texel (T,) of one asset: the texel of the other there (-1: none); and where the
-    triangles agree but the atlases do not, the other's face with barycentric u, v, else -1.
+    triangles agree but the atlases do not, the other's face, else -1; barycentric (T, 3) in it.
 
     missing  identifiers of the objects that the other asset does not have
     """
 
-    other: Texels
-    other_face_object: Int
+    other: AssetMaps
     texel: Int
     face: Int
-    u: Float
-    v: Float
+    barycentric: Float
     missing: tuple[str, ...]
-
-    def known(self) -> Bool:
-        """(T,) bool: the other asset has something there."""
-        return np.asarray(self.texel >= 0, np.bool_)
-
-    def nearest(self, values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-        """The other asset's values (T', ...) in its nearest texel; the first's where unknown."""
-        return values[np.maximum(self.texel, 0)]
 
     def interpolated(self, values: Float) -> Float:
         """The other asset's values (T', 3), bilinear where its atlas differs; 0 where unknown."""
-        found = np.where(self.known()[:, None], values[np.maximum(self.texel, 0)], 0)
+        found = np.where((self.texel >= 0)[:, None], values[np.maximum(self.texel, 0)], 0)
         between = self.face >= 0
         if between.any():
-            texture = surface_texture(self.other, self.other_face_object, values)
-            found[between] = texture.at(self.face[between], self.u[between], self.v[between])
+            texture = surface_texture(self.other.texels, self.other.scene.face_object, values)
+            u, v = (self.barycentric[between, i] for i in (1, 2))
+            found[between] = texture.at(self.face[between], u, v)
         return np.asarray(found, np.float32)
 
 
-def correspondence(
-    scene: Scene, texels: Texels, other_scene: Scene, other: Texels
-) -> Correspondence:
-    """Find the texels of ``other`` at those of ``texels``; objects go by identifier, then label.
+def correspondence(atlas: AssetMaps, other: AssetMaps) -> Correspondence:
+    """Find the texels of ``other`` at those of ``atlas``; objects go by identifier, then label.
 
     Triangle by triangle where an object has the same ones in both, else by the nearest texel of the
     same object within two texels. InputRefused where the assets share no object or no surface.
     """
-    count = len(texels)
-    texel, face = (np.full(count, -1, np.int32) for _ in range(2))
+    scene, texels = atlas.scene, atlas.texels
+    texel, face = (np.full(len(texels), -1, np.int32) for _ in range(2))
     missing = []
     for i, obj in enumerate(scene.objects):
         own = texels.of_object(i)
-        j = _same_object(obj, other_scene.objects)
+        j = None
+        for key in ("label", "identifier"):  # of which the last counts more
+            names = [getattr(each, key) for each in other.scene.objects]
+            if names.count(getattr(obj, key)) == 1:
+                j = names.index(getattr(obj, key))
         if j is None:
             missing.append(obj.identifier)
-        elif not _same_triangles(scene, i, other_scene, j):
-            texel[own] = _nearby(texels, i, other, j)
-        elif _same_atlas(scene, texels, i, other_scene, other, j):
-            texel[own] = np.arange(*other.of_object(j).indices(len(other)), dtype=np.int32)
+        elif not _same_triangles(scene, i, other.scene, j):
+            texel[own] = _nearest(texels, i, other.texels, j)
+        elif _same_atlas(atlas, i, other, j):
+            theirs = other.texels.of_object(j)
+            texel[own] = np.arange(theirs.start, theirs.stop, dtype=np.int32)
         else:
-            first = scene.objects[i].first_face
-            face[own] = texels.face[own] - first + other_scene.objects[j].first_face
-            texel[own] = _texel_at(other, j, face[own], texels.barycentric[own])
+            shift = other.scene.objects[j].first_face - obj.first_face
+            face[own] = texels.face[own] + shift
+            texel[own] = _texel_at(other.texels, j, face[own], texels.barycentric[own])
     if len(missing) == len(scene.objects):
         raise InputRefused(
-            f"the assets share no object: one has {_some(scene)}, the other {_some(other_scene)}. "
+            f"the assets share no object: one has {_some(scene)}, the other {_some(other.scene)}. "
             "Compare two assets of one scene. [compare.objects]"
         )
     if not (texel >= 0).any():
@@ -314,22 +281,8 @@ def correspondence(
             "two texels. Compare two assets of one scene in one frame. [compare.surface]"
         )
     return Correspondence(
-        other=other,
-        other_face_object=other_scene.face_object,
-        texel=texel,
-        face=face,
-        u=np.ascontiguousarray(texels.barycentric[:, 1]),
-        v=np.ascontiguousarray(texels.barycentric[:, 2]),
-        missing=tuple(missing),
+        other=other, texel=texel, face=face, barycentric=texels.barycentric, missing=tuple(missing)
     )
-
-
-def _same_object(obj: SceneObject, others: tuple[SceneObject, ...]) -> int | None:
-    for key in ("identifier", "label"):
-        names = [getattr(other, key) for other in others]
-        if names.count(getattr(obj, key)) == 1:
-            return names.index(getattr(obj, key))
-    return None
 
 
 def _same_triangles(scene: Scene, i: int, other: Scene, j: int) -> bool:
@@ -339,17 +292,15 @@ def _same_triangles(scene: Scene, i: int, other: Scene, j: int) -> bool:
     return ours.shape == theirs.shape and bool(np.abs(ours - theirs).max() <= limit)
 
 
-def _same_atlas(
-    scene: Scene, texels: Texels, i: int, other_scene: Scene, other: Texels, j: int
-) -> bool:
-    def table(scene: Scene, texels: Texels, k: int) -> tuple[npt.NDArray[np.int64], Float]:
-        own = texels.of_object(k)
-        pixel = texels.pixel[own] - texels.first_pixel[k]
-        face = texels.face[own] - scene.objects[k].first_face
-        return np.stack([pixel, face]), texels.barycentric[own]
-
-    (ours, weights), (theirs, other_weights) = table(scene, texels, i), table(other_scene, other, j)
-    return np.array_equal(ours, theirs) and np.allclose(weights, other_weights, atol=1e-3)
+def _same_atlas(atlas: AssetMaps, i: int, other: AssetMaps, j: int) -> bool:
+    tables, weights = [], []
+    for each, k in ((atlas, i), (other, j)):
+        own = each.texels.of_object(k)
+        pixel = each.texels.pixel[own] - each.texels.first_pixel[k]
+        tables.append(np.stack([pixel, each.texels.face[own] - each.scene.objects[k].first_face]))
+        weights.append(each.texels.barycentric[own])
+    same = np.array_equal(tables[0], tables[1])
+    return same and np.allclose(weights[0], weights[1], atol=1e-3)
 
 
 def _texel_at(texels: Texels, index: int, face: Int, barycentric: Float) -> Int:
@@ -361,7 +312,7 @@ def _texel_at(texels: Texels, index: int, face: Int, barycentric: Float) -> Int:
     return found
 
 
-def _nearby(texels: Texels, i: int, other: Texels, j: int) -> Int:
+def _nearest(texels: Texels, i: int, other: Texels, j: int) -> Int:
     own, theirs = texels.of_object(i), other.of_object(j)
     if own.stop == own.start or theirs.stop == theirs.start:
         return np.full(own.stop - own.start, -1, np.int32)

@@ -1,5 +1,10 @@
-"""Views of an asset predicted, by the diffuse baseline and by the full model, and compared with
-photographs: a row of figures and a sheet of pictures per view, and what is said of all of them."""
+"""Views of an asset predicted by the paper's image model (eq. 1, 2) and by its baseline, and
+compared with photographs: a row of figures and a sheet of pictures per view, and what is said of
+all of them.
+
+baseline   I = L_d                          the lit texture, the same from everywhere
+full       I = diffuse + I_nd(phi, psi)     one specular bounce of the lit texture
+"""
 
 from __future__ import annotations
 
@@ -12,42 +17,33 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
-from usdbrdf.evaluation.metrics import Pair, finite, flip_maps, psnr, relative_l2
-from usdbrdf.evaluation.report import (
-    FILES,
-    Row,
-    change,
-    files_of,
-    magma,
-    output_folder,
-    sheet,
-    summary_of_views,
-    table_text,
-    write_plot,
-)
-from usdbrdf.evaluation.truth import compare_with_truth
-from usdbrdf.evaluation.viewed_asset import (
-    PredictedView,
-    Quality,
-    ViewedAsset,
-    map_or,
-    measured_atlas,
-    predict_view,
-    viewed_asset,
-)
+from usdbrdf.errors import InputRefused
+from usdbrdf.evaluation import metrics, report
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.colour import display_exposure, to_display_srgb
 from usdbrdf.files.documents import write_json
-from usdbrdf.files.frames import FramePixels, read_frame
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Bool, Byte, Float
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions
+from usdbrdf.transport.environment import environment_from_file
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
+from usdbrdf.transport.lobe_radiance import lobe_radiance
+from usdbrdf.transport.surface_texture import SurfaceTexture
 
 DOCUMENT = "evaluation.json"
 MODELS = ("baseline", "full")
+# Surface points of a picture at once: what bounds the memory.
+_POINTS_AT_ONCE = 1 << 20
 # Cameras and renderers smear a lamp over this many pixels around it.
 _LAMP_MARGIN = 2
 # Pixels of all photographs together that the exposure is taken from, at most.
@@ -70,20 +66,19 @@ def evaluate(
     """
     chosen = options or EvaluateOptions()
     place, atlas = measured_atlas(Path(asset))
-    with output_folder(Path(output), DOCUMENT, (place,)) as work:
+    with report.output_folder(Path(output), DOCUMENT, (place,)) as work:
         known = {}
         if chosen.truth is not None:
-            albedo = map_or(atlas, "base_color", "albedo")
-            known = {"truth": compare_with_truth(atlas, chosen.truth, chosen.mesh, albedo)}
+            albedo = _map_or(atlas, "base_color", "albedo")
+            known = {"truth": metrics.compare_with_truth(atlas, chosen.truth, chosen.mesh, albedo)}
         photographs = photographs_of_views(
             Path(views), place, atlas.stage, atlas.scene, chosen.allow_outside
         )
         exposure = exposure_of_views(photographs.frames)
-        quality = Quality(per_side=chosen.per_side, rays=chosen.rays, seed=chosen.seed)
         seen = viewed_asset(place, atlas, chosen.environment)
-        rows = score_views(work / "pictures", seen, photographs, exposure, quality)
-        write_text_atomic(work / "evaluation.csv", table_text(rows))
-        write_plot(work / "evaluation.png", rows)
+        rows = score_views(work / "pictures", seen, photographs, exposure, chosen)
+        write_text_atomic(work / "evaluation.csv", report.table_text(rows))
+        report.write_plot(work / "evaluation.png", rows)
         found = {
             "asset": place.name,
             "views": Path(views).name,
@@ -91,14 +86,25 @@ def evaluate(
             "rays": chosen.rays,
             "seed": chosen.seed,
             "exposure": exposure,
-            "diffuse_map": map_or(atlas, "diffuse", "lit"),
-            "summary": summary_of_views(rows),
+            "diffuse_map": _map_or(atlas, "diffuse", "lit"),
+            "summary": report.summary_of_views(rows),
             "frames": rows,
             **known,
-            FILES: [*files_of(work), DOCUMENT],
+            report.FILES: [*report.files_of(work), DOCUMENT],
         }
         write_json(work / DOCUMENT, found)
     return found
+
+
+def measured_atlas(folder: Path) -> tuple[Asset, AssetMaps]:
+    """The maps of an asset that all steps have been through, without the artist's layer."""
+    asset = Asset.made(folder)
+    return asset, AssetMaps(open_measured(asset))
+
+
+def _map_or(atlas: AssetMaps, aov: str, otherwise: str) -> str:
+    """The name of the first map where the asset has it, else of the second."""
+    return aov if atlas.has(aov) else otherwise
 
 
 def exposure_of_views(frames: Frames) -> float:
@@ -112,8 +118,8 @@ def exposure_of_views(frames: Frames) -> float:
 
 
 def score_views(
-    folder: Path, seen: ViewedAsset, views: Views, exposure: float, quality: Quality
-) -> list[Row]:
+    folder: Path, seen: ViewedAsset, views: Views, exposure: float, options: EvaluateOptions
+) -> list[report.Row]:
     """A row per view; a sheet per view and FLIP maps per model are written to ``folder``.
 
     Rows hold, per model, relative L2 without lamps, with them, and without them after radiance
@@ -123,14 +129,20 @@ def score_views(
     photograph before FLIP. Infinite PSNR (equal pictures) is None.
     """
     folder.mkdir()
-    rows: list[Row] = []
-    for batch in _batches(seen, views, exposure, quality):
-        pairs = [Pair(v.reference, v.shown[model]) for v in batch for model in MODELS]
-        maps = iter(flip_maps(pairs, f"{len(batch)} views"))
+    rows: list[report.Row] = []
+    for batch in _batches(seen, views, exposure, options):
+        pairs = [
+            metrics.Pair(view.reference, view.shown[model]) for view in batch for model in MODELS
+        ]
+        maps = iter(metrics.flip_maps(pairs, f"{len(batch)} views"))
         for view in batch:
             errors = {model: next(maps) for model in MODELS}
-            flips = {f"flip_{model}": _mean(errors[model][view.counted]) for model in MODELS}
-            rows.append({**view.row, **flips})
+            row = dict(view.row)
+            for model in MODELS:
+                values = errors[model][view.counted]
+                mean = values.mean(dtype=np.float64) if values.size else np.nan
+                row[f"flip_{model}"] = metrics.finite(mean)
+            rows.append(row)
             _write_pictures(folder, view, errors)
     return rows
 
@@ -140,21 +152,40 @@ class _Scored:
     """A view that waits for FLIP: its row without it, display pictures in [0, 1], the pixels that
     count."""
 
-    row: Row
+    row: report.Row
     reference: Float
     shown: dict[str, Float]
     counted: Bool
 
 
 def _batches(
-    seen: ViewedAsset, views: Views, exposure: float, quality: Quality
+    seen: ViewedAsset, views: Views, exposure: float, options: EvaluateOptions
 ) -> Iterator[list[_Scored]]:
     waiting: list[_Scored] = []
     frames = views.frames
     for i in progress(range(len(frames)), total=len(frames), label="evaluate", unit="views"):
-        seeded = quality._replace(seed=quality.seed + (i << 16))
-        predicted = predict_view(seen, frames.camera(i), seeded)
-        waiting.append(_scored(i, views.names[i], predicted, read_frame(frames, i), exposure))
+        predicted = predict_view(seen, frames.camera(i), options, options.seed + (i << 16))
+        photograph = read_frame(frames, i)
+        counted = photograph.valid & predicted.surface
+        measured = photograph.radiance
+        reference = to_display_srgb(np.nan_to_num(measured), exposure_scale=exposure)
+        dim = counted & ~ndimage.binary_dilation(predicted.lamp, np.ones((3, 3)), _LAMP_MARGIN)
+        shown = {}
+        row: dict[str, Any] = {"number": i, "view": views.names[i]}
+        for model, image in zip(MODELS, (predicted.baseline, predicted.full), strict=True):
+            display = to_display_srgb(image, exposure_scale=exposure)
+            cut, cut_measured = (np.minimum(x * exposure, 1) for x in (image, measured))
+            scores = {
+                "l2": metrics.relative_l2(image, measured, dim),
+                "l2_with_lamps": metrics.relative_l2(image, measured, counted),
+                "l2_shown": metrics.relative_l2(cut, cut_measured, dim),
+                "psnr": metrics.psnr(display, reference, counted),
+            }
+            row.update({f"{key}_{model}": metrics.finite(x) for key, x in scores.items()})
+            shown[model] = np.where(counted[..., None], display, reference)
+        row["compared"] = metrics.finite(counted.mean())
+        row["lamps"] = metrics.finite(predicted.lamp.mean())
+        waiting.append(_Scored(row=row, reference=reference, shown=shown, counted=counted))
         if sum(scored.counted.size for scored in waiting) >= _WAITING_PIXELS:
             yield waiting
             waiting = []
@@ -162,43 +193,108 @@ def _batches(
         yield waiting
 
 
-def _scored(
-    number: int, name: str, predicted: PredictedView, photograph: FramePixels, exposure: float
-) -> _Scored:
-    counted = photograph.valid & predicted.surface
-    measured = photograph.radiance
-    reference = to_display_srgb(np.nan_to_num(measured), exposure_scale=exposure)
-    dim = counted & ~ndimage.binary_dilation(predicted.lamp, np.ones((3, 3)), _LAMP_MARGIN)
-    shown = {}
-    row: dict[str, Any] = {"number": number, "view": name}
-    for model, image in zip(MODELS, (predicted.baseline, predicted.full), strict=True):
-        display = to_display_srgb(image, exposure_scale=exposure)
-        cut, cut_measured = (np.minimum(x * exposure, 1) for x in (image, measured))
-        row[f"l2_{model}"] = finite(relative_l2(image, measured, dim))
-        row[f"l2_with_lamps_{model}"] = finite(relative_l2(image, measured, counted))
-        row[f"l2_shown_{model}"] = finite(relative_l2(cut, cut_measured, dim))
-        row[f"psnr_{model}"] = finite(psnr(display, reference, counted))
-        shown[model] = np.where(counted[..., None], display, reference)
-    row["compared"] = finite(counted.mean())
-    row["lamps"] = finite(predicted.lamp.mean())
-    return _Scored(row=row, reference=reference, shown=shown, counted=counted)
-
-
 def _write_pictures(folder: Path, view: _Scored, errors: dict[str, Float]) -> None:
     """NAME.png: photograph, baseline, full above what changed and their FLIP maps; and the maps."""
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(view.row["view"]).stem)[:80]
     name = f"{view.row['number']:04d}_{stem}"
-    maps = {model: magma(errors[model], view.counted) for model in MODELS}
+    maps = {model: report.magma(errors[model], view.counted) for model in MODELS}
     for model, picture in maps.items():
         write_preview_png(folder / f"{name}.flip_{model}.png", picture)
-    above = [_bytes(view.reference), *(_bytes(view.shown[model]) for model in MODELS)]
-    changed = change(errors["baseline"], errors["full"], view.counted)
-    write_preview_png(folder / f"{name}.png", sheet([above, [changed, *maps.values()]]))
+    displayed = (view.reference, *(view.shown[model] for model in MODELS))
+    above = [(picture * 255 + 0.5).astype(np.uint8) for picture in displayed]
+    changed = report.change(errors["baseline"], errors["full"], view.counted)
+    write_preview_png(folder / f"{name}.png", report.sheet([above, [changed, *maps.values()]]))
 
 
-def _bytes(display: Float) -> Byte:
-    return (display * 255 + 0.5).astype(np.uint8)
+@dataclass(frozen=True, kw_only=True)
+class ViewedAsset:
+    """What is seen: the scene with its light; L_d, and L_d without specular light, on the surface;
+    the lobe of each object, (num_objects,), NaN for none."""
+
+    lit: LitScene
+    measured: SurfaceTexture
+    diffuse: SurfaceTexture
+    phi: Float
+    psi: Float
 
 
-def _mean(values: Float) -> float | None:
-    return finite(values.mean(dtype=np.float64)) if values.size else None
+def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Path | None) -> ViewedAsset:
+    """Its light, its diffuse radiance (``diffuse``, else ``lit``), its lobes as the fit left them.
+
+    environment  latitude-longitude picture of the surroundings, None: black
+    """
+    read = [read_fit(atlas.stage, obj.prim_path) for obj in atlas.scene.objects]
+    fits = [fit for fit in read if fit is not None]
+    if len(fits) < len(read):
+        raise InputRefused(
+            f"{asset.folder}: its objects have no roughness and specular yet. Run `usdbrdf fit` "
+            "first. [asset.incomplete]"
+        )
+    up_axis = read_header(asset.layer("scan")).up_axis
+    lit = atlas.lit_scene(environment_from_file(environment, up_axis))
+    diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
+    return ViewedAsset(
+        lit=lit,
+        measured=lit.radiance.showing(atlas.texels, atlas.map("lit")),
+        diffuse=lit.radiance.showing(atlas.texels, diffuse),
+        phi=np.array([fit.phi for fit in fits], np.float32),
+        psi=np.array([fit.psi for fit in fits], np.float32),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictedView:
+    """baseline, full (H, W, 3) radiance, pixels averaged over their sub-pixels; surface (H, W):
+    all of the pixel shows the asset; lamp (H, W): some of it shows an emitter."""
+
+    baseline: Float
+    full: Float
+    surface: Bool
+    lamp: Bool
+
+
+def predict_view(
+    seen: ViewedAsset, camera: Camera, options: EvaluateOptions, seed: int
+) -> PredictedView:
+    """One picture by both models, box-filtered over ``samples_per_pixel`` points, which share the
+    rays for I_nd."""
+    per_pixel, width, height = options.samples_per_pixel, camera.width, camera.height
+    at_once = max(1, _POINTS_AT_ONCE // (width * per_pixel))
+    offset = (np.arange(options.per_side) + 0.5) / options.per_side
+    bands = []
+    for top in range(0, height, at_once):
+        # Pixel by pixel, row by row, all points of each.
+        lines = np.arange(top, min(top + at_once, height))
+        rows, columns, down, right = np.meshgrid(
+            lines, np.arange(width), offset, offset, indexing="ij"
+        )
+        pixels = np.stack([columns + right, rows + down], axis=-1).reshape(-1, 2)
+        points = visible_points(seen.lit, camera, pixels)
+        values = _radiance_at(seen, points, max(1, options.rays // per_pixel), seed + top)
+        bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
+    picture = np.concatenate(bands).astype(np.float32)
+    return PredictedView(
+        baseline=picture[..., :3],
+        full=picture[..., 3:6],
+        surface=picture[..., 6] > 1 - 0.5 / per_pixel,
+        lamp=picture[..., 7] > 0,
+    )
+
+
+def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int) -> Float:
+    """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
+    hit = points.face >= 0
+    place = points.face, points.u, points.v
+    lamp = hit & seen.lit.emits(points)
+    values = np.zeros((len(hit), 8), np.float32)
+    values[:, :3] = seen.measured.at(*place)
+    values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
+    values[:, 6], values[:, 7] = hit, lamp
+    owner = seen.lit.owner(points.face)
+    known = np.isfinite(seen.phi) & np.isfinite(seen.psi)
+    reflects = np.flatnonzero(hit & ~lamp & known[owner])
+    owner = owner[reflects]
+    values[reflects, 3:6] += lobe_radiance(
+        seen.lit, points.take(reflects), seen.phi[owner], seen.psi[owner], rays, seed
+    )
+    return values

@@ -9,7 +9,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,6 +25,23 @@ from usdbrdf.model.arrays import Bool, Byte, Float
 Row: TypeAlias = Mapping[str, Any]
 # metric -> whether more of it is better
 _METRICS = {"l2": False, "l2_with_lamps": False, "l2_shown": False, "flip": False, "psnr": True}
+# Matplotlib's magma (CC0) at nine equal steps, as FLIP shows its maps; linear in between.
+_MAGMA = np.array(
+    [(0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100),
+     (251, 135, 97), (254, 194, 135), (252, 253, 191)], np.float32,
+)  # fmt: skip
+_GREY = np.array((96, 96, 96), np.uint8)
+# A change of this much in FLIP gets the full colour.
+_FULL_CHANGE = 0.2
+_GAP = 4  # pixels between the pictures of a sheet
+_LINES = (("baseline", "diffuse baseline", "tab:blue"), ("full", "full model", "tab:orange"))
+_PANELS = (
+    ("l2", "relative $L_2$ without lamps"),
+    ("l2_shown", "the same, cut off at display white"),
+    ("flip", "mean FLIP"),
+)
+_MARKED = 60  # so many views still get a dot each
+FILES = "files"
 
 
 def summary_of_views(rows: Sequence[Row]) -> dict[str, Any]:
@@ -58,15 +75,11 @@ def summary_line(summary: Mapping[str, Any]) -> str:
         ("l2_shown", "L2 below white", 4),
         ("psnr", "PSNR", 1),
     ):
-        values = summary.get(metric)
-        if values is None:
-            continue
-        text = f"{title} {values['baseline']:.{digits}f} -> {values['full']:.{digits}f}"
-        if "change_percent" in values:
-            text += f" ({values['change_percent']:+.1f} %)"
-        if "change_db" in values:
-            text += f" ({values['change_db']:+.1f} dB)"
-        parts.append(text)
+        if values := summary.get(metric):
+            text = f"{title} {values['baseline']:.{digits}f} -> {values['full']:.{digits}f}"
+            for name, unit in (("change_percent", "%"), ("change_db", "dB")):
+                text += f" ({values[name]:+.1f} {unit})" if name in values else ""
+            parts.append(text)
     worse = summary.get("flip", {}).get("worse_views", 0)
     return (
         f"{summary['views']} views, diffuse baseline -> full model: {', '.join(parts)}; "
@@ -98,31 +111,20 @@ def table_text(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-# Matplotlib's magma (CC0) at nine equal steps, as FLIP shows its maps; linear in between.
-_MAGMA = np.array(
-    [(0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100),
-     (251, 135, 97), (254, 194, 135), (252, 253, 191)], np.float32,
-)  # fmt: skip
-_GREY = np.array((96, 96, 96), np.uint8)
-# A change of this much in FLIP gets the full colour.
-_FULL_CHANGE = 0.2
-_GAP = 4  # pixels between the pictures of a sheet
-
-
-def magma(error: Float, counted: Bool | None = None) -> Byte:
+def magma(error: Float, counted: Bool) -> Byte:
     """(H, W, 3) sRGB of errors (H, W), black at 0 and pale yellow from 1; grey: not counted."""
     steps = np.linspace(0, 1, len(_MAGMA))
     level = np.clip(np.nan_to_num(error), 0, 1)
     colour = np.stack([np.interp(level, steps, _MAGMA[:, c]) for c in range(3)], axis=-1)
-    return _masked((colour + 0.5).astype(np.uint8), counted)
+    return np.where(counted[..., None], (colour + 0.5).astype(np.uint8), _GREY)
 
 
-def change(before: Float, after: Float, counted: Bool | None = None) -> Byte:
+def change(before: Float, after: Float, counted: Bool) -> Byte:
     """(H, W, 3) sRGB of what became of an error (H, W): blue smaller, orange larger, black same."""
     amount = np.clip((after - before) / _FULL_CHANGE, -1, 1)[..., None]
     smaller, larger = np.array((70, 150, 255.0)), np.array((255, 140, 40.0))
     colour = np.maximum(-amount, 0) * smaller + np.maximum(amount, 0) * larger
-    return _masked((colour + 0.5).astype(np.uint8), counted)
+    return np.where(counted[..., None], (colour + 0.5).astype(np.uint8), _GREY)
 
 
 def sheet(rows: Sequence[Sequence[Byte]]) -> Byte:
@@ -138,30 +140,17 @@ def sheet(rows: Sequence[Sequence[Byte]]) -> Byte:
     return whole
 
 
-def _masked(colour: Byte, counted: Bool | None) -> Byte:
-    return colour if counted is None else np.where(counted[..., None], colour, _GREY)
-
-
-_LINES = (("baseline", "diffuse baseline", "tab:blue"), ("full", "full model", "tab:orange"))
-_PANELS = (
-    ("l2", "relative $L_2$ without lamps"),
-    ("l2_shown", "the same, cut off at display white"),
-    ("flip", "mean FLIP"),
-)
-_MARKED = 60  # so many views still get a dot each
-
-
-def write_plot(path: Path, rows: Sequence[Row]) -> bool:
+def write_plot(path: Path, rows: Sequence[Row]) -> None:
     """Panels of L2 and FLIP over the rows ``l2_baseline``, ``l2_full``, ... as PNG.
 
-    Without matplotlib nothing is drawn: one line says so, and False is returned.
+    Without matplotlib nothing is drawn, and one line says so.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         say(f"{path.name}: not drawn, matplotlib is missing. Install usdbrdf[report].")
-        return False
+        return
     figure = Figure(figsize=(15, 4), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (metric, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS, strict=True):
@@ -178,10 +167,6 @@ def write_plot(path: Path, rows: Sequence[Row]) -> bool:
     with temporary_beside(path) as staged:
         figure.savefig(staged, dpi=110, metadata={"Software": None})
         publish(staged, path)
-    return True
-
-
-FILES = "files"
 
 
 @contextmanager
@@ -196,14 +181,31 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
     folder = Path(os.path.abspath(folder))
     for asset in assets:
         asset.refuse_output(folder, "evaluate.output")
-    earlier = _earlier_files(folder, document)
+    if folder.exists() and not folder.is_dir():
+        raise OwnershipConflict(f"{folder}: not a folder. Name another with -o. [evaluate.output]")
+    earlier: object = None if folder.is_dir() and any(folder.iterdir()) else []
+    if (folder / document).is_file():
+        with suppress(InputRefused, AttributeError):
+            earlier = read_json(folder / document).get(FILES)
+    if not isinstance(earlier, list) or not all(isinstance(name, str) for name in earlier):
+        raise OwnershipConflict(
+            f"{folder}: holds files but no {document} of ours. Name an empty or a new folder with "
+            "-o. [evaluate.output]"
+        )
     with environment_failures(str(folder)):
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=folder.parent))
     try:
         yield work
         with environment_failures(str(folder)):
-            _move(work, folder, document, earlier)
+            made = files_of(work)
+            for relative in sorted(made, key=lambda name: name == document):
+                (folder / relative).parent.mkdir(parents=True, exist_ok=True)
+                publish(work / relative, folder / relative)
+            for relative in set(earlier) - set(made):
+                stale = (folder / relative).resolve()
+                if stale.is_relative_to(folder.resolve()) and stale.is_file():
+                    stale.unlink()
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -211,33 +213,3 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
 def files_of(work: Path) -> list[str]:
     """What was written so far, relative, for the document's list."""
     return sorted(p.relative_to(work).as_posix() for p in work.rglob("*") if p.is_file())
-
-
-def _earlier_files(folder: Path, document: str) -> list[str]:
-    if folder.exists() and not folder.is_dir():
-        raise OwnershipConflict(f"{folder}: not a folder. Name another with -o. [evaluate.output]")
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return []
-    known: object = None
-    if (folder / document).is_file():
-        try:
-            known = read_json(folder / document).get(FILES)
-        except (InputRefused, AttributeError):
-            known = None
-    if not isinstance(known, list) or not all(isinstance(name, str) for name in known):
-        raise OwnershipConflict(
-            f"{folder}: holds files but no {document} of ours. Name an empty or a new folder with "
-            "-o. [evaluate.output]"
-        )
-    return known
-
-
-def _move(work: Path, folder: Path, document: str, earlier: list[str]) -> None:
-    made = files_of(work)
-    for relative in sorted(made, key=lambda name: name == document):
-        (folder / relative).parent.mkdir(parents=True, exist_ok=True)
-        publish(work / relative, folder / relative)
-    for relative in set(earlier) - set(made):
-        stale = (folder / relative).resolve()
-        if stale.is_relative_to(folder.resolve()) and stale.is_file():
-            stale.unlink()

@@ -60,8 +60,7 @@ def to_display_srgb8(pixels: Float, *, exposure_scale: float) -> npt.NDArray[np.
 def to_display_srgb(pixels: Float, *, exposure_scale: float) -> Float:
     """sRGB values in [0, 1], (H, W, 3) float32, of linear Rec.709 radiance times the scale."""
     scaled = np.clip(pixels * np.float32(exposure_scale), 0, 1).astype(np.float32)
-    encoded: Float = np.clip(_converted(scaled, WORKING_SPACE, DISPLAY_SPACE), 0, 1)
-    return encoded
+    return np.asarray(np.clip(_converted(scaled, WORKING_SPACE, DISPLAY_SPACE), 0, 1))
 
 
 def display_exposure(levels: Float) -> float:
@@ -82,16 +81,20 @@ def _converted(pixels: Float, source: str, target: str) -> Float:
 
 @cache
 def _processor(source: str, target: str) -> Any:
-    config = _config()
-    processor = config.getProcessor(_name_in(config, source), _name_in(config, target))
-    # Lossless, because the default replaces the power function by a fast approximation.
-    return processor.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
-
-
-@cache
-def _config() -> Any:
     built_in = ocio.BuiltinConfigRegistry().getBuiltinConfigs()
-    return ocio.Config.CreateFromBuiltinConfig(_pick_config([entry[0] for entry in built_in]))
+    config = ocio.Config.CreateFromBuiltinConfig(_pick_config([entry[0] for entry in built_in]))
+    names = []
+    for encoding in (source, target):
+        known = [name for name in _NAMES[encoding] if config.getColorSpace(name) is not None]
+        if not known:
+            raise InputRefused(
+                f"colour space {encoding!r} is not in this OpenColorIO ({ocio.__version__}). "
+                "Install 2.5 or newer. [colour.encoding]"
+            )
+        names.append(known[0])
+    # Lossless, because the default replaces the power function by a fast approximation.
+    processor = config.getProcessor(*names)
+    return processor.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
 
 
 def _pick_config(available: list[str]) -> str:
@@ -100,13 +103,3 @@ def _pick_config(available: list[str]) -> str:
         return _CONFIG
     kind = [name for name in available if name.startswith("cg-config-v")]
     return max(kind, key=lambda name: [int(number) for number in re.findall(r"\d+", name)])
-
-
-def _name_in(config: Any, encoding: str) -> str:
-    for name in _NAMES[encoding]:
-        if config.getColorSpace(name) is not None:
-            return name
-    raise InputRefused(
-        f"colour space {encoding!r} is not in this OpenColorIO ({ocio.__version__}). Install 2.5 "
-        "or newer. [colour.encoding]"
-    )

@@ -1,11 +1,15 @@
-"""JSON without its traps: finite numbers, no key twice, bounded size and depth."""
+"""Records in files: JSON without its traps (finite numbers, no key twice, bounded size and depth),
+and named arrays as an uncompressed .npz without pickles and with fixed bytes.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
-from collections.abc import Callable, Collection
+import zipfile
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import write_text_atomic
+from usdbrdf.model.arrays import Array
 
 # Not msgspec: it keeps the last of two equal keys without a word, takes no NaN even where the
 # caller is to judge it, and names the byte of a fault, not its line.
@@ -32,20 +37,18 @@ class _KeyTwice(ValueError):
     """An object names one key two times."""
 
 
-def read_json(
-    path: Path,
-    *,
-    nonfinite_below: Collection[str] = (),
-    max_bytes: int = MAX_BYTES,
-    max_depth: int = MAX_DEPTH,
-) -> Any:
+def read_json(path: Path, *, nonfinite_below: Collection[str] = ()) -> Any:
     """Parse a JSON document strictly; InputRefused names the file and, where known, the line.
 
     ``json`` alone would take NaN, turn 1e999 into infinity and keep the last of two equal keys.
 
     nonfinite_below  keys whose values may hold NaN and infinities, for the caller to judge
     """
-    text = _read_text(path, max_bytes)
+    text = _read_text(path)
+    too_deep = InputRefused(
+        f"{path}: nested deeper than {MAX_DEPTH} levels. This is not a document of ours; check "
+        "what wrote it. [document.depth]"
+    )
     try:
         try:
             document = _parsed(text, _finite)
@@ -53,25 +56,26 @@ def read_json(
             document = _parsed(text, float)
             if _any_nonfinite(document, nonfinite_below):
                 raise
-    except _BadNumber as error:
-        raise InputRefused(
-            f"{path}:{_line_of_fault(text, error)}: the number {_short(error)} is not a finite "
-            "64-bit number. Remove or correct it. [document.nonfinite]"
-        ) from error
-    except _KeyTwice as error:
-        raise InputRefused(
-            f"{path}:{_line_of_fault(text, error)}: the key {_short(error)} occurs twice in one "
-            "object. Keep one of the two. [document.duplicate]"
-        ) from error
+    except (_BadNumber, _KeyTwice) as error:
+        shown = repr(str(error) if len(str(error)) <= 40 else f"{str(error)[:40]}...")
+        number = f"the number {shown} is not a finite 64-bit number. Remove or correct it"
+        twice = f"the key {shown} occurs twice in one object. Keep one of the two"
+        said, rule = (twice, "duplicate") if isinstance(error, _KeyTwice) else (number, "nonfinite")
+        line = _line_of_fault(text, error)
+        raise InputRefused(f"{path}:{line}: {said}. [document.{rule}]") from error
     except json.JSONDecodeError as error:
         raise InputRefused(
             f"{path}:{error.lineno}: not valid JSON ({error.msg}, column {error.colno}). Export "
             "it again or correct it. [document.json]"
         ) from error
     except RecursionError as error:
-        raise _too_deep(path, max_depth) from error
-    if _deeper_than(document, max_depth):
-        raise _too_deep(path, max_depth)
+        raise too_deep from error
+    level = [node for node in (document,) if isinstance(node, dict | list)]
+    for _ in range(MAX_DEPTH):
+        children = (c for node in level for c in (node.values() if type(node) is dict else node))
+        level = [child for child in children if isinstance(child, dict | list)]
+    if level:
+        raise too_deep
     if _HALF_A_PAIR.search(text):
         try:
             json.dumps(document, ensure_ascii=False).encode()
@@ -98,14 +102,14 @@ def json_text(obj: Any) -> str:
         ) from error
 
 
-def _read_text(path: Path, max_bytes: int) -> str:
+def _read_text(path: Path) -> str:
     try:
         if not path.is_file():  # a FIFO or device would block or never end
             raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")
         size = path.stat().st_size
-        if size > max_bytes:
+        if size > MAX_BYTES:
             raise InputRefused(
-                f"{path}: {size} bytes, more than the limit of {max_bytes}. Split the capture. "
+                f"{path}: {size} bytes, more than the limit of {MAX_BYTES}. Split the capture. "
                 "[document.size]"
             )
         return path.read_bytes().decode("utf-8-sig")
@@ -161,7 +165,7 @@ def _integer(token: str) -> int:
 
 
 def _line_of_fault(text: str, error: _BadNumber | _KeyTwice) -> int:
-    """The line of the first number or key of the kind that was refused."""
+    """The line of the first such number, or of the first key that occurs twice."""
     keys: list[set[str]] = []
     line, position, previous = 1, 0, ""
     for match in _TOKEN.finditer(text):
@@ -177,43 +181,36 @@ def _line_of_fault(text: str, error: _BadNumber | _KeyTwice) -> int:
             if isinstance(error, _KeyTwice) and key in keys[-1]:
                 break
             keys[-1].add(key)
-        elif isinstance(error, _BadNumber) and token[0] in "-0123456789NI":
-            try:
-                (_integer if token.lstrip("-").isdigit() else _finite)(token)
-            except ValueError:
-                break
+        elif isinstance(error, _BadNumber) and token == str(error):
+            break
         previous = token
     return line
-
-
-def _deeper_than(document: Any, limit: int) -> bool:
-    level = [document]
-    for _ in range(limit):
-        level = [
-            child
-            for node in level
-            if isinstance(node, dict | list)
-            for child in (node.values() if isinstance(node, dict) else node)
-            if isinstance(child, dict | list)
-        ]
-        if not level:
-            return False
-    return True
-
-
-def _too_deep(path: Path, limit: int) -> InputRefused:
-    return InputRefused(
-        f"{path}: nested deeper than {limit} levels. This is not a document of ours; check what "
-        "wrote it. [document.depth]"
-    )
-
-
-def _short(error: ValueError) -> str:
-    text = str(error)
-    return repr(text if len(text) <= 40 else text[:40] + "...")
 
 
 def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} is not a JSON type")
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write arrays; object arrays raise ValueError. (np.savez would not take the key "file".)"""
+    with path.open("wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for key, array in arrays.items():
+            member = zipfile.ZipInfo(f"{key}.npy")  # its date is 1980, so equal arrays, equal bytes
+            with archive.open(member, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def load_arrays(path: Path) -> dict[str, Array]:
+    """Read all arrays of a file; a damaged one or one that holds pickles is refused."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise InputRefused(
+            f"{path}: not a readable array file ({error}); pickled data is refused. Write it "
+            "again. [arrays.damaged]"
+        ) from error

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -19,19 +20,17 @@ PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 _CLIPPED_SHARE = 0.998
 # Threads that decode, and frames in memory besides the one that is used.
 _READERS, _AHEAD = 2, 3
+# Of a frame: three channels of radiance and four masks.
+_BYTES_OF_PIXEL = 16
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
 
 
-def _linear(code: float) -> float:
-    """The sRGB curve, code value in [0, 1]."""
-    return float(code / 12.92 if code <= 0.04045 else ((code + 0.055) / 1.055) ** 2.4)
-
-
 # An 8-bit photograph near its ends tells that a channel is bright or dark, not how much: JPEG
-# compression alone moves values by several codes there. Linear values at one reference exposure.
-PHOTOGRAPH_SATURATION = _linear(250 / 255)
-PHOTOGRAPH_NOISE_FLOOR = _linear(3 / 255)
+# compression alone moves values by several codes there. Codes 250 and 3 as linear values (the two
+# pieces of the sRGB curve) at one reference exposure.
+PHOTOGRAPH_SATURATION = ((250 / 255 + 0.055) / 1.055) ** 2.4
+PHOTOGRAPH_NOISE_FLOOR = 3 / 255 / 12.92
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,27 +61,25 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     """
     recorded = read_radiance(frames.image_paths[i])
     if frames.encoding == PHOTOGRAPH_ENCODING:
-        scale = np.float32(radiance_scale(frames)[i])
+        # Radiance is value * reference exposure / exposure time. The adapter wrote that factor into
+        # the saturation; unlike a median of exposure times it stays when frames are left out.
+        scale = np.float32(frames.saturation_radiance[i] / PHOTOGRAPH_SATURATION)
         recorded = to_working_space(recorded, frames.encoding) * scale
-    finite = ~_in_any_channel(~np.isfinite(recorded))
-    negative = finite & _in_any_channel(recorded < 0)
-    unknown, ringing = ~finite, negative
-    if negative.any():
-        lowest = -_RINGING * max(float(np.median(recorded[finite])), 0.0)
-        ringing = negative & ~_in_any_channel(recorded < lowest)
-        unknown = ~finite | (negative & ~ringing)
+    unknown = _in_any_channel(~np.isfinite(recorded))
+    ringing = ~unknown & _in_any_channel(recorded < 0)
+    if ringing.any():
+        lowest = -_RINGING * max(float(np.median(recorded[~unknown])), 0.0)
+        below = ringing & _in_any_channel(recorded < lowest)
+        ringing, unknown = ringing & ~below, unknown | below
     recorded[ringing] = np.maximum(recorded[ringing], 0)
     recorded[unknown] = np.nan
-    known = ~unknown
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= _CLIPPED_SHARE * frames.saturation_radiance[i])
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
-    radiance = recorded
-    if frames.encoding != PHOTOGRAPH_ENCODING:
-        radiance = to_working_space(recorded, frames.encoding)
+    photograph = frames.encoding == PHOTOGRAPH_ENCODING
     return FramePixels(
-        radiance=radiance,
-        valid=known & ~clipped & ~dark,
+        radiance=recorded if photograph else to_working_space(recorded, frames.encoding),
+        valid=~(unknown | clipped | dark),
         clipped=clipped,
         dark=dark,
         unknown=unknown,
@@ -90,38 +87,48 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     )
 
 
-def read_frames(frames: Frames, order: Sequence[int]) -> Iterator[tuple[int, FramePixels]]:
+def read_frames(
+    read: Callable[[int], FramePixels], order: Sequence[int]
+) -> Iterator[tuple[int, FramePixels]]:
     """Number and pixels of the frames of ``order``, the next ones decoded while one is used."""
     with ThreadPoolExecutor(max_workers=_READERS) as readers:
-        coming = deque((i, readers.submit(read_frame, frames, i)) for i in order[:_AHEAD])
+        coming = deque((i, readers.submit(read, i)) for i in order[:_AHEAD])
         try:
             for ahead in range(_AHEAD, len(order) + _AHEAD):
                 i, pixels = coming.popleft()
                 found = pixels.result()
                 if ahead < len(order):
-                    coming.append((order[ahead], readers.submit(read_frame, frames, order[ahead])))
+                    coming.append((order[ahead], readers.submit(read, order[ahead])))
                 yield i, found
         finally:
             for _, job in coming:
                 job.cancel()
 
 
+class FrameReader:
+    """Frames that are asked for again and again: the first of them, as many as fit into
+    ``most_bytes`` decoded, are read once and kept, the others read each time."""
+
+    def __init__(self, frames: Frames, most_bytes: int) -> None:
+        self.frames = frames
+        sizes = _BYTES_OF_PIXEL * frames.resolution.prod(axis=1, dtype=np.int64)
+        self._num_kept = int(np.searchsorted(sizes.cumsum(), most_bytes, side="right"))
+        self._kept: dict[int, FramePixels] = {}
+        self._locks = [Lock() for _ in range(self._num_kept)]
+
+    def read(self, i: int) -> FramePixels:
+        """Pixels of frame ``i``, not to be written to; from any thread. See ``read_frame``."""
+        if i >= self._num_kept:
+            return read_frame(self.frames, i)
+        with self._locks[i]:
+            if i not in self._kept:
+                self._kept[i] = read_frame(self.frames, i)
+            return self._kept[i]
+
+
 def _in_any_channel(true: Bool) -> Bool:
     """(H, W) of (H, W, 3). NumPy's own any() over so short an axis takes eight times as long."""
     return true[..., 0] | true[..., 1] | true[..., 2]
-
-
-def radiance_scale(frames: Frames) -> Double:
-    """(N,) factor from linearised pixel values to radiance.
-
-    1 for scene-linear images. A photograph's value is radiance times exposure time, so there
-    radiance = value * reference_exposure / exposure_time. The adapter wrote the same factor into
-    the radiance at which the frame saturates, and from there it is taken: unlike a median of the
-    exposure times it does not change when frames are left out.
-    """
-    if frames.encoding != PHOTOGRAPH_ENCODING:
-        return np.ones(len(frames))
-    return frames.saturation_radiance / PHOTOGRAPH_SATURATION
 
 
 def photograph_limits(exposure_time: Double) -> tuple[Double, Double]:

@@ -1,8 +1,8 @@
 """Images in and out; the only importer of OpenImageIO.
 
 Reading gives every pixel or refuses: a truncated file never becomes zeros, and what is made of a
-file is bounded, whatever it stores. Writing clamps to what
-half floats hold, pins the date so that equal pixels give equal bytes, and reads the file back.
+file is bounded, whatever it stores. Writing clamps to what half floats hold, pins the date so that
+equal pixels give equal bytes, and reads the file back.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,11 +43,11 @@ _RAW_SUFFIXES = frozenset((
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
+# As OpenImageIO and the libraries below it put it.
+_WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
 # Process-wide guards of the decoders themselves, before anything is allocated.
 oiio.attribute("limits:channels", MAX_CHANNELS)
-
 oiio.attribute("limits:resolution", MAX_SIDE)
-
 oiio.attribute("limits:imagesize_MB", MAX_DECLARED_BYTES >> 20)
 
 
@@ -59,7 +59,8 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
     """
     source = _open(path, max_side)
     names = source.spec().channelnames
-    channels = _rgb_channels(names)
+    lower = [name.lower() for name in names]
+    channels = [lower.index(letter) for letter in "rgb" if letter in lower]
     if len(channels) != 3:
         raise ImageRefused(
             f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
@@ -101,12 +102,7 @@ def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
     bad = int(np.count_nonzero(~np.isfinite(image)))
     if bad:
         raise UsdBrdfError(f"{path}: {bad} values to be written are not finite. [image.write]")
-    clamped = 0
-    if half:
-        clamped = int(np.count_nonzero(np.abs(image) > HALF_MAX))
-        stored: Any = np.clip(image, -HALF_MAX, HALF_MAX).astype(np.float16)
-    else:
-        stored = image
+    stored: Any = np.clip(image, -HALF_MAX, HALF_MAX).astype(np.float16) if half else image
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], len(names), "half" if half else "float")
     spec.channelnames = names
     spec.attribute("compression", "zip")
@@ -122,7 +118,7 @@ def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
                 "[image.write]"
             )
         publish(staged, path)
-    return clamped
+    return int(np.count_nonzero(np.abs(image) > HALF_MAX)) if half else 0
 
 
 def needs_float(values: Float) -> bool:
@@ -169,7 +165,19 @@ def _open(path: Path, max_side: int) -> Any:
             f"{path}: camera raw files are not read (only their preview would be). Develop it "
             "to a scene-linear EXR. [image.raw]"
         )
-    size = _size_of_regular_file(path)
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ImageRefused(
+            f"{path}: cannot be read ({reason}). Check name and permission. [image.unreadable]"
+        ) from error
+    if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
+        raise ImageRefused(f"{path}: not a regular file. Name an image file. [image.unreadable]")
+    if not os.access(path, os.R_OK):
+        raise ImageRefused(f"{path}: permission denied. Make it readable. [image.unreadable]")
+    if status.st_size == 0:
+        raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
     # Without the hint, PNG's colours would come multiplied by their alpha.
     hint = oiio.ImageSpec()
     hint.attribute("oiio:UnassociatedAlpha", 1)
@@ -183,7 +191,7 @@ def _open(path: Path, max_side: int) -> Any:
             f"{path}: {source.format_name()} {'deep or volume ' if spec.deep else ''}images are "
             f"not read. Export a flat image ({', '.join(_FORMATS)}). [image.format]"
         )
-    _check_limits(path, spec, size, max_side)
+    _check_limits(path, spec, status.st_size, max_side)
     return source
 
 
@@ -202,7 +210,12 @@ def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0
         yield
     except Exception as error:
         said = _message(decoder)
-        if isinstance(error, MemoryError) or _WANT_OF_MEMORY.search(said) or not _is_free(making):
+        scarce = isinstance(error, MemoryError) or _WANT_OF_MEMORY.search(said)
+        try:
+            np.zeros(2 * making, np.uint8)  # twice: the decoder has buffers of its own
+        except MemoryError:
+            scarce = True
+        if scarce:
             raise EnvironmentFailure(
                 f"{path}: too little memory to read this image. Free some or use a larger "
                 "machine, then run the same command again. [environment.memory]"
@@ -210,36 +223,6 @@ def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0
         raise ImageRefused(f"{path}: {problem} ({said}). Copy or export it again. [{rule}]") from (
             None if isinstance(error, _Undecoded) else error
         )
-
-
-# As OpenImageIO and the libraries below it put it.
-_WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
-
-
-def _is_free(num_bytes: int) -> bool:
-    """Whether so much memory can be had, twice: the decoder has buffers of its own."""
-    try:
-        np.zeros(2 * num_bytes, np.uint8)
-    except MemoryError:
-        return False
-    return True
-
-
-def _size_of_regular_file(path: Path) -> int:
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ImageRefused(
-            f"{path}: cannot be read ({reason}). Check name and permission. [image.unreadable]"
-        ) from error
-    if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
-        raise ImageRefused(f"{path}: not a regular file. Name an image file. [image.unreadable]")
-    if not os.access(path, os.R_OK):
-        raise ImageRefused(f"{path}: permission denied. Make it readable. [image.unreadable]")
-    if status.st_size == 0:
-        raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
-    return status.st_size
 
 
 def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
@@ -270,7 +253,17 @@ def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
 def _pixels(path: Path, source: Any) -> Float:
     """The data window, (H, W, C) float32, complete."""
     if source.format_name() == "jpeg":
-        _refuse_cut_jpeg(path)
+        # The decoder paints what is missing grey and only warns; look for the end mark. It is
+        # searched after the first scan starts: a thumbnail in the header has one of its own.
+        content = path.read_bytes()
+        position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
+        while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
+            position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+        if content.find(b"\xff\xd9", position) < 0:
+            raise ImageRefused(
+                f"{path}: truncated (no end-of-image mark). Copy or export it again. "
+                "[image.truncated]"
+            )
     spec = source.spec()
     shape = (spec.height, spec.width, spec.nchannels)
     with _decoding(
@@ -282,21 +275,6 @@ def _pixels(path: Path, source: Any) -> Float:
     return np.asarray(pixels, dtype=np.float32)
 
 
-def _refuse_cut_jpeg(path: Path) -> None:
-    """The JPEG decoder paints what is missing grey and only warns; look for the end mark.
-
-    The mark is searched after the first scan starts: a thumbnail in the header has one of its own.
-    """
-    content = path.read_bytes()
-    position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
-    while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
-        position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
-    if content.find(b"\xff\xd9", position) < 0:
-        raise ImageRefused(
-            f"{path}: truncated (no end-of-image mark). Copy or export it again. [image.truncated]"
-        )
-
-
 def _in_display_window(spec: Any, data: Float) -> Float:
     left, top = spec.x - spec.full_x, spec.y - spec.full_y
     if (left, top, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
@@ -306,11 +284,6 @@ def _in_display_window(spec: Any, data: Float) -> Float:
     part = data[max(0, -top) : spec.full_height - top, max(0, -left) : spec.full_width - left]
     image[max(0, top) : max(0, bottom), max(0, left) : max(0, right)] = part
     return image
-
-
-def _rgb_channels(names: Sequence[str]) -> list[int]:
-    lower = [name.lower() for name in names]
-    return [lower.index(letter) for letter in "rgb" if letter in lower]
 
 
 def _write(path: Path, staged: Path, spec: Any, pixels: Any) -> None:

@@ -28,7 +28,8 @@ def unique_identifiers(labels: Sequence[str]) -> list[str]:
     for i in exact_first:
         name, occurrence = wanted[i], list(labels[:i]).count(labels[i])
         while name.lower() in taken:
-            name = f"{wanted[i][: _MAX_LENGTH - 9]}_{_digest(f'{occurrence}:{labels[i]}')}"
+            text = f"{occurrence}:{labels[i]}".encode("utf-8", "backslashreplace")
+            name = f"{wanted[i][: _MAX_LENGTH - 9]}_{hashlib.sha256(text).hexdigest()[:8]}"
             occurrence += 1
         taken.add(name.lower())
         names[i] = name
@@ -52,7 +53,3 @@ def readable_label(label: str) -> str:
     """The label as USD can store it: control characters and lone surrogates become U+FFFD."""
     encodable = label.encode("utf-8", "replace").decode("utf-8")
     return "".join("\ufffd" if unicodedata.category(c) == "Cc" else c for c in encodable)
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:8]

@@ -20,22 +20,31 @@ def contained(root: Path, candidate: str) -> Path:
     Nothing is opened, and the file need not exist. Absolute paths are refused even if they lie
     inside: they would break as soon as the capture is moved.
     """
+    cause: Exception | None = None
     if not candidate or "\0" in candidate:
-        raise _refused(root, candidate, "is not a file name")
-    if _URI.match(candidate):
-        raise _refused(root, candidate, "is a URI, only relative paths are followed")
-    if _ABSOLUTE.match(candidate):
-        raise _refused(root, candidate, "is an absolute path, only relative paths are followed")
-    try:
-        home = root.resolve()
-        path = (home / candidate).resolve()
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
-            path.stat()
-    except (OSError, RuntimeError, ValueError) as error:  # too long a name, a loop of links
-        raise _refused(root, candidate, f"cannot be resolved ({_words(error)})") from error
-    if not path.is_relative_to(home):
-        raise _refused(root, candidate, "leads outside that folder")
-    return path
+        reason = "is not a file name"
+    elif _URI.match(candidate):
+        reason = "is a URI, only relative paths are followed"
+    elif _ABSOLUTE.match(candidate):
+        reason = "is an absolute path, only relative paths are followed"
+    else:
+        try:
+            home = root.resolve()
+            path = (home / candidate).resolve()
+            with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+                path.stat()
+            if path.is_relative_to(home):
+                return path
+            reason = "leads outside that folder"
+        except (OSError, RuntimeError, ValueError) as error:  # too long a name, a loop of links
+            # Without the path, which may be the long part.
+            words = getattr(error, "strerror", None) or getattr(error, "reason", None) or error
+            cause, reason = error, f"cannot be resolved ({str(words)[:200]})"
+    shown = repr(candidate if len(candidate) <= 200 else candidate[:200] + "...")
+    raise InputRefused(
+        f"{str(root)!r}: the path {shown} {reason}. Put the file inside the folder and name it "
+        "relative to it. [paths.outside]"
+    ) from cause
 
 
 def inside(root: Path, place: Path) -> Path:
@@ -50,12 +59,6 @@ def inside(root: Path, place: Path) -> Path:
             "it; put a folder in its place. [ownership.link]"
         )
     return place
-
-
-def _words(error: Exception) -> str:
-    """What is wrong, without the path, which may be the long part."""
-    words = getattr(error, "strerror", None) or getattr(error, "reason", None) or error
-    return str(words)[:200]
 
 
 def refuse_nameless(path: Path | None) -> None:
@@ -79,12 +82,4 @@ def files_below(folder: Path, *, without: Path) -> list[Path]:
         if not any(path.match(pattern) for pattern in _LITTER)
         and path.is_file()
         and not path.is_relative_to(own)
-    )
-
-
-def _refused(root: Path, candidate: str, reason: str) -> InputRefused:
-    shown = repr(candidate if len(candidate) <= 200 else candidate[:200] + "...")
-    return InputRefused(
-        f"{str(root)!r}: the path {shown} {reason}. Put the file inside the folder and name it "
-        "relative to it. [paths.outside]"
     )

@@ -6,14 +6,14 @@ NumPy finds what is wrong and with which objects; only these go through pymeshla
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.child import run_child
-from usdbrdf.model.arrays import Bool, Float, Int
-from usdbrdf.model.mesh import doubled_areas, welded_ids
+from usdbrdf.model.arrays import Bool, Float, Int, Long
+from usdbrdf.model.mesh import compact, doubled_areas, welded_ids
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,16 +43,14 @@ def clean_mesh(
     object.
 
     decimate  number of triangles wanted in all; each object is reduced in proportion
-    label     what the mesh is called in messages
     """
     found = _damage(points, triangles, face_object)
-    if not found.keep.any():
+    if not found.num_whole:
         raise InputRefused(
             f"{label}: none of the {len(triangles)} faces has an area. Export it again. "
             "[mesh.empty]"
         )
-    counts = dict(found.counts)
-    num_given, num_before = len(points), int(found.keep.sum())
+    counts, num_given = found.counts, len(points)
     repaired = np.zeros(0, np.int32)
     if len(found.damaged_sheets):
         points, triangles, origin = _repaired(points, triangles, found, label)
@@ -68,38 +66,42 @@ def clean_mesh(
         )
         points, triangles, face_object = (reduced[name] for name in given)
         num_given = len(points)
-        counts["decimated_faces"] = num_before - len(triangles)
-    used, compact = np.unique(triangles, return_inverse=True)
+        counts["decimated_faces"] = found.num_whole - len(triangles)
+    used, points, triangles = compact(points, triangles)
     counts["unreferenced_vertices"] = num_given - int((used < num_given).sum())
     return CleanMesh(
-        points=np.ascontiguousarray(points[used]),
-        triangles=compact.reshape(-1, 3).astype(np.int32),
+        points=np.ascontiguousarray(points),
+        triangles=triangles,
         face_object=face_object,
         counts=counts,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Damage:
+class _Damage(NamedTuple):
     """What is wrong with a mesh.
 
-    keep            (F,) bool: neither flat nor repeated
     void            (F,) bool: flat, or repeated from another object
     sheet           (F,) int32: 2 x object, + 1 for a face that lies on an earlier one of the same
                     object with its back to it (the two sides of a leaf are two sheets)
     damaged_sheets  numbers of the sheets with something to repair
+    num_whole       how many faces are neither flat nor repeated
     """
 
-    keep: Bool
     void: Bool
     sheet: Int
     damaged_sheets: Int
+    num_whole: int
     counts: dict[str, int]
 
 
 def _damage(points: Float, triangles: Int, face_object: Int) -> _Damage:
     corners = welded_ids(points)[triangles]
-    flat = ~_has_area(points, triangles, corners)
+    a, b, c = corners.T
+    edges = points.astype(np.float64)[triangles]
+    longest = np.linalg.norm(np.roll(edges, -1, axis=1) - edges, axis=2).max(axis=1)
+    # Relative to the longest edge, so that small scans keep their small triangles.
+    flat = doubled_areas(points, triangles) <= 1e-9 * longest**2
+    flat |= (a == b) | (b == c) | (c == a)
     turn = (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3
     first = _first_equal(np.take_along_axis(corners, turn, axis=1), ~flat)
     repeated = first != np.arange(len(triangles))
@@ -107,31 +109,23 @@ def _damage(points: Float, triangles: Int, face_object: Int) -> _Damage:
     same_place = np.column_stack([np.sort(corners, axis=1), face_object])
     back = _first_equal(same_place, keep) != np.arange(len(triangles))
     sheet = (2 * face_object + back[first]).astype(np.int32)
-    branching = _sheets_of_branching_edges(corners[keep], sheet[keep])
-    return _Damage(
-        keep=keep,
-        void=flat | (repeated & (face_object[first] != face_object)),
-        sheet=sheet,
-        damaged_sheets=np.unique(np.concatenate([sheet[~keep], branching])),
-        counts={
-            "degenerate_faces": int(flat.sum()),
-            "duplicate_faces": int(repeated.sum()),
-            "nonmanifold_edges": len(branching),
-        },
-    )
+    # Of each edge that more than two triangles of one sheet share, that sheet.
+    ends = np.sort(corners[keep][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    edge = np.column_stack([np.repeat(sheet[keep], 3), ends[:, 0] << 32 | ends[:, 1]])
+    edge = edge[np.lexsort(edge.T[::-1])]
+    first_use = np.flatnonzero(np.r_[True, (edge[1:] != edge[:-1]).any(axis=1)])
+    branching = edge[first_use[np.diff(first_use, append=len(edge)) > 2], 0]
+    counts = {
+        "degenerate_faces": int(flat.sum()),
+        "duplicate_faces": int(repeated.sum()),
+        "nonmanifold_edges": len(branching),
+    }
+    void = flat | (repeated & (face_object[first] != face_object))
+    damaged = np.unique(np.concatenate([sheet[~keep], branching])).astype(np.int32)
+    return _Damage(void, sheet, damaged, int(keep.sum()), counts)
 
 
-def _has_area(points: Float, triangles: Int, corners: Int) -> Bool:
-    a, b, c = corners.T
-    distinct: Bool = (a != b) & (b != c) & (c != a)
-    p = points.astype(np.float64)[triangles]
-    longest = np.linalg.norm(np.roll(p, -1, axis=1) - p, axis=2).max(axis=1)
-    # Relative to the longest edge, so that small scans keep their small triangles.
-    flat: Bool = doubled_areas(points, triangles) <= 1e-9 * longest**2
-    return distinct & ~flat
-
-
-def _first_equal(rows: Int, among: Bool) -> npt.NDArray[np.int64]:
+def _first_equal(rows: Int, among: Bool) -> Long:
     """(F,) for each row the index of the first equal one, of the rows ``among``; else its own."""
     chosen = np.flatnonzero(among)
     # lexsort is stable: within a group of equal rows the file's order is kept.
@@ -144,22 +138,7 @@ def _first_equal(rows: Int, among: Bool) -> npt.NDArray[np.int64]:
     return first
 
 
-def _sheets_of_branching_edges(corners: Int, sheet: Int) -> Int:
-    """For each edge that more than two triangles of one sheet share, that sheet."""
-    ends = np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    edge, owner = ends[:, 0] << 32 | ends[:, 1], np.repeat(sheet, 3)
-    order = np.lexsort((edge, owner))
-    edge, owner = edge[order], owner[order]
-    begins = np.ones(len(edge), np.bool_)
-    begins[1:] = (edge[1:] != edge[:-1]) | (owner[1:] != owner[:-1])
-    first = np.flatnonzero(begins)
-    uses = np.diff(first, append=len(edge))
-    return np.asarray(owner[first[uses > 2]], np.int32)
-
-
-def _repaired(
-    points: Float, triangles: Int, found: _Damage, label: str
-) -> tuple[Float, Int, npt.NDArray[np.int64]]:
+def _repaired(points: Float, triangles: Int, found: _Damage, label: str) -> tuple[Float, Int, Long]:
     """Points, triangles and the input face of each. Copies of vertices are appended."""
     damaged = np.isin(found.sheet, found.damaged_sheets)
     given = triangles[damaged]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.model.arrays import Array
-from usdbrdf.model.mesh import welded_ids
+from usdbrdf.model.mesh import compact, joined, welded_ids
 
 # No object is reduced below this, or small ones would vanish beside a large one.
 _MIN_TRIANGLES = 32
@@ -28,19 +28,17 @@ def repair_sheets(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) ->
     face that each output face was.
     """
     points, triangles, sheet = (arrays[k] for k in ("points", "triangles", "sheet"))
-    vertices, faces, origins = [], [], []
-    first = 0
+    parts, origins = [], []
     for index in np.unique(sheet):
         own = np.flatnonzero(sheet == index)
-        used, corners = np.unique(triangles[own], return_inverse=True)
-        vertex, face, origin = _repaired(points[used], corners.reshape(-1, 3))
-        vertices.append(used[vertex])
-        faces.append(face + first)
+        used, own_points, corners = compact(points, triangles[own])
+        vertex, faces, origin = _repaired(own_points, corners)
+        parts.append((used[vertex], faces))
         origins.append(own[origin])
-        first += len(vertex)
+    vertex, faces, _ = joined(parts)
     return {
-        "vertex": np.concatenate(vertices, dtype=np.int32),
-        "triangles": np.concatenate(faces, dtype=np.int32),
+        "vertex": vertex.astype(np.int32),
+        "triangles": faces,
         "face": np.concatenate(origins, dtype=np.int32),
     }
 
@@ -54,7 +52,7 @@ def _repaired(points: Array, triangles: Array) -> tuple[Array, Array, Array]:
     meshes.add_mesh(
         pymeshlab.Mesh(
             points.astype(np.float64),
-            triangles.astype(np.int32),
+            triangles,
             v_scalar_array=np.arange(len(points), dtype=np.float64),
             f_scalar_array=np.arange(len(triangles), dtype=np.float64),
         )
@@ -88,39 +86,24 @@ def decimate_objects(
 
     points, triangles, face_object = (arrays[k] for k in ("points", "triangles", "face_object"))
     share = parameters["target"] / len(triangles)
-    parts: list[tuple[Array, Array, int]] = []
-    for index in np.unique(face_object):
-        own = triangles[face_object == index]
-        target = max(_MIN_TRIANGLES, round(share * len(own)))
-        part = _part(points, own, weld=index not in arrays["joined"])
-        if target < len(own):
+    objects = np.unique(face_object)
+    parts: list[tuple[Array, Array]] = []
+    for index in objects:
+        _, own, corners = compact(points, triangles[face_object == index])
+        if index not in arrays["joined"]:  # edges must be shared to be collapsed
+            ids = welded_ids(own)
+            _, first, shared = np.unique(ids, return_index=True, return_inverse=True)
+            own, corners = own[first], shared[corners].astype(np.int32)
+        target = max(_MIN_TRIANGLES, round(share * len(corners)))
+        if target < len(corners):
             meshes = pymeshlab.MeshSet()
-            meshes.add_mesh(pymeshlab.Mesh(part[0].astype(np.float64), part[1]))
+            meshes.add_mesh(pymeshlab.Mesh(own.astype(np.float64), corners))
             meshes.meshing_decimation_quadric_edge_collapse(
                 targetfacenum=target, preserveboundary=True, boundaryweight=2.0,
                 preservenormal=True, planarquadric=True, autoclean=True,
             )  # fmt: skip
             mesh = meshes.current_mesh()
-            part = (mesh.vertex_matrix().astype(np.float32), mesh.face_matrix())
-        parts.append((*part, int(index)))
-    firsts = np.cumsum([0, *[len(p) for p, _, _ in parts]])
-    return {
-        "points": np.concatenate([p for p, _, _ in parts]),
-        "triangles": np.concatenate(
-            [f + firsts[i] for i, (_, f, _) in enumerate(parts)], dtype=np.int32
-        ),
-        "face_object": np.repeat(
-            np.array([index for _, _, index in parts], np.int32), [len(f) for _, f, _ in parts]
-        ),
-    }
-
-
-def _part(points: Array, triangles: Array, *, weld: bool) -> tuple[Array, Array]:
-    """One object's own vertices and faces; welded, because edges must be shared to be collapsed."""
-    used, corners = np.unique(triangles, return_inverse=True)
-    corners = corners.reshape(-1, 3)
-    own = points[used]
-    if not weld:
-        return own, corners.astype(np.int32)
-    _, first, joined = np.unique(welded_ids(own), return_index=True, return_inverse=True)
-    return own[first], joined[corners].astype(np.int32)
+            own, corners = mesh.vertex_matrix().astype(np.float32), mesh.face_matrix()
+        parts.append((own, corners))
+    points, triangles, part = joined(parts)
+    return {"points": points, "triangles": triangles, "face_object": objects[part].astype(np.int32)}

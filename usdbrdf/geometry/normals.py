@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
 
 from usdbrdf.kernel import parallel_kernel
-from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.mesh import face_normals_and_angles, welded_ids
 
 # The pairs of corners around one vertex grow with the square of their number. Beyond this a vertex
@@ -45,12 +44,7 @@ def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Fl
 
 @parallel_kernel
 def _sum_over_neighbours(
-    corners: npt.NDArray[np.int64],
-    starts: npt.NDArray[np.int64],
-    faces: Double,
-    angles: Double,
-    min_cosine: float,
-    normals: Float,
+    corners: Long, starts: Long, faces: Double, angles: Double, min_cosine: float, normals: Float
 ) -> None:
     """Each corner is written by one vertex alone and summed in file order: threads do not show."""
     for vertex in prange(len(starts) - 1):

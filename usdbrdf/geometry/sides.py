@@ -17,7 +17,7 @@ from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Bool, Double, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.mesh import ScanMesh, face_normals, welded_ids
+from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles, welded_ids
 from usdbrdf.transport.rays import RayScene, lift_from_surface
 
 # Rays that graze a face may belong to its neighbour behind the edge: their side tells nothing.
@@ -64,7 +64,7 @@ class Sides:
 def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
     """The side of every face of a mesh that cameras, in its own frame and unit, looked at."""
     rays = RayScene(mesh.points, mesh.triangles)
-    normals = face_normals(mesh.points, mesh.triangles)
+    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
     seen = sightings(rays, normals, cameras)
     votes = seen.votes
     decided = np.abs(votes) >= _PIXELS
@@ -205,7 +205,7 @@ def turned_towards_cameras(
             corners[sides.turned] = corners[sides.turned][:, [0, 2, 1]]
         made = slice(None) if has_normals is None else ~has_normals
         normals[made] = corner_normals(mesh.points, triangles[made], crease_angle_deg)
-        front = face_normals(mesh.points, triangles)
+        front = face_normals_and_angles(mesh.points, triangles)[0]
         normals[sides.turned & ((normals.sum(axis=1) * front).sum(axis=1) < 0)] *= -1
         turned = replace(mesh, triangles=triangles, corner_normals=normals)
     return _with_second_skin(turned, sides.both) if sides.both.any() else turned
@@ -214,7 +214,7 @@ def turned_towards_cameras(
 def _with_second_skin(mesh: ScanMesh, both: Bool) -> ScanMesh:
     """The faces ``both`` once more, seen from behind and a little behind themselves."""
     corner = mesh.points[mesh.triangles[both]]
-    normal = face_normals(mesh.points, mesh.triangles[both])
+    normal = face_normals_and_angles(mesh.points, mesh.triangles[both])[0]
     diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
     behind = corner - (_BEHIND * diagonal) * normal[:, None].astype(np.float32)
     number = len(mesh.points) + np.arange(3 * len(corner), dtype=np.int32).reshape(-1, 3)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from usdbrdf.kernel import kernel
-from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.arrays import Float, Int, Long
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 
@@ -37,9 +37,17 @@ def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
     distance = np.full(first_pixel[-1], np.inf, np.float32)
     _rasterise(corner_pixel, scene.face_object, first_pixel, resolution, owner, distance)
     pixel = np.flatnonzero(owner >= 0)
-    face = owner[pixel]
-    interior = distance[pixel] <= 0
+    face, interior = owner[pixel], distance[pixel] <= 0
     del distance
+    nearest = np.full(len(owner), -1, np.int32)
+    nearest[pixel] = np.arange(len(pixel), dtype=np.int32)
+    for i, (width, height) in enumerate(resolution):
+        picture = nearest[first_pixel[i] : first_pixel[i + 1]].reshape(height, width)
+        if (picture >= 0).any():
+            rows, columns = ndimage.distance_transform_edt(
+                picture < 0, return_distances=False, return_indices=True
+            )
+            picture[:] = picture[rows, columns]
     return Texels(
         pixel=pixel,
         face=face,
@@ -48,18 +56,14 @@ def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
         resolution=resolution,
         first_pixel=first_pixel,
         first_texel=np.searchsorted(pixel, first_pixel),
-        nearest_texel=_nearest_texel(owner, pixel, resolution, first_pixel),
+        nearest_texel=nearest,
         corner_pixel=corner_pixel,
+        far_objects=tuple(np.flatnonzero(scene.is_far).tolist()),
     )
 
 
 def _surface_points(
-    scene: Scene,
-    corner_pixel: Float,
-    pixel: npt.NDArray[np.int64],
-    face: Int,
-    resolution: Int,
-    first_pixel: npt.NDArray[np.int64],
+    scene: Scene, corner_pixel: Float, pixel: Long, face: Int, resolution: Int, first_pixel: Long
 ) -> dict[str, Float]:
     """What ``Texels`` says of each texel's point, some at a time: on the way there are hundreds of
     bytes per texel."""
@@ -75,9 +79,15 @@ def _surface_points(
         centre = np.stack([local % width, local // width], axis=-1) + np.float32(0.5)
         barycentric = _barycentric(corner_pixel[own], centre)
         corners = scene.points[scene.triangles[own]]
-        geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        # How the surface point moves by one texel right and one texel down, in metres.
+        e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        a, b = (corner_pixel[own, k] - corner_pixel[own, 0] for k in (1, 2))
+        det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        det = np.where(np.abs(det) < 1e-9, np.inf, det)[:, None]
+        step_x = ((e1 * b[:, 1:2] - e2 * a[:, 1:2]) / det).astype(np.float32)
+        step_y = ((e2 * a[:, 0:1] - e1 * b[:, 0:1]) / det).astype(np.float32)
+        geometric = np.cross(e1, e2)
         normal = np.einsum("tc,tcd->td", barycentric, scene.corner_normals[own])
-        step_x, step_y = _surface_steps(corners, corner_pixel[own])
         points["barycentric"][some] = barycentric
         points["position"][some] = np.einsum("tc,tcd->td", barycentric, corners)
         points["normal"][some] = _unit(normal, otherwise=geometric)
@@ -95,7 +105,7 @@ def _surface_points(
 def _rasterise(
     corner_pixel: Float,
     face_object: Int,
-    first_pixel: npt.NDArray[np.int64],
+    first_pixel: Long,
     resolution: Int,
     owner: Int,
     distance: Float,
@@ -159,42 +169,12 @@ def _barycentric(corners: Float, points: npt.NDArray[np.floating]) -> Float:
     edge = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
     inset = np.minimum(_INSET * edge / np.abs(det)[:, None], 0.1)
     weights = np.maximum(np.stack([1 - u - v, u, v], axis=-1), inset)
-    weights /= weights.sum(axis=-1, keepdims=True)
-    barycentric: Float = weights.astype(np.float32)
-    return barycentric
-
-
-def _surface_steps(corners: Float, corner_pixel: Float) -> tuple[Float, Float]:
-    """How the surface point moves by one texel right and one texel down: (T, 3) metres each."""
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    a, b = (corner_pixel[:, k] - corner_pixel[:, 0] for k in (1, 2))
-    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    det = np.where(np.abs(det) < 1e-9, np.inf, det)[:, None]
-    step_x = (e1 * b[:, 1:2] - e2 * a[:, 1:2]) / det
-    step_y = (e2 * a[:, 0:1] - e1 * b[:, 0:1]) / det
-    return step_x.astype(np.float32), step_y.astype(np.float32)
+    return np.asarray(weights / weights.sum(axis=-1, keepdims=True), np.float32)
 
 
 def _unit(vectors: npt.NDArray[np.floating], otherwise: npt.NDArray[np.floating]) -> Float:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     other = np.linalg.norm(otherwise, axis=-1, keepdims=True)
     fallback = np.where(other > 0, otherwise / np.maximum(other, 1e-30), (0, 0, 1))
-    return np.where(length > 1e-12, vectors / np.maximum(length, 1e-30), fallback).astype(
-        np.float32
-    )
-
-
-def _nearest_texel(
-    owner: Int, pixel: npt.NDArray[np.int64], resolution: Int, first_pixel: npt.NDArray[np.int64]
-) -> Int:
-    index = np.full(len(owner), -1, np.int32)
-    index[pixel] = np.arange(len(pixel), dtype=np.int32)
-    for i, (width, height) in enumerate(resolution):
-        flat = slice(first_pixel[i], first_pixel[i + 1])
-        picture = index[flat].reshape(height, width)
-        if (picture >= 0).any():
-            rows, columns = ndimage.distance_transform_edt(
-                picture < 0, return_distances=False, return_indices=True
-            )
-            index[flat] = picture[rows, columns].ravel()
-    return index
+    unit = np.where(length > 1e-12, vectors / np.maximum(length, 1e-30), fallback)
+    return unit.astype(np.float32)

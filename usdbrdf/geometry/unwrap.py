@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -19,11 +18,13 @@ from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Double, Float, Int
-from usdbrdf.model.mesh import doubled_areas
-from usdbrdf.model.scene import Scene
+from usdbrdf.model.mesh import compact, doubled_areas
+from usdbrdf.model.scene import Scene, SceneObject
 
-# Texels between charts: bilinear lookup stays inside its own.
-_GAP = 2
+# Texels between charts: of those that came along, so that bilinear lookup stays inside its own; of
+# new ones, with two mip levels.
+_GAP, PADDING = 2, 4
+MAX_SIDE = 16384
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -54,32 +55,30 @@ def atlas_side(corner_uv: Float, corners: Float, texel_size: float) -> int | Non
     odd = ((stretch > _MAX_STRETCH) | (stretch < 1 / _MAX_STRETCH)).any(axis=1)
     if area[shown][odd].sum() > _MAX_SHARE * area.sum():
         return None
-    return side if _is_one_to_one(corner_uv, _charts(corner_uv, corners), side) else None
-
-
-def _charts(corner_uv: Float, corners: Float) -> Int:
-    """(F,) the chart of each triangle: connected both on the surface and in the atlas."""
+    # Charts are connected both on the surface and in the atlas. No texel's centre may lie in two
+    # triangles, and none of two charts nearer than _GAP texels.
     rows = np.concatenate([corner_uv, corners], axis=2).reshape(-1, 5)
     _, vertex = np.unique(rows, axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1, 3)
-    a, b = vertex[:, [0, 0]].reshape(-1), vertex[:, [1, 2]].reshape(-1)
-    size = int(vertex.max()) + 1
-    links = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
-    _, chart = connected_components(links, directed=False)
-    return np.asarray(chart[vertex[:, 0]], np.int32)
-
-
-def _is_one_to_one(corner_uv: Float, chart: Int, side: int) -> bool:
-    """No texel's centre in two triangles, none of two charts nearer than _GAP texels."""
     owner = np.full((side, side), -1, np.int32)
+    chart = connected_triangles(vertex.reshape(-1, 3))
     if not _paint(corner_uv.astype(np.float64) * side, chart, owner):
-        return False
+        return None
     near = 2 * _GAP + 1
     highest = ndimage.maximum_filter(owner, near, mode="nearest")
     lowest = ndimage.minimum_filter(
         np.where(owner >= 0, owner, np.iinfo(np.int32).max), near, mode="nearest"
     )
-    return bool((highest == lowest)[owner >= 0].all())
+    return side if (highest == lowest)[owner >= 0].all() else None
+
+
+def connected_triangles(vertex: Array) -> Int:
+    """(F,) int32: a number for the part of the surface, connected through shared vertices, that
+    each triangle (F, 3) belongs to."""
+    size = int(vertex.max()) + 1
+    ends = np.repeat(vertex[:, 0], 2), vertex[:, 1:].reshape(-1)
+    links = coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(size, size))
+    _, part = connected_components(links, directed=False)
+    return np.asarray(part[vertex[:, 0]], np.int32)
 
 
 @kernel
@@ -103,11 +102,6 @@ def _paint(corners: Double, chart: Int, owner: Int) -> bool:
                         return False
                     owner[j, i] = chart[f]
     return True
-
-
-# Texels between charts: bilinear lookup and two mip levels stay inside a chart's own gutter.
-PADDING = 4
-MAX_SIDE = 16384
 
 
 class TexelSizes(NamedTuple):
@@ -169,7 +163,20 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
 
     Raises InputRefused when an atlas would be larger than 16,384 texels on a side.
     """
-    _refuse_huge(scene, sizes.side)
+
+    def too_large(obj: SceneObject, said: str) -> InputRefused:
+        return InputRefused(
+            f"<{obj.prim_path}>: its {said} texels (limit {MAX_SIDE}). Choose a larger "
+            f"--texel-size than {sizes.side[obj.faces].min():g} m. [texturing.size]"
+        )
+
+    # Packing what cannot fit takes xatlas minutes; the area alone tells it at once.
+    area = doubled_areas(scene.points, scene.triangles) / 2
+    texels = area / sizes.side.astype(np.float64) ** 2
+    for obj in scene.objects:
+        side = math.ceil(math.sqrt(texels[obj.faces].sum()))
+        if side > MAX_SIDE and not obj.far:
+            raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces * (not obj.far) for obj in scene.objects], np.int64)
     result = run_child(
@@ -187,33 +194,11 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     )
     for obj, (width, height) in zip(scene.objects, result["resolution"], strict=True):
         if max(width, height) > MAX_SIDE:
-            raise InputRefused(
-                f"<{obj.prim_path}>: its texture would be {width} x {height} texels (limit "
-                f"{MAX_SIDE}). Choose a larger --texel-size than {sizes.side.min():g} m. "
-                "[texturing.size]"
-            )
+            raise too_large(obj, f"texture would be {width} x {height}")
     return result["corner_uv"], result["resolution"]
 
 
-def _refuse_huge(scene: Scene, side: Float) -> None:
-    """Packing what cannot fit takes xatlas minutes; the area alone tells it at once."""
-    area = doubled_areas(scene.points, scene.triangles) / 2
-    texels = np.bincount(scene.face_object, area / side.astype(np.float64) ** 2)
-    for obj, count, square_metres in zip(
-        scene.objects, texels, np.bincount(scene.face_object, area), strict=True
-    ):
-        across = math.ceil(math.sqrt(count))
-        if across > MAX_SIDE and not obj.far:
-            raise InputRefused(
-                f"<{obj.prim_path}>: its {square_metres:.3g} m^2 would need {across} x {across} "
-                f"texels (limit {MAX_SIDE}). Choose a larger --texel-size than "
-                f"{side[obj.faces].min():g} m. [texturing.size]"
-            )
-
-
-def unwrap_objects(
-    arrays: Mapping[str, npt.NDArray[Any]], parameters: Mapping[str, Any]
-) -> dict[str, npt.NDArray[Any]]:
+def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
     """Child process: unwrap each object by itself (see ``unwrap``)."""
     triangles, points = arrays["triangles"], arrays["points"]
     corner_uv = np.zeros((len(triangles), 3, 2), np.float32)
@@ -222,16 +207,13 @@ def unwrap_objects(
         if not count:
             continue
         faces = slice(int(first), int(first + count))
-        used, local = np.unique(triangles[faces], return_inverse=True)
+        _, own, corners = compact(points, triangles[faces])
         sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])
-        uv, size = _unwrap_one(points[used], local.reshape(-1, 3).astype(np.uint32), sizes)
-        corner_uv[faces], resolution[i] = uv, size
+        corner_uv[faces], resolution[i] = _unwrap_one(own, corners, sizes)
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 
-def _unwrap_one(
-    points: Float, triangles: npt.NDArray[np.uint32], sizes: TexelSizes
-) -> tuple[Float, tuple[int, int]]:
+def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float, tuple[int, int]]:
     import xatlas
 
     low, high = points.min(axis=0), points.max(axis=0)
@@ -239,7 +221,7 @@ def _unwrap_one(
     unit = ((points - low) / max(extent, 1e-12)).astype(np.float32)
     finest = float(sizes.side.min())
     atlas = xatlas.Atlas()
-    atlas.add_mesh(unit, triangles)
+    atlas.add_mesh(unit, triangles.astype(np.uint32))
     options = xatlas.PackOptions()
     options.padding = PADDING
     options.texels_per_unit = extent / finest
@@ -255,19 +237,19 @@ def _unwrap_one(
         corner_uv[..., 1] = 1 - corner_uv[..., 1]
         if corner_uv.min() >= 0 and corner_uv.max() <= 1:
             return corner_uv.astype(np.float32), (width, height)
-    return pack_triangles_singly(points[triangles.astype(np.int64)], finest)
+    return pack_triangles_singly(points[triangles], finest)
 
 
 def _at_own_densities(
-    atlas: Any, points: Float, triangles: npt.NDArray[np.uint32], sizes: TexelSizes, options: Any
-) -> tuple[Any, npt.NDArray[np.uint32], Float]:
+    atlas: Any, points: Float, triangles: Int, sizes: TexelSizes, options: Any
+) -> tuple[Any, Int, Float]:
     """The charts of an atlas packed again, each at the texel size that its triangles agree on:
     atlas, corners and uv as xatlas gives them."""
     import xatlas
 
     _, corners, uv = atlas[0]
     chart = np.zeros(len(triangles), np.int64)
-    area = doubled_areas(points, triangles.astype(np.int32))
+    area = doubled_areas(points, triangles)
     count = atlas.get_mesh_chart_count(0)
     scale = np.ones(count)
     for k in range(count):

@@ -96,10 +96,9 @@ def _trace_doubtful(rays: RayScene, camera: Camera, picture: _Picture, point: Fl
     point[row, column] = np.where(hits.face[:, None] >= 0, reached, 0)
 
 
-@parallel_kernel
 def _boxes_in_view(boxes: Float, camera: _Pinhole) -> Bool:
-    """Does any part of a box (low, high) lie ahead of the camera, between its image's borders?"""
-    inside = np.zeros(len(boxes), np.bool_)
+    """(B,) whether any part of a box (low, high) lies ahead of the camera, between its image's
+    borders and a pixel beyond."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     # Inward normals of the planes through the image's borders, and of the one through the eye.
     sides = np.array([
@@ -108,16 +107,9 @@ def _boxes_in_view(boxes: Float, camera: _Pinhole) -> Bool:
         [0.0, 0.0, 1.0],
     ])  # fmt: skip
     planes = sides @ camera.rotation
-    for b in prange(len(boxes)):
-        seen = True
-        for k in range(5):
-            far = 0.0
-            for a in range(3):
-                end = boxes[b, 1, a] if planes[k, a] > 0 else boxes[b, 0, a]
-                far += planes[k, a] * (end - camera.eye[a])
-            seen = seen and far >= 0
-        inside[b] = seen
-    return inside
+    low, high = boxes[:, 0] - camera.eye, boxes[:, 1] - camera.eye
+    farthest = np.maximum(planes, 0) @ high.T + np.minimum(planes, 0) @ low.T
+    return np.asarray((farthest >= 0).all(axis=0), np.bool_)
 
 
 @kernel

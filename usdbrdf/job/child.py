@@ -2,33 +2,77 @@
 
 A fresh interpreter is started, not forked: our threads and locks stay here, and a caller's script
 needs no ``__main__`` guard. It imports nothing of the package but what the function needs. Arrays
-travel as files without pickles. The child dies with us.
+travel as files without pickles, in a folder for the time of the call; those that a killed run left
+behind go at the next one. The child dies with us.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
+import fcntl
 import json
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from usdbrdf import errors
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.files.arrays import load_arrays, save_arrays
 from usdbrdf.files.atomic import environment_failures
-from usdbrdf.files.documents import json_text
-from usdbrdf.job.scratch import scratch_folder
+from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
+
+PREFIX = "usdbrdf-scratch-"
+# Between its making and its locking a folder seems to have no owner.
+_MIN_AGE_SECONDS = 60
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder beside other temporary ones, of this user alone, gone at the end of the block.
+
+    It is locked as long as this process lives, so that it can be told from what nobody owns.
+    """
+    _sweep(tempfile.gettempdir())
+    with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as name:
+        descriptor = os.open(name, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # a file system without locks: it then has to be swept by hand
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield Path(name)
+        finally:
+            os.close(descriptor)
+
+
+@cache  # once in a process is enough
+def _sweep(parent: str) -> None:
+    with suppress(OSError), os.scandir(parent) as entries:
+        for entry in (entry for entry in entries if entry.name.startswith(PREFIX)):
+            with suppress(OSError):  # gone meanwhile, or locked: it has an owner
+                status = entry.stat(follow_symlinks=False)
+                old = time.time() - status.st_mtime > _MIN_AGE_SECONDS
+                ours = entry.is_dir(follow_symlinks=False) and status.st_uid == os.geteuid()
+                if not (ours and old):
+                    continue
+                descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                finally:
+                    os.close(descriptor)
+                shutil.rmtree(entry.path, ignore_errors=True)
+
 
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
@@ -51,13 +95,12 @@ def run_child(
     *,
     memory_limit_bytes: int | None = None,
 ) -> dict[str, Array]:
-    """Call ``function`` ("package.module:name") as f(arrays, parameters) in a child process.
+    """The arrays that ``function`` ("package.module:name") returns, called as f(arrays, parameters)
+    in a child process; parameters must be JSON.
 
-    arrays, parameters   what it gets; parameters must be JSON
     timeout_s            wall time after which it is killed
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
-    returns              the dictionary of arrays that it returned
 
     A UsdBrdfError raised there is raised here with its class. Death by a signal is an
     InputRefused; running out of time or memory, SIGKILL and what cannot be imported there are
@@ -77,7 +120,12 @@ def run_child(
             (folder / "task.json").write_text(json_text(task), "utf-8")
         status = _run(folder, timeout_s, label)
         if status == _ERROR_TOLD:
-            raise _told_error(folder, label)
+            told = json.loads((folder / "error.json").read_text("utf-8"))
+            if told["class"] in _ERROR_CLASSES:
+                raise _ERROR_CLASSES[told["class"]](told["message"])
+            raise UsdBrdfError(
+                f"{label} failed: {told['class']}: {told['message']}. [child.failed]"
+            ) from RuntimeError(told["traceback"])
         if status != 0:
             raise _crash(status, folder, label)
         return load_arrays(folder / "result.npz")
@@ -105,19 +153,9 @@ def _run(folder: Path, timeout_s: float, label: str) -> int:
             "again when the machine is less busy, or simplify the input. [child.timeout]"
         ) from error
     finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
-        with contextlib.suppress(ProcessLookupError):
+        with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-
-
-def _told_error(folder: Path, label: str) -> UsdBrdfError:
-    told = json.loads((folder / "error.json").read_text("utf-8"))
-    known = _ERROR_CLASSES.get(told["class"])
-    if known is not None:
-        return known(told["message"])
-    error = UsdBrdfError(f"{label} failed: {told['class']}: {told['message']}. [child.failed]")
-    error.__cause__ = RuntimeError(told["traceback"])
-    return error
 
 
 def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
@@ -142,7 +180,11 @@ def main() -> None:
     """The child's side: read the task, call the function, leave its result or its error."""
     folder = Path(sys.argv[1])
     task = json.loads((folder / "task.json").read_text("utf-8"))
-    _die_with(task["parent"])
+    # The kernel kills this process when its parent dies, which may have happened already.
+    with suppress(OSError, AttributeError):  # another system than Linux
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != task["parent"]:
+        os.kill(os.getpid(), signal.SIGKILL)
     signal.alarm(task["alarm_s"])
     if task["memory_limit_bytes"] is not None:
         limits = (task["memory_limit_bytes"], *resource.getrlimit(resource.RLIMIT_AS))
@@ -155,24 +197,13 @@ def main() -> None:
             result = getattr(import_module(module), name)(arrays, task["parameters"])
             save_arrays(folder / "result.npz", result)
     except Exception as error:
-        told: dict[str, str] = {
-            "class": type(error).__name__,
-            "message": str(error),
-            "traceback": traceback.format_exc(),
-        }
+        name, message = type(error).__name__, str(error)
         if isinstance(error, ImportError):  # a library is missing, or memory is too small for it
-            told["class"] = EnvironmentFailure.__name__
-            told["message"] = (
+            name = EnvironmentFailure.__name__
+            message = (
                 f"{task['label']}: {error}. Check the installation and the limits of this shell "
                 "(ulimit -a). [child.start]"
             )
+        told = {"class": name, "message": message, "traceback": traceback.format_exc()}
         (folder / "error.json").write_text(json.dumps(told), "utf-8")
         sys.exit(_ERROR_TOLD)
-
-
-def _die_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent dies, which may have happened already."""
-    with contextlib.suppress(OSError, AttributeError):  # another system than Linux
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os.kill(os.getpid(), signal.SIGKILL)

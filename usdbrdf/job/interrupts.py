@@ -18,10 +18,14 @@ class Terminated(BaseException):
 def interruptible() -> Iterator[None]:
     """SIGINT raises KeyboardInterrupt and SIGTERM ``Terminated`` in here, as far as they are not
     ignored; the handlers before are back afterwards."""
+
+    def interrupt(number: int, _frame: object) -> NoReturn:
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     heard = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
     for number in heard:
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
@@ -38,7 +42,3 @@ def loading() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _interrupt(number: int, _frame: object) -> NoReturn:
-    raise KeyboardInterrupt if number == signal.SIGINT else Terminated

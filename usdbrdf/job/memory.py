@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import resource
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,12 +21,28 @@ _OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 def machine_bytes() -> int:
-    """The machine's memory, or less where a container or a batch system allows less."""
-    return min([int(psutil.virtual_memory().total), *_limits()])
+    """The machine's memory, or less where a container or a batch system allows less: the limits of
+    this process's control group and of all above it (versions 2 and 1).
+
+    Lines are ``0::/GROUP`` and ``N:memory:/GROUP``. In a container GROUP may be the host's name
+    for it, of which nothing is mounted but the root.
+    """
+    limits = [int(psutil.virtual_memory().total)]
+    with suppress(OSError):
+        for line in _OWN_CGROUPS.read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            if controllers and "memory" not in controllers.split(","):
+                continue
+            top = _CGROUPS / "memory" if controllers else _CGROUPS
+            file = "memory.limit_in_bytes" if controllers else "memory.max"
+            own = top / group.strip("/")
+            for folder in (own, *own.parents[: len(own.parts) - len(top.parts)]):
+                with suppress(OSError, ValueError):  # no such file, or "max"
+                    limits.append(int((folder / file).read_text()))
+    return min(limits)
 
 
 def resident_bytes() -> int:
-    """What this process has now."""
     return int(psutil.Process().memory_info().rss)
 
 
@@ -47,22 +62,3 @@ def give_back_freed() -> None:
     million texels two fifths of all that the process held."""
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _limits() -> Iterator[int]:
-    """The limits of this process's control group and of all above it (versions 2 and 1).
-
-    Lines are ``0::/GROUP`` and ``N:memory:/GROUP``. In a container GROUP may be the host's name
-    for it, of which nothing is mounted but the root.
-    """
-    with suppress(OSError):
-        for line in _OWN_CGROUPS.read_text().splitlines():
-            _, controllers, group = line.split(":", 2)
-            if controllers and "memory" not in controllers.split(","):
-                continue
-            top = _CGROUPS / "memory" if controllers else _CGROUPS
-            file = "memory.limit_in_bytes" if controllers else "memory.max"
-            own = top / group.strip("/")
-            for folder in (own, *own.parents[: len(own.parts) - len(top.parts)]):
-                with suppress(OSError, ValueError):  # no such file, or "max"
-                    yield int((folder / file).read_text())

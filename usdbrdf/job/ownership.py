@@ -1,19 +1,111 @@
-"""Whose files are these? An output folder is ours only if we made it; edits by hand are noticed."""
+"""Whose folder is this? One run at a time in it, by a lock that the kernel frees on any death; ours
+only if we made it; and edits by hand are noticed."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import shutil
+import socket
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime, timezone
 from pathlib import Path
 
-from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, sha256_of
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.paths import inside
-from usdbrdf.job.lock import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
+
+_POLL_SECONDS = 0.2
+# Which thread of this process has which lock file. POSIX record locks belong to the process: a
+# second one from another thread would just succeed, and closing any descriptor of the file would
+# free the first. A forked child has none of them.
+_holders: dict[str, int] = {}
+
+os.register_at_fork(after_in_child=_holders.clear)
+
+
+@contextmanager
+def folder_lock(
+    state_folder: Path, wait_s: float = 0.0, *, without_lock: bool = False
+) -> Iterator[None]:
+    """Hold ``state_folder/lock``; for the thread that holds it already, nothing happens.
+
+    wait_s        how long to wait for another holder before FolderBusy, which names it
+    without_lock  go on where the file system has no locks, which is FolderBusy otherwise
+
+    The file stays and means nothing by itself; nobody ever has to delete it. FileNotFoundError: the
+    folder is not there, or was removed by the holder that this call waited for.
+    """
+    # The library filelock gives none of this on all Pythons that we run on: its locks (flock)
+    # outlive us in forked children, its earlier versions empty the file of the one who waits for
+    # it, and where a file system has no locks it leaves a file that no death removes.
+    path = state_folder.resolve() / "lock"
+    key, own = str(path), threading.get_ident()
+    if _holders.get(key) == own:
+        yield
+        return
+    deadline = time.monotonic() + wait_s
+    while _holders.setdefault(key, own) != own:
+        _wait_or_refuse(path, deadline, f"another thread of this process (pid {os.getpid()})")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        try:
+            while not _taken(descriptor, path, without_lock):
+                signed = os.pread(descriptor, 4096, 0).decode("utf-8", "replace")
+                _wait_or_refuse(path, deadline, signed or "another run that has not signed yet")
+            if not os.path.samestat(os.fstat(descriptor), path.stat()):
+                raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
+            since = datetime.now(timezone.utc).isoformat(timespec="seconds")
+            signature = f"pid {os.getpid()} on {socket.gethostname()} since {since}"
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, signature.encode("utf-8", "replace"), 0)
+            try:
+                yield
+            finally:
+                os.ftruncate(descriptor, 0)
+        finally:
+            os.close(descriptor)
+    finally:
+        _holders.pop(key, None)
+
+
+def is_held(state_folder: Path) -> bool:
+    """Whether this thread holds ``state_folder/lock``."""
+    return _holders.get(str(state_folder.resolve() / "lock")) == threading.get_ident()
+
+
+def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
+    try:
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+            raise
+        if not without_lock:
+            raise FolderBusy(
+                f"{path.parent.parent}: this file system has no working locks ({error.strerror}), "
+                "so two runs could write here at once. See that nothing else does and run with "
+                "--without-lock, or name a folder on another disk. [lock.none]"
+            ) from error
+    return True
+
+
+def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:
+    left = deadline - time.monotonic()
+    if left <= 0:
+        raise FolderBusy(
+            f"{path.parent.parent}: in use by {holder}. Wait for it to end (--wait SECONDS), or "
+            "stop it. [lock.busy]"
+        )
+    time.sleep(min(_POLL_SECONDS, left))
+
 
 JOB_SCHEMA = 1
 
@@ -30,14 +122,24 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
     made: list[Path] = []
     with ExitStack() as held:
         with environment_failures(str(asset)):
-            state = _accepted(asset, made)
             while True:
+                state = _accepted(asset, made)
                 with suppress(FileNotFoundError):  # a run that failed took its folder away
                     held.enter_context(folder_lock(state, wait_s, without_lock=without_lock))
                     break
-                state = _accepted(asset, made)
             held.enter_context(_removed_if_unused(asset, made))
-            _write_job_record(state / "job.json")
+            record = state / "job.json"
+            try:
+                document = read_json(record)
+                schema = document.get("schema") if isinstance(document, dict) else None
+                if isinstance(schema, int) and schema > JOB_SCHEMA:
+                    raise OwnershipConflict(
+                        f"{record}: written by a newer usdbrdf (schema {schema}, this one knows "
+                        f"{JOB_SCHEMA}). Install that version or name another folder. "
+                        "[ownership.newer]"
+                    )
+            except InputRefused:  # absent or damaged: it only says whose folder this is
+                write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
             for folder in (state, state / "stamps", state / "work"):
                 inside(asset, folder).mkdir(exist_ok=True)
                 for litter in folder.glob(f"{TEMPORARY_PREFIX}*"):
@@ -72,12 +174,19 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
             f"{asset}: {place} is not writable. Change its permission or name another folder. "
             "[environment.output]"
         )
-    if place == asset and not _is_ours(asset):
+    state = asset / STATE_FOLDER
+    entries = {entry.name for entry in asset.iterdir()} if place == asset else set()
+    # Killed between the first mkdir and job.json: nothing of anybody's can be in there yet.
+    begun = entries == {STATE_FOLDER} and all(
+        entry.name in ("stamps", "work", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
+        for entry in state.iterdir()
+    )
+    if entries and not begun and not (state / "job.json").is_file():
         raise OwnershipConflict(
             f"{asset}: the folder is not empty and was not made by usdbrdf. Name a new or empty "
             "folder. [ownership.foreign]"
         )
-    state = inside(asset, asset / STATE_FOLDER)
+    inside(asset, state)
     inside(asset, state / "lock")
     for folder in (*reversed(asset.parents), asset, state):
         if not os.path.lexists(folder):
@@ -85,18 +194,6 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
                 folder.mkdir()
                 made.insert(0, folder)
     return state
-
-
-def _is_ours(asset: Path) -> bool:
-    entries = {entry.name for entry in asset.iterdir()}
-    state = asset / STATE_FOLDER
-    if not entries or (state / "job.json").is_file():
-        return True
-    # Killed between the first mkdir and job.json: nothing of anybody's can be in there yet.
-    return entries == {STATE_FOLDER} and all(
-        entry.name in ("stamps", "work", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
-        for entry in state.iterdir()
-    )
 
 
 @contextmanager
@@ -115,17 +212,3 @@ def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
                 for folder in made:
                     folder.rmdir()
         raise
-
-
-def _write_job_record(path: Path) -> None:
-    try:
-        record = read_json(path)
-    except InputRefused:  # absent or damaged: it only says whose folder this is
-        write_json(path, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
-        return
-    schema = record.get("schema") if isinstance(record, dict) else None
-    if isinstance(schema, int) and schema > JOB_SCHEMA:
-        raise OwnershipConflict(
-            f"{path}: written by a newer usdbrdf (schema {schema}, this one knows {JOB_SCHEMA}). "
-            "Install that version or name another folder. [ownership.newer]"
-        )

@@ -89,16 +89,12 @@ def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Ite
             iterable, total=total, desc=printable(label), unit=f" {unit}", file=sys.stderr
         )
     else:
-        yield from _with_lines(iterable, total, label, unit)
-
-
-def _with_lines(iterable: Iterable[T], total: int, label: str, unit: str) -> Iterator[T]:
-    due = time.monotonic() + _SECONDS_BETWEEN_LINES
-    for done, item in enumerate(iterable):
-        if time.monotonic() >= due:
-            say(f"{label}: {done} of {total} {unit}")
-            due = time.monotonic() + _SECONDS_BETWEEN_LINES
-        yield item
+        due = time.monotonic() + _SECONDS_BETWEEN_LINES
+        for done, item in enumerate(iterable):
+            if time.monotonic() >= due:
+                say(f"{label}: {done} of {total} {unit}")
+                due = time.monotonic() + _SECONDS_BETWEEN_LINES
+            yield item
 
 
 def printable(text: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -17,9 +18,29 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.files.documents import json_text, read_json, write_json
 from usdbrdf.identity import tasks_identity
+
+
+def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
+    """One SHA-256 over names (relative to ``root``, if given) and contents of many files, wherever
+    they lie, in the order in which they come; InputRefused where one is missing."""
+    names = list(files)
+    for name in names:
+        if not name.is_file():
+            raise InputRefused(
+                f"{name}: this file, which was there at ingest, is missing. Run `usdbrdf convert` "
+                "with the capture again, from where it lies now. [input.missing]"
+            )
+    with environment_failures("reading the inputs"), ThreadPoolExecutor() as pool:
+        digests = list(pool.map(sha256_of, names))
+    lines = [
+        f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
+        for name, digest in zip(names, digests, strict=True)
+    ]
+    return hashlib.sha256("".join(lines).encode(errors="surrogateescape")).hexdigest()
+
 
 STATE_FOLDER = ".usdbrdf"
 STAMP_SCHEMA = 1
@@ -29,7 +50,6 @@ STAMP_SCHEMA = 1
 class Stamp:
     """What a task did.
 
-    stage                its name
     version, code        of the package, and the hash of its sources
     parameters, inputs   what it depends on; inputs maps a label to a SHA-256
     outputs              asset-relative path -> SHA-256
@@ -52,23 +72,21 @@ class Stamp:
     def fingerprint(self) -> str:
         """12 hexadecimal digits of all that the outputs depend on."""
         cause = [self.stage, self.version, self.code, self.parameters, self.inputs]
-        return hashlib.sha256(json_text(cause).encode()).hexdigest()[:12]
+        return _sha256_of_json(cause)[:12]
 
 
 def stamp_of(name: str, parameters: Mapping[str, Any], inputs: Mapping[str, str]) -> Stamp:
     """The stamp of a task that has not run yet, its parameters as JSON gives them back."""
-    plain = json.loads(json_text(dict(parameters)))
     return Stamp(
         stage=name,
         version=code_version(),
         code=tasks_identity(),
-        parameters=plain,
+        parameters=json.loads(json_text(dict(parameters))),
         inputs=dict(inputs),
     )
 
 
 def stamp_path(asset: Path, order: int, name: str) -> Path:
-    """Where the stamp of a task lies."""
     return asset / STATE_FOLDER / "stamps" / f"{order}-{name}.json"
 
 
@@ -81,7 +99,7 @@ def read_stamp(path: Path) -> Stamp | None:
     """A stamp or journal; None if absent, damaged, altered or of a schema that we do not know."""
     try:
         record = read_json(path)
-        if record.pop("schema") != STAMP_SCHEMA or record.pop("check") != _check(record):
+        if record.pop("schema") != STAMP_SCHEMA or record.pop("check") != _sha256_of_json(record):
             return None
         stamp = Stamp(**record)
         for relative in (*stamp.outputs, *stamp.once, *stamp.earlier):
@@ -94,7 +112,7 @@ def read_stamp(path: Path) -> Stamp | None:
 def write_stamp(path: Path, stamp: Stamp) -> None:
     """Write a stamp or journal, whole or not at all."""
     record = asdict(stamp)
-    write_json(path, {"schema": STAMP_SCHEMA, "check": _check(record), **record})
+    write_json(path, {"schema": STAMP_SCHEMA, "check": _sha256_of_json(record), **record})
 
 
 def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
@@ -107,7 +125,8 @@ def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
     if stamp.code != wanted.code:
         return "code changed"
     for kind in ("parameters", "inputs"):
-        names = _differing(getattr(stamp, kind), getattr(wanted, kind))
+        old, new = getattr(stamp, kind), getattr(wanted, kind)
+        names = sorted(key for key in {*old, *new} if old.get(key, ...) != new.get(key, ...))
         if names:
             return f"{kind} changed: {', '.join(names)}"
     for relative, expected in stamp.outputs.items():
@@ -154,10 +173,5 @@ def code_version() -> str:
         return "0+checkout"
 
 
-def _check(record: Mapping[str, Any]) -> str:
+def _sha256_of_json(record: object) -> str:
     return hashlib.sha256(json_text(record).encode()).hexdigest()
-
-
-def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    missing = object()
-    return sorted(key for key in {*old, *new} if old.get(key, missing) != new.get(key, missing))

@@ -1,27 +1,38 @@
 """Run a task so that it can be killed at any moment and started again by the same command.
 
-Work happens in ``.usdbrdf/work/<task>-<fingerprint>``: checkpoints of finished pieces, and the
-outputs under their final names. Only complete, verified outputs are published; a journal written
-before the first replacement lets the next run finish a publish that was interrupted half-way.
-The stamp comes last. Hold ``folder_lock`` around it: nothing here expects company.
+Work happens in ``.usdbrdf/work/<task>-<fingerprint>``: checkpoints of finished pieces, each a file
+that carries its own hash in its name, and the outputs under their final names. Only complete,
+verified outputs are published; a journal written before the first replacement lets the next run
+finish a publish that was interrupted half-way. The stamp comes last. Hold ``folder_lock`` around
+it: nothing here expects company.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
-from usdbrdf.errors import UsdBrdfError
-from usdbrdf.files.atomic import environment_failures, flush_folder, move, sha256_of
-from usdbrdf.files.documents import json_text
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import (
+    environment_failures,
+    flush_folder,
+    move,
+    publish,
+    sha256_of,
+    temporary_beside,
+)
+from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.files.paths import inside
-from usdbrdf.job.checkpoints import Checkpoints
 from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.stamp import (
     STATE_FOLDER,
@@ -35,7 +46,13 @@ from usdbrdf.job.stamp import (
     why_rerun,
     write_stamp,
 )
+from usdbrdf.model.arrays import Array
 
+# A checkpoint's name: key, index of a running computation's state, hash of its bytes.
+_NAME = re.compile(r"(?P<key>[^@]*)(?:@(?P<index>\d{9}))?\.(?P<sha256>[0-9a-f]{64})\.npz")
+# Seconds between saved states of a running computation, and how many times as long as saving one
+# takes: what a kill can cost, and what saving may.
+_SAVE_AFTER, _SAVE_SELDOM = 2.0, 30
 # What a layer points at is there before the layer: textures, binary layers, text layers.
 _RANK = {".usdc": 1, ".usd": 1, ".usda": 2}
 
@@ -49,11 +66,14 @@ class TaskResult:
     reason: str
 
 
-class TaskRun(Checkpoints):
-    """What the work of a task gets: places for its outputs, and checkpoints."""
+class TaskRun:
+    """What the work of a task gets: places for its outputs, and checkpoints.
+
+    A checkpoint is a named set of arrays for a later run of the same task; a damaged one is as good
+    as none. Of the numbered states of one running computation only the newest is kept.
+    """
 
     def __init__(self, asset: Path, name: str, folder: Path) -> None:
-        super().__init__(folder / "checkpoints")
         self.asset = asset
         self.name = name
         self.staged = folder / "staged"
@@ -61,6 +81,19 @@ class TaskRun(Checkpoints):
         self.once: list[str] = []
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
+        self._checkpoints = folder / "checkpoints"
+        self._checkpoints.mkdir(exist_ok=True)
+        self._files: dict[tuple[str, int | None], Path] = {}
+        # When a running computation's state was saved last, and how long that took: the first is
+        # saved at once, which tells.
+        self._saved = -math.inf, 0.0
+        for path in self._checkpoints.iterdir():
+            match = _NAME.fullmatch(path.name)
+            if match is None:
+                path.unlink()  # what a killed process was writing
+                continue
+            index = match["index"]
+            self._files[unquote(match["key"]), int(index) if index else None] = path
 
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
@@ -77,6 +110,66 @@ class TaskRun(Checkpoints):
         path = self.staged / relative
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+    def checkpoint(self, key: str, compute: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
+        """The arrays of ``compute``, from an earlier run of the same task if it got that far."""
+        stored = self.checkpoint_if(key)
+        if stored is not None:
+            return stored
+        arrays = dict(compute())
+        self.save(key, arrays)
+        return arrays
+
+    def checkpoint_if(self, key: str, index: int | None = None) -> dict[str, Array] | None:
+        """The arrays saved under ``key`` by this or an interrupted run, bit for bit, or None."""
+        path = self._files.get((key, index))
+        if path is None:
+            return None
+        with suppress(OSError, InputRefused):
+            if sha256_of(path) == path.name.split(".")[-2]:
+                return load_arrays(path)
+        self._files.pop((key, index)).unlink(missing_ok=True)
+        return None
+
+    def save(self, key: str, arrays: Mapping[str, Array], index: int | None = None) -> None:
+        """Store arrays; the file is there under its final name only once it is complete."""
+        stem = quote(key, safe="") + (f"@{index:09d}" if index is not None else "")
+        with temporary_beside(self._checkpoints / "arrays.npz") as staged:
+            save_arrays(staged, arrays)
+            path = self._checkpoints / f"{stem}.{sha256_of(staged)}.npz"
+            publish(staged, path)
+        earlier = self._files.get((key, index), path)
+        self._files[key, index] = path
+        if earlier != path:
+            earlier.unlink(missing_ok=True)
+
+    def latest(self, key: str) -> tuple[int, dict[str, Array]] | None:
+        """Index and arrays of the newest intact state that ``save_latest`` stored, or None."""
+        for index in sorted(
+            (i for k, i in self._files if k == key and i is not None), reverse=True
+        ):
+            arrays = self.checkpoint_if(key, index)
+            if arrays is not None:
+                return index, arrays
+        return None
+
+    def save_latest(self, key: str, index: int, arrays: Mapping[str, Array]) -> None:
+        """Store the state of a running computation after step ``index``; older ones are deleted."""
+        self.save(key, arrays, index)
+        for known in list(self._files):
+            if known[0] == key and known[1] not in (None, index):
+                self._files.pop(known).unlink(missing_ok=True)
+
+    def save_latest_in_time(
+        self, key: str, index: int, arrays: Callable[[], Mapping[str, Array]]
+    ) -> None:
+        """``save_latest``, but not so often that it costs more than a few per cent of the time."""
+        last, took = self._saved
+        start = time.monotonic()
+        if start - last >= max(_SAVE_AFTER, _SAVE_SELDOM * took):
+            self.save_latest(key, index, arrays())
+            end = time.monotonic()
+            self._saved = end, end - start
 
 
 def run_task(
@@ -127,7 +220,10 @@ def run_task(
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
         run = TaskRun(asset, name, folder)
         summary = json.loads(json_text(work(run)))
-        outputs = _hashes_of_staged(run)
+        for relative in (*run.outputs, *run.once):
+            if not (run.staged / relative).is_file():
+                raise UsdBrdfError(f"the task {name} did not write {relative}. [task.output]")
+        outputs = {relative: sha256_of(run.staged / relative) for relative in run.outputs}
         # The hashes of this task's files as they may lie there now, and of what is about to be
         # replaced, such as an empty layer that another task put there.
         earlier = hashes_in([read_stamp(stamp), noted])
@@ -147,13 +243,6 @@ def run_task(
         return TaskResult(summary=summary, reran=True, reason=reason)
 
 
-def _hashes_of_staged(run: TaskRun) -> dict[str, str]:
-    for relative in (*run.outputs, *run.once):
-        if not (run.staged / relative).is_file():
-            raise UsdBrdfError(f"the task {run.name} did not write {relative}. [task.output]")
-    return {relative: sha256_of(run.staged / relative) for relative in run.outputs}
-
-
 def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
     """Whether every output of an interrupted publish is in the asset or still waits, intact."""
     return all(
@@ -167,27 +256,30 @@ def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
 def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     """Replace the outputs, delete those that are no longer made, write the stamp, clean up; every
     step can be repeated."""
-    staged = folder / "staged"
-    for _, outputs in groupby(sorted(sorted(journal.outputs), key=_rank), key=_rank):
+
+    def moved(relative: str) -> Path:
+        """The folder of an output that has been moved there, or had been already."""
+        staged, final = folder / "staged" / relative, asset / relative
+        inside(asset, final.parent)
+        if staged.is_file():
+            final.parent.mkdir(parents=True, exist_ok=True)
+            move(staged, final)
+        return final.parent
+
+    def rank(relative: str) -> int:
+        return _RANK.get(Path(relative).suffix, 0)
+
+    for _, outputs in groupby(sorted(sorted(journal.outputs), key=rank), key=rank):
         # The asset itself, too: its folders may be new.
-        for changed in {asset, *(_moved_into(asset, staged, relative) for relative in outputs)}:
+        for changed in {asset, *map(moved, outputs)}:
             flush_folder(changed)
     for relative in journal.once:
         if not (asset / relative).exists():
-            flush_folder(_moved_into(asset, staged, relative))
+            flush_folder(moved(relative))
     _retire(asset, journal)
     write_stamp(stamp_path(asset, order, journal.stage), replace(journal, earlier={}))
     journal_path(asset, journal.stage).unlink()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def _moved_into(asset: Path, staged: Path, relative: str) -> Path:
-    """The folder of an output that has been moved there, or had been already."""
-    folder = inside(asset, (asset / relative).parent)
-    if (staged / relative).is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        move(staged / relative, asset / relative)
-    return folder
 
 
 def _retire(asset: Path, journal: Stamp) -> None:
@@ -197,7 +289,3 @@ def _retire(asset: Path, journal: Stamp) -> None:
         if relative not in journal.outputs and path.is_file() and sha256_of(path) in hashes:
             inside(asset, path.parent)
             path.unlink()
-
-
-def _rank(relative: str) -> int:
-    return _RANK.get(Path(relative).suffix, 0)

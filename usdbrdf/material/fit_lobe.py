@@ -4,21 +4,21 @@ what the noise of the rays does to it."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.material.lobe_posterior import (
+from usdbrdf.material.verdict import (
     NOTHING_KNOWN,
+    SOME_EVIDENCE,
     LobeEstimate,
     averaged,
     least_costs,
     lobe_from_costs,
 )
-from usdbrdf.material.verdict import SOME_EVIDENCE
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.transport.lobe_radiance import Basis
@@ -58,16 +58,11 @@ def error_of_rays(
     each -= np.einsum("pci,pc->pi", first - second, solved[..., 4])
     pull = model.sums_of_texels(each) / 2
     crossed = np.einsum("pci,pcj->ij", solved[..., :2], second)
-    moved = pull @ _inverse((crossed + crossed.T) / 2)
-    by_phi, by_psi = np.sqrt((moved**2).sum(axis=0))
+    # With the prior's precision at least: noise may leave less than that of it.
+    values, vectors = np.linalg.eigh((crossed + crossed.T) / 2)
+    inverse = (vectors / (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
+    by_phi, by_psi = np.sqrt(((pull @ inverse) ** 2).sum(axis=0))
     return float(by_phi), float(by_psi)
-
-
-def _inverse(normal: Double) -> Double:
-    """Of a symmetric matrix with the prior's precision: noise may leave less than that of it."""
-    values, vectors = np.linalg.eigh(normal)
-    found: Double = (vectors / (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
-    return found
 
 
 def repeated_where_noisy(fit: Callable[[int, int], LobeEstimate], seed: int) -> LobeEstimate:
@@ -92,12 +87,9 @@ def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
         of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
     of_rays /= np.sqrt(len(found))
     errors = np.minimum(np.hypot(stated.mean(axis=0), of_rays), NOTHING_KNOWN)
-    means = {
-        name: float(np.mean([getattr(one, name) for one in found]))
-        for name in ("phi", "psi", "unresolved", "cost", "evidence")
-    }
+    names = ("phi", "psi", "unresolved", "cost", "evidence")
     return LobeEstimate(
-        **means,
+        **{name: float(np.mean([getattr(one, name) for one in found])) for name in names},
         phi_error=float(errors[0]),
         psi_error=float(errors[1]),
         of_rays=(float(of_rays[0]), float(of_rays[1])),
@@ -115,8 +107,7 @@ _LEVEL_2 = 3
 _UPDATES, _MORE = 4, 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class Candidate:
+class Candidate(NamedTuple):
     """What the lobe would look like with one footprint of the samples.
 
     first, second, third  roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K)
@@ -136,26 +127,64 @@ class Candidate:
     likely: float = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Search:
-    """c0, c1, c2 of cost(psi) = c0 - 2 psi c1 + psi^2 c2 at each roughness, (K, 3)."""
+class _Fit:
+    """One candidate and the samples, at the model's present variances."""
 
-    phis: Sequence[float]
-    terms: Double
+    def __init__(self, candidate: Candidate, model: ViewModel, radiance: Float) -> None:
+        self._candidate, self._model, self._radiance = candidate, model, radiance[..., None]
+        # Two bases of level 1 for costs, one at single roughnesses for weights.
+        self._first, self._second = candidate.first(_LEVEL_1), candidate.second(_LEVEL_1)
+        self._of_weights = cache(lambda phi: candidate.third([phi]))
 
-    @property
-    def least(self) -> tuple[float, int, float]:
-        """The least cost, with the index of its roughness and its psi in [0, 1]."""
-        psi, cost, _ = least_costs(self.terms, float(self.terms[:, 0].max()))
-        best = int(cost.argmin())
-        return float(cost[best]), best, float(psi[best])
+    def coarse(self) -> Double:
+        """The costs' terms at level 1."""
+        return self._terms(self._first, self._second)
 
-    def and_more(self, other: _Search) -> _Search:
-        """Both, with ascending roughnesses."""
-        phis = [*self.phis, *other.phis]
-        order = np.argsort(phis)
-        terms = np.concatenate([self.terms, other.terms])[order]
-        return _Search(phis=[phis[k] for k in order], terms=terms)
+    def improve(self) -> None:
+        """The variances, from what the best lobe leaves."""
+        _, best, psi = _least(self.coarse())
+        base, slope = self._of_weights(_LEVEL_1[best])
+        self._model.update((base + psi * slope)[..., 0])
+
+    def estimate(self, coarse: Double, without: float, repeats: int) -> LobeEstimate:
+        """The lobe, searched more closely than at level 1. without: the cost without specular
+        light."""
+        _, best, _ = _least(coarse)
+        ends = _LEVEL_1[max(best - 1, 0) : best + 2]
+        steps = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
+        between = [float(phi) for part in steps for phi in part]
+        bases = self._candidate.first(between), self._candidate.second(between)
+        order = np.argsort([*_LEVEL_1, *between])
+        phis = np.array([*_LEVEL_1, *between])[order]
+        terms = np.concatenate([coarse, self._terms(*bases)])[order]
+        least, best, psi = _least(terms)
+        near = [float(phis[k]) for k in (max(best - 1, 0), best, min(best + 1, len(phis) - 1))]
+        bases = self._candidate.first(near), self._candidate.second(near)
+        # The cost with the bases' own noise in it: the mean of either basis' squares.
+        lobes = [(base + np.float32(psi) * slope)[..., 1:2] for base, slope in bases]
+        rest = self._model.reduced(self._radiance - np.concatenate(lobes, axis=2))
+        noisy = least + (float(self._model.product(rest, rest).mean()) - least) / repeats
+        freedom = self._model.degrees_of_freedom
+        found = lobe_from_costs(phis, terms, without, noisy, freedom, self._candidate.blur)
+        of_rays = error_of_rays(self._model, self._radiance[..., 0], bases, near, psi)
+        return found._replace(of_rays=of_rays)
+
+    def _terms(self, first: Pair, second: Pair) -> Double:
+        """c0, c1, c2 of cost(psi) = c0 - 2 psi c1 + psi^2 c2 at each roughness, (K, 3), from bases
+        (P, 3, K) with independent noise."""
+        model = self._model
+        sets = self._radiance - first[0], self._radiance - second[0], first[1], second[1]
+        rest, other_rest, slope, other_slope = model.reduced(np.concatenate(sets, axis=2)).parts(4)
+        crossed = model.product(slope, other_rest) + model.product(other_slope, rest)
+        square, constant = model.product(slope, other_slope), model.product(rest, other_rest)
+        return np.stack([constant, crossed / 2, square], axis=1)
+
+
+def _least(terms: Double) -> tuple[float, int, float]:
+    """The least cost, with the index of its roughness and its psi in [0, 1]."""
+    psi, cost, _ = least_costs(terms, float(terms[:, 0].max()))
+    best = int(cost.argmin())
+    return float(cost[best]), best, float(psi[best])
 
 
 def fit_lobe(
@@ -168,92 +197,19 @@ def fit_lobe(
     with these. With them fixed all candidates are fitted and compared.
     """
     model = ViewModel(samples)
-    radiance = samples.radiance[..., None]
-    tables = [_Table(candidate) for candidate in candidates]
+    fits = [_Fit(candidate, model, samples.radiance) for candidate in candidates]
     for _ in range(_UPDATES):
-        _improve(model, radiance, tables[0])
-    coarse = [_search(model, radiance, table) for table in tables]
-    best = int(np.argmin([search.least[0] for search in coarse]))
+        fits[0].improve()
+    coarse = [fit.coarse() for fit in fits]
+    best = int(np.argmin([_least(terms)[0] for terms in coarse]))
     if best > 0:
         for _ in range(_MORE):
-            _improve(model, radiance, tables[best])
-        coarse = [_search(model, radiance, table) for table in tables]
-    whole = model.reduced(radiance)
+            fits[best].improve()
+        coarse = [fit.coarse() for fit in fits]
+    whole = model.reduced(samples.radiance[..., None])
     without = float(model.product(whole, whole)[0])
     estimates = [
-        _estimate(model, radiance, candidate, search, without, repeats)
-        for candidate, search in zip(candidates, coarse, strict=True)
+        fit.estimate(terms, without, repeats) for fit, terms in zip(fits, coarse, strict=True)
     ]
     likely = [candidate.likely for candidate in candidates]
     return averaged(estimates, model.degrees_of_freedom, likely)
-
-
-def _estimate(
-    model: ViewModel,
-    radiance: Float,
-    candidate: Candidate,
-    coarse: _Search,
-    without: float,
-    repeats: int,
-) -> LobeEstimate:
-    """One candidate's lobe, searched more closely than ``coarse``, with the variances as they are.
-    without: the cost without specular light."""
-    between = _level_2(_LEVEL_1[coarse.least[1]])
-    bases = candidate.first(between), candidate.second(between)
-    more = _Search(phis=between, terms=_terms(model, radiance, *bases))
-    fine = coarse.and_more(more)
-    least, best, psi = fine.least
-    near = [fine.phis[k] for k in (max(best - 1, 0), best, min(best + 1, len(fine.phis) - 1))]
-    bases = candidate.first(near), candidate.second(near)
-    noisy = least + (_cost_with_noise(model, radiance, bases, psi) - least) / repeats
-    found = lobe_from_costs(
-        np.array(fine.phis), fine.terms, without, noisy, model.degrees_of_freedom, candidate.blur
-    )
-    of_rays = error_of_rays(model, radiance[..., 0], bases, near, psi)
-    return replace(found, of_rays=of_rays)
-
-
-class _Table:
-    """A candidate's bases: two of level 1 for costs, one at single roughnesses for weights."""
-
-    def __init__(self, candidate: Candidate) -> None:
-        self.first, self.second = candidate.first(_LEVEL_1), candidate.second(_LEVEL_1)
-        self.of_weights = cache(lambda phi: candidate.third([phi]))
-
-
-def _improve(model: ViewModel, radiance: Float, table: _Table) -> None:
-    _, best, psi = _search(model, radiance, table).least
-    base, slope = table.of_weights(_LEVEL_1[best])
-    model.update((base + psi * slope)[..., 0])
-
-
-def _search(model: ViewModel, radiance: Float, table: _Table) -> _Search:
-    return _Search(phis=_LEVEL_1, terms=_terms(model, radiance, table.first, table.second))
-
-
-def _terms(model: ViewModel, radiance: Float, first: Pair, second: Pair) -> Double:
-    """c0, c1, c2 of each roughness, (K, 3), from bases (P, 3, K) with independent noise."""
-    sets = radiance - first[0], radiance - second[0], first[1], second[1]
-    rest, other_rest, slope, other_slope = model.reduced(np.concatenate(sets, axis=2)).parts(4)
-    crossed = model.product(slope, other_rest) + model.product(other_slope, rest)
-    return np.stack(
-        [model.product(rest, other_rest), crossed / 2, model.product(slope, other_slope)], axis=1
-    )
-
-
-def _cost_with_noise(
-    model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], psi: float
-) -> float:
-    """The cost of the lobe in the middle of three, with the bases' own noise in it: the mean of
-    either basis' squares."""
-    sets = [radiance - (base + np.float32(psi) * slope)[..., 1:2] for base, slope in bases]
-    rest = model.reduced(np.concatenate(sets, axis=2))
-    return float(model.product(rest, rest).mean())
-
-
-def _level_2(near: float) -> list[float]:
-    """More roughnesses on both sides of ``near``, one of level 1."""
-    best = _LEVEL_1.index(near)
-    ends = [_LEVEL_1[k] for k in range(max(best - 1, 0), min(best + 2, len(_LEVEL_1)))]
-    between = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
-    return [float(phi) for part in between for phi in part]

@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, FrameReader, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_target import (
-    FrameCounts,
     Residual,
     choose_target_frames,
     count_frame,
@@ -31,10 +30,9 @@ from usdbrdf.material.verdict import (
     verdict_on_frame,
     verdict_on_views,
 )
-from usdbrdf.model.arrays import Array, Bool, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import SceneObject
-from usdbrdf.model.texels import Texels
 from usdbrdf.options import FitOptions
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_radiance import Mixture
@@ -78,17 +76,13 @@ class ObjectFit(NamedTuple):
 
     def arrays(self) -> dict[str, Array]:
         """As checkpoints hold it."""
-        return {
-            "numbers": np.array(self[:7]),
-            "used": np.array(self.num_samples),
-            "target": np.array(self.target),
-        }
+        return {"fit": np.array(self, np.float64)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> ObjectFit:
         """The inverse of ``arrays``."""
-        counts = int(arrays["used"]), int(arrays["target"])
-        return cls._make([*map(float, arrays["numbers"]), *counts])
+        *numbers, num_samples, target = arrays["fit"].tolist()
+        return cls._make([*numbers, int(num_samples), int(target)])
 
     def rounded(self) -> ObjectFit:
         """Without the digits that depend on how many threads the linear algebra had."""
@@ -96,48 +90,43 @@ class ObjectFit(NamedTuple):
 
 
 def survey_frames(
-    run: TaskRun, lit: LitScene, texels: Texels, usable: Bool, frames: Frames, options: FitOptions
+    run: TaskRun, lit: LitScene, usable: Bool, reader: FrameReader, options: FitOptions
 ) -> Survey:
     """Gather all that the fits need of the frames, which are read once.
 
     usable (T,): measured by frames, and no lamp
     """
+    frames = reader.frames
 
     def gather() -> dict[str, Array]:
         by_views = options.method == "views"
-        follower = Follower(
-            lit, texels, usable & texels.interior & by_views, len(frames), options.seed
-        )
+        followed = usable & lit.texels.interior & by_views
+        follower = Follower(lit, followed, len(frames), options.seed)
         counts = []
-        numbers = range(len(frames))
-        for i in progress(numbers, total=len(frames), label="fit: survey", unit="frames"):
-            pixels = read_frame(frames, i)
+        images = read_frames(reader.read, range(len(frames)))
+        for i, pixels in progress(images, total=len(frames), label="fit: survey", unit="frames"):
             if by_views:
-                view = _view(frames, i, np.nan_to_num(pixels.radiance), pixels.valid)
-                follower.add(view, pixels.clipped, float(frames.noise_floor_radiance[i]))
+                noise_floor = float(frames.noise_floor_radiance[i])
+                follower.add(_view(frames, i, pixels), pixels.clipped, noise_floor)
             else:
-                counts.append(_count(lit, frames, i, pixels.valid))
-        target = follower.target_frames(texels) if by_views else choose_target_frames(counts)[0]
-        chosen = follower.chosen(texels, options.seed)
+                stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
+                counts.append(count_frame(lit, pixels.valid, frames.camera(i), stride))
+        target = follower.target_frames() if by_views else choose_target_frames(counts)[0]
         smoothing = np.array(follower.smoothing)
-        return {"target": target, "smoothing": smoothing, **chosen.arrays()}
+        return {"target": target, "smoothing": smoothing, **follower.chosen(options.seed)._asdict()}
 
     found = run.checkpoint("survey", gather)
     target, smoothing = found.pop("target"), float(found.pop("smoothing"))
     return Survey(target=target, smoothing=smoothing, observations=Observations(**found))
 
 
-def _view(frames: Frames, i: int, radiance: Float, valid: Bool) -> View:
-    return View(radiance=radiance, valid=valid, camera=frames.camera(i))
-
-
-def _count(lit: LitScene, frames: Frames, i: int, valid: Bool) -> FrameCounts:
-    stride = max(1, round(math.sqrt(valid.size / _COUNTED_PIXELS)))
-    return count_frame(lit, valid, frames.camera(i), stride)
+def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
+    radiance = np.nan_to_num(pixels.radiance)
+    return View(radiance=radiance, valid=pixels.valid, camera=frames.camera(i))
 
 
 def fitted_objects(
-    run: TaskRun, lit: LitScene, texels: Texels, frames: Frames, survey: Survey, options: FitOptions
+    run: TaskRun, lit: LitScene, reader: FrameReader, survey: Survey, options: FitOptions
 ) -> list[ObjectFit]:
     """``fit_object`` of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))
@@ -149,7 +138,7 @@ def fitted_objects(
         ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
     ):
         jobs = {
-            pool.submit(fit_object, lit, texels, frames, survey, i, options): i
+            pool.submit(fit_object, lit, reader, survey, i, options): i
             for i in numbers
             if i not in done
         }
@@ -166,8 +155,7 @@ def fitted_objects(
 
 def fit_object(
     lit: LitScene,
-    texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     survey: Survey,
     index: int,
     options: FitOptions,
@@ -176,20 +164,19 @@ def fit_object(
     """The lobe of one object by the chosen method; mixture: see fit_views."""
     target = int(survey.target[index])
     if options.method == "views":
-        own = survey.observations.of_texels(texels.of_object(index))
+        own = survey.observations.of_texels(lit.texels.of_object(index))
         lobe, used = fit_views(
-            lit, texels, own, survey.smoothing, frames.camera, index, options.seed, mixture
+            lit, own, survey.smoothing, reader.frames.camera, index, options.seed, mixture
         )
         if lobe is None:
             return ObjectFit(num_samples=used, target=target)
-        return ObjectFit(
-            lobe.phi, lobe.psi, lobe.phi_error, lobe.psi_error, lobe.unresolved, lobe.cost,
-            lobe.evidence, used, target,
-        )  # fmt: skip
-    if target < 0 or _is_lamp(lit, index):
+        return ObjectFit(*lobe[:7], used, target)
+    faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
+    third = np.full(len(faces), 1 / 3, np.float32)
+    shines = lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5
+    if target < 0 or shines.all():
         return ObjectFit(target=target)
-    pixels = read_frame(frames, target)
-    view = _view(frames, target, np.nan_to_num(pixels.radiance), pixels.valid)
+    view = _view(reader.frames, target, reader.read(target))
     residual: Residual = "paper" if options.method == "paper" else "scaled"
     found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
     if found is None:
@@ -199,13 +186,6 @@ def fit_object(
     return ObjectFit(
         found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence, used, target
     )
-
-
-def _is_lamp(lit: LitScene, index: int) -> bool:
-    """Does every point of the object shine?"""
-    faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
-    third = np.full(len(faces), 1 / 3, np.float32)
-    return bool((lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5).all())
 
 
 def judged(found: ObjectFit, obj: SceneObject, method: str, observed: bool) -> Verdict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -104,8 +104,7 @@ def object_pixels(
     return chosen[order], stands_for[order].astype(np.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridFit:
+class GridFit(NamedTuple):
     """phi, psi in [0, 1]; the roughnesses phi_low..phi_high that fit as well within 1 %; cost at
     phi, psi per residual; evidence = 1 - cost / cost without any specular light."""
 
@@ -139,7 +138,13 @@ def fit_grid(observed: Float, weight: Float, basis: Basis, without_diffuse: Proj
             if phi not in tried:
                 base, slope = basis(phi)
                 rest = target - without_diffuse(base * root)
-                tried[phi] = _best_psi(rest, without_diffuse(slope * root))
+                slope_left = without_diffuse(slope * root)
+                square = float((slope_left * slope_left).sum())
+                psi = float((slope_left * rest).sum()) / square if square > 0 else 0.0
+                # The cost is that of the clamped psi; ``base`` stays at 0.
+                psi = min(1.0, max(0.0, psi))
+                left = rest - psi * slope_left
+                tried[phi] = float((left * left).sum()), psi
         best = min(range(GRID), key=lambda k: tried[grid[k]][0])
         return grid[max(best - 1, 0)], grid[min(best + 1, GRID - 1)]
 
@@ -147,15 +152,8 @@ def fit_grid(observed: Float, weight: Float, basis: Basis, without_diffuse: Proj
     low, phi, high = _flat_interval(tried)
     cost, psi = tried[phi]
     unexplained = float((target * target).sum())
-    evidence = 1.0 - cost / unexplained if unexplained > 0 else 0.0
-    return GridFit(
-        phi=phi,
-        psi=psi,
-        phi_low=low,
-        phi_high=high,
-        cost=cost / max(target.size, 1),
-        evidence=max(0.0, evidence),
-    )
+    evidence = max(0.0, 1.0 - cost / unexplained if unexplained > 0 else 0.0)
+    return GridFit(phi, psi, low, high, cost / max(target.size, 1), evidence)
 
 
 def nothing(values: Double) -> Double:
@@ -172,15 +170,6 @@ def multiple_of(diffuse: Double) -> Projection:
         return rest
 
     return project
-
-
-def _best_psi(rest: Double, slope: Double) -> tuple[float, float]:
-    """(cost, psi) for one roughness; the cost is that of the clamped psi (``base`` stays at 0)."""
-    square = float((slope * slope).sum())
-    psi = float((slope * rest).sum()) / square if square > 0 else 0.0
-    psi = min(1.0, max(0.0, psi))
-    left = rest - psi * slope
-    return float((left * left).sum()), psi
 
 
 def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, float, float]:
@@ -213,7 +202,16 @@ def fit_target_frame(
     Each pixel is the mean of 2 x 2 surface points with 52 rays each, traced once for all
     roughnesses.
     """
-    chosen, stands_for, points = _points_of_object(lit, view, index, max_pixels, seed)
+    pixels, shape = view.camera.pixels(), view.valid.shape
+    seen = visible_points(lit, view.camera, pixels)
+    highlight = mirror_hits_emitter(lit, seen).reshape(shape) & view.valid
+    random = np.random.default_rng([seed, index])
+    chosen, stands_for = object_pixels(
+        lit.owner(seen.face).reshape(shape), view.valid, highlight, index, max_pixels,
+        random.permutation,
+    )  # fmt: skip
+    whole, points = sub_pixel_points(lit, view.camera, pixels[chosen], index, _SUB_PIXEL)
+    chosen, stands_for = chosen[whole], stands_for[whole]
     if len(chosen) < MIN_PIXELS:
         return None, len(chosen)
     of_phis = lobe_basis(lit, points, len(chosen), seed)
@@ -235,21 +233,3 @@ def fit_target_frame(
     floor = max(0.1 * float(np.median(level)), 1e-30)
     weight = (1 / (level + floor) ** 2).astype(np.float32)
     return fit_grid(observed, weight, basis, multiple_of(diffuse * np.sqrt(weight))), len(chosen)
-
-
-def _points_of_object(
-    lit: LitScene, view: View, index: int, max_pixels: int, seed: int
-) -> tuple[Long, Float, SurfacePoints]:
-    """The pixels to fit (flat indices), how many pixels each stands for, and the four surface
-    points of each, in order."""
-    pixels = view.camera.pixels()
-    seen = visible_points(lit, view.camera, pixels)
-    owner = lit.owner(seen.face).reshape(view.valid.shape)
-    mirrored = mirror_hits_emitter(lit, seen)
-    highlight = mirrored.reshape(view.valid.shape) & view.valid
-    random = np.random.default_rng([seed, index])
-    chosen, stands_for = object_pixels(
-        owner, view.valid, highlight, index, max_pixels, random.permutation
-    )
-    whole, points = sub_pixel_points(lit, view.camera, pixels[chosen], index, _SUB_PIXEL)
-    return chosen[whole], stands_for[whole], points

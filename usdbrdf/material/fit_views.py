@@ -15,12 +15,11 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
-from usdbrdf.material.lobe_posterior import LobeEstimate
 from usdbrdf.material.observations import Observations
+from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
@@ -41,7 +40,6 @@ _CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 def fit_views(
     lit: LitScene,
-    texels: Texels,
     observed: Observations,
     smoothing: float,
     camera_of: Callable[[int], Camera],
@@ -59,61 +57,61 @@ def fit_views(
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
         return None, 0
-    observed, footprints = _footprints(lit, texels, observed, camera_of, index)
+    observed, footprints = _footprints(lit, observed, camera_of, index)
     if len(observed.texel) < MIN_OBSERVATIONS:
         return None, len(observed.texel)
-    samples = _samples(lit, texels, observed, footprints[0], camera_of)
+    position, points = lit.texels.position[observed.texel], footprints[0]
+    # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
+    # or, of a square's mean, that along its rim.
+    shown = lit.radiance.at(points.face, points.u, points.v)
+    contrast = shown.reshape(len(position), len(RINGS), 3).std(axis=1) / observed.side[:, None]
+    samples = ViewSamples(
+        texel=np.unique(observed.texel, return_inverse=True)[1].astype(np.int64),
+        frame=observed.frame.astype(np.int64),
+        position=position,
+        radiance=observed.radiance,
+        noise=np.hypot(observed.noise[:, None], contrast),
+        cell=_CELL_PIXELS * _pixel_size(position, observed.frame, camera_of),
+    )
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
         mixture = mixture._replace(per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
-        candidates = _candidates(lit, samples, footprints, smoothing, own_seed, mixture)
+        candidates = []
+        for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
+            # Views of a texel share their random numbers: what they have in common then cancels in
+            # their differences, which are all that is fitted.
+            first, second, third = (
+                lobe_basis(lit, points, len(samples.texel), seed_of_basis, mixture, samples.texel)
+                for seed_of_basis in range(3 * own_seed, 3 * own_seed + 3)
+            )
+            blur, likely = _deviation_of_normal(points), _likely(width, smoothing)
+            candidates.append(Candidate(first, second, third, blur, likely))
         return fit_lobe(samples, candidates, repeats)
 
     return repeated_where_noisy(fitted, seed), len(samples.texel)
 
 
-def _candidates(
-    lit: LitScene,
-    samples: ViewSamples,
-    footprints: list[SurfacePoints],
-    smoothing: float,
-    seed: int,
-    mixture: Mixture,
-) -> list[Candidate]:
-    """What the lobe would look like with each of the footprints; see ``_likely``."""
-    candidates = []
-    for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
-        # Views of a texel share their random numbers: what they have in common then cancels in
-        # their differences, which are all that is fitted.
-        first, second, third = [
-            lobe_basis(lit, points, len(samples.texel), 3 * seed + k, mixture, samples.texel)
-            for k in range(3)
-        ]
-        blur, likely = _deviation_of_normal(points), _likely(width, smoothing)
-        candidates.append(
-            Candidate(first=first, second=second, third=third, blur=blur, likely=likely)
-        )
-    return candidates
-
-
 def _footprints(
-    lit: LitScene,
-    texels: Texels,
-    observed: Observations,
-    camera_of: Callable[[int], Camera],
-    index: int,
+    lit: LitScene, observed: Observations, camera_of: Callable[[int], Camera], index: int
 ) -> tuple[Observations, list[SurfacePoints]]:
     """The observations whose footprint lies on the object as a whole, of texels that several frames
     see; and the footprints' points, for the usual width and, on curved objects, for others."""
 
     def whole(some: Observations, width: float) -> tuple[Long, SurfacePoints]:
-        kept, points = _points(lit, texels, some, camera_of, index, width * RINGS)
+        kept, points = _points(lit, some, camera_of, index, width * RINGS)
         enough = _several_views(some.texel[kept])
         return kept[enough], points.take(np.flatnonzero(np.repeat(enough, len(RINGS))))
 
-    kept, points = whole(observed, _width(texels, observed, camera_of))
+    # What the samples spread over, in pixels: the footprint of a single texel's, and the square
+    # that others are the mean of.
+    usual, side = _FOOTPRINT, observed.side[0]
+    if side > 1:
+        pixel = _pixel_size(lit.texels.position[observed.texel], observed.frame, camera_of)
+        square = side * math.sqrt(float(np.median(lit.texels.area[observed.texel])) / 12)
+        usual = math.hypot(_FOOTPRINT, square / pixel)
+    kept, points = whole(observed, usual)
     observed = observed.take(kept)
     if not len(kept) or _deviation_of_normal(points) < _CURVED:
         return observed, [points]
@@ -135,38 +133,6 @@ def _likely(width: float, smoothing: float) -> float:
         return 1.0
     expected = math.hypot(_FOOTPRINT, smoothing)
     return math.exp(-0.5 * (math.log(width / expected) / _SPREAD_OF_WIDTHS) ** 2)
-
-
-def _width(texels: Texels, observed: Observations, camera_of: Callable[[int], Camera]) -> float:
-    """Standard deviation of what the samples spread over, in pixels: the footprint of a single
-    texel's, and the square that others are the mean of."""
-    if observed.side[0] <= 1:
-        return _FOOTPRINT
-    pixel = _pixel_size(texels.position[observed.texel], observed.frame, camera_of)
-    square = observed.side[0] * math.sqrt(float(np.median(texels.area[observed.texel])) / 12)
-    return math.hypot(_FOOTPRINT, square / pixel)
-
-
-def _samples(
-    lit: LitScene,
-    texels: Texels,
-    observed: Observations,
-    points: SurfacePoints,
-    camera_of: Callable[[int], Camera],
-) -> ViewSamples:
-    position = texels.position[observed.texel]
-    # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
-    # or, of a square's mean, that along its rim.
-    shown = lit.radiance.at(points.face, points.u, points.v)
-    contrast = shown.reshape(len(position), len(RINGS), 3).std(axis=1) / observed.side[:, None]
-    return ViewSamples(
-        texel=np.unique(observed.texel, return_inverse=True)[1].astype(np.int64),
-        frame=observed.frame.astype(np.int64),
-        position=position,
-        radiance=observed.radiance,
-        noise=np.hypot(observed.noise[:, None], contrast),
-        cell=_CELL_PIXELS * _pixel_size(position, observed.frame, camera_of),
-    )
 
 
 def _clear_of_noise(observed: Observations) -> Bool:
@@ -203,7 +169,6 @@ def _deviation_of_normal(points: SurfacePoints) -> float:
 
 def _points(
     lit: LitScene,
-    texels: Texels,
     observed: Observations,
     camera_of: Callable[[int], Camera],
     index: int,
@@ -215,7 +180,7 @@ def _points(
     for frame in np.unique(observed.frame):
         which = np.flatnonzero(observed.frame == frame)
         camera = camera_of(int(frame))
-        pixels = camera.project(texels.position[observed.texel[which]])
+        pixels = camera.project(lit.texels.position[observed.texel[which]])
         whole, points = sub_pixel_points(lit, camera, pixels, index, offsets)
         kept.append(which[whole])
         parts.append(points)

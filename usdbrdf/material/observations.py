@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -138,8 +138,7 @@ _PROXY_ALPHA = calibration.number("observations.proxy_alpha")
 _FRAMES_OF_NOISE = 20
 
 
-@dataclass(frozen=True, kw_only=True)
-class Observations:
+class Observations(NamedTuple):
     """M samples of texels by frames, sorted by object and texel.
 
     texel (M,) int32; frame (M,) int32; radiance (M, 3) float32; noise (M,) float32, the frame's
@@ -158,26 +157,30 @@ class Observations:
         return self.take(slice(int(first), int(last)))
 
     def take(self, index: slice | npt.NDArray[np.int64]) -> Observations:
-        """Some of them."""
-        return Observations(**{name: values[index] for name, values in vars(self).items()})
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        return dict(vars(self))
+        return Observations._make(values[index] for values in self)
 
 
 class Follower:
     """Follows some texels of every object through the frames, one ``add`` per frame."""
 
-    def __init__(self, lit: LitScene, texels: Texels, usable: Bool, frames: int, seed: int) -> None:
+    def __init__(self, lit: LitScene, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
-        self._lit = lit
+        self._lit, texels = lit, lit.texels
         side, usable = sides_of_samples(texels, usable, lit.diagonal_m)
-        self._index, rows = _texels_to_follow(texels, usable, frames, seed)
+        random = np.random.default_rng([seed, 0])
+        own = [texels.of_object(i) for i in range(len(texels.resolution))]
+        candidates = [part.start + np.flatnonzero(usable[part]) for part in own]
+        limit, rows = _table_size(frames, sum(len(some) > 0 for some in candidates))
+        picked = [
+            np.sort(random.choice(some, min(limit, len(some)), replace=False))
+            for some in candidates
+        ]
+        self._index = np.concatenate([np.zeros(0, np.int64), *picked])
         self._owner = texels.object_index()[self._index]
         self._side = side[self._owner]
-        own = texels.take(self._index)
-        across = self._side[:, None]
-        self._texels = replace(own, step_x=across * own.step_x, step_y=across * own.step_y)
+        followed, across = texels.take(self._index), self._side[:, None]
+        steps = {"step_x": across * followed.step_x, "step_y": across * followed.step_y}
+        self._texels = replace(followed, **steps)
         # Offsets of the proxy's half vectors, the same for all texels so that views compare.
         self._jitter = _PROXY_ALPHA * (2 * shifts_of(np.arange(_PROXY_RAYS), 3, seed) - 1)
         # Row of a frame in the tables; what was not seen there is zero.
@@ -211,35 +214,49 @@ class Follower:
         self._light[row, seen] = self._mirrored_light(seen, view.camera.eye)
         self._noise[row] = noise_floor
 
-    def chosen(self, texels: Texels, seed: int) -> Observations:
-        """The texels and views to fit, after the last frame."""
-        score = self._scores()
-        pairs = []
+    def chosen(self, seed: int) -> Observations:
+        """The texels and views to fit, after the last frame.
+
+        Half of the kept texels are from the best fifth by score, half from all that have a score.
+        Of a texel's views a third are those with most mirrored light, the rest spread.
+        """
+        scores, texels, pairs = self._scores(), self._lit.texels, []
         random = np.random.default_rng([seed, 1])
         for own in (texels.of_object(i) for i in range(len(texels.resolution))):
             low, high = np.searchsorted(self._index, [own.start, own.stop])
-            for column in _informative(score[low:high], random) + low:
-                for row in _views_of(self._seen[:, column], self._light[:, column]):
-                    pairs.append((column, row))
+            score = scores[low:high]
+            kept = np.flatnonzero(score >= 0)
+            if len(kept) > _KEPT:
+                count = max(_KEPT // 2, len(kept) // 5)
+                best = kept[np.argsort(-score[kept], kind="stable")[:count]]
+                first = random.choice(best, _KEPT // 2, replace=False)
+                others = np.setdiff1d(kept, first)
+                second = random.choice(others, _KEPT - len(first), replace=False)
+                kept = np.sort(np.concatenate([first, second]))
+            for column in kept + low:
+                views = np.flatnonzero(self._seen[:, column])
+                if len(views) > _VIEWS:
+                    light = self._light[views, column]
+                    brightest = views[np.argsort(-light, kind="stable")[: _VIEWS // 3]]
+                    rest = np.setdiff1d(views, brightest)
+                    spread = np.linspace(0, len(rest) - 1, _VIEWS - len(brightest)).round()
+                    views = np.sort(np.concatenate([brightest, rest[spread.astype(int)]]))
+                pairs += [(column, row) for row in views]
         column, row = np.array(pairs, np.int64).reshape(-1, 2).T
-        return Observations(
-            texel=self._index[column].astype(np.int32),
-            frame=self._frame[row].astype(np.int32),
-            radiance=self._radiance[row, column],
-            noise=self._noise[row],
-            side=self._side[column],
-        )
+        texel, frame = self._index[column].astype(np.int32), self._frame[row].astype(np.int32)
+        radiance, side = self._radiance[row, column], self._side[column]
+        return Observations(texel, frame, radiance, self._noise[row], side)
 
     @property
     def smoothing(self) -> float:
         """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
         return smoothing_of(self._noise_in_windows)
 
-    def target_frames(self, texels: Texels) -> Int:
+    def target_frames(self) -> Int:
         """Per object, the frame in which its followed texels mirror most light beyond what each of
         them mirrors on the mean; -1 where none does, or nothing was followed."""
         mean = self._light.sum(axis=0) / np.maximum(self._seen.sum(axis=0), 1)
-        objects = len(texels.resolution)
+        objects = len(self._lit.scene.objects)
         beyond = np.stack(
             [
                 np.bincount(self._owner, np.maximum(light - mean, 0) * seen, minlength=objects)
@@ -280,21 +297,6 @@ class Follower:
         return mean
 
 
-def _texels_to_follow(
-    texels: Texels, usable: Bool, frames: int, seed: int
-) -> tuple[npt.NDArray[np.int64], int]:
-    """Ascending indices of usable texels of each object, picked at random, and the number of frames
-    to follow them through."""
-    random = np.random.default_rng([seed, 0])
-    own = [texels.of_object(i) for i in range(len(texels.resolution))]
-    candidates = [part.start + np.flatnonzero(usable[part]) for part in own]
-    limit, rows = _table_size(frames, sum(len(some) > 0 for some in candidates))
-    picked = [
-        np.sort(random.choice(some, min(limit, len(some)), replace=False)) for some in candidates
-    ]
-    return np.concatenate([np.zeros(0, np.int64), *picked]), rows
-
-
 def _table_size(frames: int, objects: int) -> tuple[int, int]:
     """(texels to follow per object, frames to follow them through): their product over all objects
     is at most _MAX_CELLS, whatever is asked for."""
@@ -303,26 +305,3 @@ def _table_size(frames: int, objects: int) -> tuple[int, int]:
         return texels, frames
     rows = min(frames, max(_MIN_VIEWS, _MAX_CELLS // (_FEWEST * objects)))
     return min(_FEWEST, _MAX_CELLS // (rows * objects)), rows
-
-
-def _informative(score: Double, random: np.random.Generator) -> npt.NDArray[np.int64]:
-    """Half of the kept texels from the best fifth by score, half from all that have a score."""
-    good = np.flatnonzero(score >= 0)
-    if len(good) <= _KEPT:
-        return good
-    best = good[np.argsort(-score[good], kind="stable")[: max(_KEPT // 2, len(good) // 5)]]
-    first = random.choice(best, _KEPT // 2, replace=False)
-    others = np.setdiff1d(good, first)
-    second = random.choice(others, _KEPT - len(first), replace=False)
-    return np.sort(np.concatenate([first, second]))
-
-
-def _views_of(known: Bool, light: Float) -> npt.NDArray[np.int64]:
-    """At most _VIEWS frames of a texel: the third with most mirrored light, the rest spread."""
-    frames = np.flatnonzero(known)
-    if len(frames) <= _VIEWS:
-        return frames
-    brightest = frames[np.argsort(-light[frames], kind="stable")[: _VIEWS // 3]]
-    rest = np.setdiff1d(frames, brightest)
-    spread = rest[np.linspace(0, len(rest) - 1, _VIEWS - len(brightest)).round().astype(int)]
-    return np.sort(np.concatenate([brightest, spread]))

@@ -13,31 +13,34 @@ What their cure changes is small against S, so few rays do."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import FrameReader, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.shaded import albedo_map, at_texels, denoised_irradiance, tiles_of_patches
+from usdbrdf.shading.shaded import albedo_map, by_tiles, denoised_irradiance
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
-from usdbrdf.texturing.passes import BytesPerTexel, groups_of_texels, in_passes, smallest_groups
+from usdbrdf.texturing.passes import (
+    BytesPerTexel,
+    bytes_for_frames,
+    groups_of_texels,
+    in_passes,
+    smallest_groups,
+)
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
@@ -62,7 +65,6 @@ class Lobes:
 def refined_irradiance(
     run: TaskRun,
     lit: LitScene,
-    texels: Texels,
     traced: Float,
     change: Float,
     lobes: Lobes,
@@ -71,43 +73,26 @@ def refined_irradiance(
 ) -> Float:
     """S (T, 3), W/m^2: as ``traced`` (T, 3) from the lit texture, with what changes if the light is
     other by ``change`` (T, 3), W/(m^2 sr), and the lobes are light as well."""
-    refined = np.maximum(traced + _change(run, lit, texels, change, lobes, seed), 0)
-    return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
+    texels, seed = lit.texels, seed ^ _SEED
+    texture = lit.radiance.showing(texels, change)
+    lights = lights_from_radiance(lit.scene, texels, np.abs(change))
+    sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
 
-
-def _change(
-    run: TaskRun, lit: LitScene, texels: Texels, radiance: Float, lobes: Lobes, seed: int
-) -> Float:
-    """What the change of the diffuse ``radiance`` (T, 3) and the lobes' light add to S, traced tile
-    by tile."""
-    texture = lit.radiance.showing(texels, radiance)
-    lights = lights_from_radiance(lit.scene, texels, np.abs(radiance))
-    sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED)
-    order, patch = tiles_of_texels(texels)
-    near = ~lit.scene.is_far[texels.object_index()[order]]
-    order, patch = order[near], patch[near]
-
-    def tile(part: slice) -> dict[str, npt.NDArray[Any]]:
-        index = order[part]
+    def tile(index: Array, patch: Array) -> dict[str, Array]:
         position, normal = texels.position[index], texels.normal[index]
         diffuse = irradiance_at(
-            lit.rays, texture, lights, black_environment(), position, normal, patch[part],
-            sampling, lit.diagonal_m,
+            lit.rays, texture, lights, black_environment(), position, normal, patch, sampling,
+            lit.diagonal_m,
         )  # fmt: skip
         specular = specular_irradiance(
             lit, position, normal, index, lobes.phi, lobes.psi,
-            rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed ^ _SEED,
+            rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed,
         )  # fmt: skip
         return {"change": diffuse.mean + specular}
 
-    tiles = tiles_of_patches(patch)
-    changes = [
-        run.checkpoint(f"refined-{number}", partial(tile, part))["change"]
-        for number, part in enumerate(
-            progress(tiles, total=len(tiles), label="fit: shade", unit="tiles")
-        )
-    ]
-    return at_texels(order, np.concatenate(changes).astype(np.float32), len(texels))
+    found = by_tiles(run, texels, "refined", "fit: shade", tile)["change"]
+    refined = np.maximum(traced + np.asarray(found, np.float32), 0)
+    return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
 
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
@@ -163,8 +148,7 @@ class Refined:
 def refined_light(
     run: TaskRun,
     lit: LitScene,
-    texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     before: LightBefore,
     lobes: Lobes,
     lightmap_filter: str,
@@ -177,12 +161,12 @@ def refined_light(
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
-    found = _means_without_lobes(run, lit, texels, frames, before, lobes, memory, seed)
-    emissive, observed = before.emissive, before.coverage.observed
-    far = lit.scene.is_far[texels.object_index()]
-    known = np.isfinite(found.mean[:, 0]) & ~emissive
-    restored_light = _restored(texels, found, known, _level(before.lit))
-    diffuse = np.where(emissive[:, None], before.emission, restored_light)
+    found = _means_without_lobes(run, lit, reader, before, lobes, memory, seed)
+    texels, emissive, observed = lit.texels, before.emissive, before.coverage.observed
+    known, level = np.isfinite(found.mean[:, 0]) & ~emissive, _level(before.lit)
+    filled_in = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
+    diffuse = restored(texels, filled_in, known, found.variance * level**2, found.footprint)
+    diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
     # What clips in every frame is at least as bright as that.
     clipped = before.coverage.clipped[:, None]
     diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
@@ -190,22 +174,15 @@ def refined_light(
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
         """Base colour, and L_d with what it reflects where nobody looked."""
-        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive, far)
+        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive)
         return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
 
     _, diffuse = reflected(diffuse, before.irradiance)
     change = np.where(emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
     traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
-    irradiance = refined_irradiance(run, lit, texels, traced, change, lobes, lightmap_filter, seed)
+    irradiance = refined_irradiance(run, lit, traced, change, lobes, lightmap_filter, seed)
     base_color, diffuse = reflected(diffuse, irradiance)
     return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
-
-
-def _restored(texels: Texels, found: RobustMean, known: Bool, level: Float) -> Float:
-    """(T, 3), W/(m^2 sr), from the means in units of ``level``; filled in where not ``known``."""
-    filled = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
-    variance = found.variance * level**2
-    return np.maximum(restored(texels, filled, known, variance, found.footprint), 0)
 
 
 def _level(lit: Float) -> Float:
@@ -218,8 +195,7 @@ def _level(lit: Float) -> Float:
 def _means_without_lobes(
     run: TaskRun,
     lit: LitScene,
-    texels: Texels,
-    frames: Frames,
+    reader: FrameReader,
     before: LightBefore,
     lobes: Lobes,
     memory: float | None,
@@ -227,77 +203,56 @@ def _means_without_lobes(
 ) -> RobustMean:
     """Of T texels the mean over all frames without their specular light, relative to ``_level`` of
     their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
-    textures = _bytes_of(lit) // len(texels)
-    need = _OF_REFINING._replace(always=_OF_REFINING.always + textures)
+    frames, texels = reader.frames, lit.texels
+    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
+    far = texels.is_far
+
+    def means(part: slice) -> dict[str, Float]:
+        """Of some texels, going on from the last saved state of an interrupted run."""
+        name = f"refined-{part.start}-{part.stop}"
+        saved = run.latest(name)
+        start, observed = 0, MeanState.empty(part.stop - part.start)
+        if saved is not None:
+            start, observed = saved[0] + 1, MeanState(**saved[1])
+        # The mean starts from its first samples, which must not all show one highlight.
+        order = spread_order(len(frames))[start:]
+        sampled = samples_from_frames(lit, frames, read_frames(reader.read, order), part)
+        bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
+        for done, some in enumerate(bar, start):
+            taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
+            taken &= ~far[some.texel]
+            texel, camera = some.texel[taken], frames.camera(some.frame)
+            of_texel = Lobes(lobes.phi[owner[texel]], lobes.psi[owner[texel]])
+            own_seed = seed + len(frames) + some.frame
+            specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
+            unit, covered = level[texel], footprints(texels, texel, camera)
+            noise = np.float32(_OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
+            # A wide view of a texel says less of it than its noise tells.
+            wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
+            deviation = np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+            values = (some.radiance[taken] - specular) / unit[:, None]
+            update(observed, texel - np.int32(part.start), values, deviation, covered)
+            run.save_latest_in_time(name, done, observed._asdict)
+        return robust_mean(observed)._asdict()
+
+    need = _need(lit)
     try:
         groups = groups_of_texels(texels, lit.scene, frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
         warn(str(short))
         groups = smallest_groups(texels)
-
-    def means(part: slice) -> dict[str, Float]:
-        observed = _observed(run, lit, texels, frames, before, lobes, seed, part)
-        return robust_mean(observed)._asdict()
-
     return RobustMean(**in_passes(run, "means", groups, means))
 
 
-def _bytes_of(lit: LitScene) -> int:
-    """What the light takes beside scene and texels."""
-    return lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+def frame_reader(lit: LitScene, frames: Frames, memory: float | None) -> FrameReader:
+    """Keeps the frames for which refining leaves room in ``memory`` (GiB)."""
+    return FrameReader(frames, bytes_for_frames(lit.texels, lit.scene, frames, memory, _need(lit)))
 
 
-def _observed(
-    run: TaskRun,
-    lit: LitScene,
-    texels: Texels,
-    frames: Frames,
-    before: LightBefore,
-    lobes: Lobes,
-    seed: int,
-    part: slice,
-) -> MeanState:
-    """Some texels in all frames, going on from the last saved state of an interrupted run."""
-    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
-    far = lit.scene.is_far[owner]
-    name = f"refined-{part.start}-{part.stop}"
-    saved = run.latest(name)
-    start, observed = 0, MeanState.empty(part.stop - part.start)
-    if saved is not None:
-        start, observed = saved[0] + 1, MeanState(**saved[1])
-    # The mean starts from its first samples, which must not all show one highlight.
-    order = spread_order(len(frames))[start:]
-    images = read_frames(frames, order)
-    sampled = samples_from_frames(texels, lit.scene, lit.rays, frames, images, part)
-    bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
-    for done, some in enumerate(bar, start):
-        taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
-        taken &= ~far[some.texel]
-        texel, radiance = some.texel[taken], some.radiance[taken]
-        camera = frames.camera(some.frame)
-        specular = np.empty_like(radiance)
-        often = samples[texel] >= _MANY_FRAMES
-        for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
-            own = texel[which]
-            specular[which] = lobe_radiance(
-                lit, _seen_from(texels, own, camera.eye), lobes.phi[owner[own]],
-                lobes.psi[owner[own]], rays, seed + len(frames) + some.frame, own.astype(np.int64),
-            )  # fmt: skip
-        unit, covered = level[texel], footprints(texels, texel, camera)
-        deviation = _deviation(unit, covered, float(frames.noise_floor_radiance[some.frame]))
-        values = (radiance - specular) / unit[:, None]
-        update(observed, texel - np.int32(part.start), values, deviation, covered)
-        run.save_latest_in_time(name, done, observed.arrays)
-    return observed
-
-
-def _deviation(unit: Float, covered: Float, noise_floor: float) -> Float:
-    """Of the errors of samples, (M,), in units of their texels' ``unit``, with footprints
-    ``covered`` (M, 3)."""
-    noise = np.float32(_OF_NOISE_FLOOR * noise_floor) / unit
-    # A wide view of a texel says less of it than its noise tells.
-    wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-    return np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+def _need(lit: LitScene) -> BytesPerTexel:
+    """With the light, which lies beside scene and texels."""
+    light = lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+    return _OF_REFINING._replace(always=_OF_REFINING.always + light // len(lit.texels))
 
 
 def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
@@ -310,17 +265,20 @@ def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
     return taken
 
 
-def _seen_from(texels: Texels, which: Int, eye: Double) -> SurfacePoints:
-    """Texels as surface points that a camera at ``eye`` sees."""
-    position = texels.position[which]
-    to_camera = (eye - position).astype(np.float32)
-    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
-    barycentric = texels.barycentric[which]
-    return SurfacePoints(
-        face=texels.face[which],
-        u=barycentric[:, 1],
-        v=barycentric[:, 2],
-        position=position,
-        normal=texels.normal[which],
-        to_camera=to_camera,
-    )
+def _specular(
+    lit: LitScene, lobes: Lobes, texel: Int, samples: Float, eye: Double, seed: int
+) -> Float:
+    """(M, 3) light that texels (M,), each with a lobe of its own and seen by ``samples`` (M,)
+    frames, reflect to ``eye``."""
+    texels = lit.texels
+    found = np.empty((len(texel), 3), np.float32)
+    often = samples >= _MANY_FRAMES
+    for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
+        own = texel[which]
+        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
+        to_camera = (eye - position).astype(np.float32)
+        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
+        phi, psi = lobes.phi[which], lobes.psi[which]
+        found[which] = lobe_radiance(lit, points, phi, psi, rays, seed, own.astype(np.int64))
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,15 +26,7 @@ class FrameEffects:
     has: Bool
 
 
-@dataclass(frozen=True, kw_only=True)
-class Effects:
-    """The shared errors of all frames, and how many kinds there are."""
-
-    frames: list[FrameEffects]
-    kinds: int
-
-
-def effects_of_frames(every: Sequence[tuple[Long, int | None]], frame: Long) -> Effects:
+def effects_of_frames(every: Sequence[tuple[Long, int | None]], frame: Long) -> list[FrameEffects]:
     """Of each kind, the error that each sample has (-1: none), and the one channel that it is for
     (None: all three alike); and each sample's frame (P,), of which there is none that shares an
     error with another, and none that shows a texel twice."""
@@ -48,12 +41,10 @@ def effects_of_frames(every: Sequence[tuple[Long, int | None]], frame: Long) -> 
             has = (own[:, None, None] == shared) & of_channel[:, None]
             kinds.append(np.full(len(shared), kind))
             columns.append(has.reshape(3 * len(samples), len(shared)))
-        one = FrameEffects(
-            samples=samples, kind=np.concatenate(kinds), has=np.concatenate(columns, axis=1)
-        )
-        if len(one.kind):
-            frames.append(one)
-    return Effects(frames=frames, kinds=len(every))
+        kind_of, has_it = np.concatenate(kinds), np.concatenate(columns, axis=1)
+        if len(kind_of):
+            frames.append(FrameEffects(samples=samples, kind=kind_of, has=has_it))
+    return frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +65,7 @@ class SharedErrors:
 
     def __init__(
         self,
-        effects: Effects,
+        effects: Sequence[FrameEffects],
         deviation: Double,
         level: Double,
         weight: Double,
@@ -83,14 +74,27 @@ class SharedErrors:
     ) -> None:
         """deviation (kinds,); level (P, 3), what an error of 1 adds; weight (P, 3, 3), W; texel
         (P,); of_texels (texels, 3, 3), T."""
-        self._kinds, self._count = effects.kinds, len(level)
+        self._kinds, self._count = len(deviation), len(level)
         count = len(of_texels)
         blocks = np.zeros((count, 3, count, 3))
         blocks[np.arange(count), :, np.arange(count)] = of_texels
         dense = blocks.reshape(3 * count, 3 * count)
         self._frames = []
-        for one in effects.frames:
-            frame = _frame(one, deviation, level, weight, texel)
+        for one in effects:
+            samples = one.samples
+            adds = one.has * level[samples].reshape(-1, 1)
+            weighted = (weight[samples] @ adds.reshape(len(samples), 3, -1)).reshape(adds.shape)
+            normal = adds.T @ weighted
+            normal[np.diag_indices_from(normal)] += 1 / deviation[one.kind] ** 2
+            inverse_root, _ = linalg.lapack.dtrtri(np.linalg.cholesky(normal), lower=True)
+            frame = _Frame(
+                samples=samples,
+                kind=one.kind,
+                places=(3 * texel[samples][:, None] + np.arange(3)).ravel(),
+                inverse_root=inverse_root,
+                along=inverse_root @ adds.T,
+                of_texels=inverse_root @ weighted.T,
+            )
             _subtract(dense, frame.places, frame.of_texels.T @ frame.of_texels)
             self._frames.append(frame)
         self._root = linalg.cholesky(dense, lower=True, check_finite=False)
@@ -161,25 +165,6 @@ def _symmetric_block(lower: Double, places: Long) -> Double:
     return block
 
 
-def _frame(
-    effects: FrameEffects, deviation: Double, level: Double, weight: Double, texel: Long
-) -> _Frame:
-    samples = effects.samples
-    adds = effects.has * level[samples].reshape(-1, 1)
-    weighted = (weight[samples] @ adds.reshape(len(samples), 3, -1)).reshape(adds.shape)
-    normal = adds.T @ weighted
-    normal[np.diag_indices_from(normal)] += 1 / deviation[effects.kind] ** 2
-    inverse_root, _ = linalg.lapack.dtrtri(np.linalg.cholesky(normal), lower=True)
-    return _Frame(
-        samples=samples,
-        kind=effects.kind,
-        places=(3 * texel[samples][:, None] + np.arange(3)).ravel(),
-        inverse_root=inverse_root,
-        along=inverse_root @ adds.T,
-        of_texels=inverse_root @ weighted.T,
-    )
-
-
 _INDEPENDENT = calibration.number("errors.independent")
 _OF_SPECULAR = calibration.number("errors.of_specular")
 # Where the search for the shared errors' standard deviations starts, and their least value.
@@ -204,8 +189,7 @@ class ViewSamples:
     cell: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reduced:
+class Reduced(NamedTuple):
     """K sets of values freed of the texels' means, (P, 3, K), the same weighted, and their part
     along the shared errors, whitened, (N, K)."""
 
@@ -215,11 +199,8 @@ class Reduced:
 
     def parts(self, count: int) -> list[Reduced]:
         """Equally many sets after each other."""
-        every = [np.split(one, count, axis=-1) for one in (self.values, self.weighted, self.shared)]
-        return [
-            Reduced(values=values, weighted=weighted, shared=shared)
-            for values, weighted, shared in zip(*every, strict=True)
-        ]
+        split = (np.split(one, count, axis=-1) for one in self)
+        return [Reduced._make(one) for one in zip(*split, strict=True)]
 
 
 class ViewModel:
@@ -228,21 +209,24 @@ class ViewModel:
     def __init__(self, samples: ViewSamples) -> None:
         self._texel = samples.texel
         self._num_texels = int(samples.texel.max()) + 1
-        self._gather = _gather(samples.texel)
+        # (texels, P): sums of each texel's samples.
+        count = len(samples.texel)
+        self._gather = sparse.csr_matrix((np.ones(count), (samples.texel, np.arange(count))))
         self._radiance = samples.radiance.astype(np.float64)
         self._noise = samples.noise.astype(np.float64)
-        count = np.bincount(samples.texel)
-        mean = np.stack([np.bincount(samples.texel, c) / count for c in self._radiance.T], axis=-1)
+        views = np.bincount(samples.texel)
+        mean = np.stack([np.bincount(samples.texel, c) / views for c in self._radiance.T], axis=-1)
         mean = np.maximum(mean, _LEAST_LEVEL * mean.mean(axis=1, keepdims=True))[samples.texel]
         self._mean, self._level = mean, mean
         self._specular = np.zeros_like(mean)
         # Of all samples, what is left for errors after each texel took its mean.
-        self._freedom = len(samples.texel) / (len(samples.texel) - len(count))
-        self._effects = effects_of_frames(_effects(samples), samples.frame)
-        self._deviation = np.full(self._effects.kinds, _FIRST_GUESS)
+        self._freedom = count / (count - len(views))
+        every = _effects(samples)
+        self._effects = effects_of_frames(every, samples.frame)
+        self._deviation = np.full(len(every), _FIRST_GUESS)
         self._own_deviation = _FIRST_GUESS
         self._scale = 1.0
-        self._robust_weight = np.ones(len(samples.texel))
+        self._robust_weight = np.ones(count)
         self._factorise()
 
     @property
@@ -319,19 +303,16 @@ class ViewModel:
         )
 
 
-def _gather(texel: Long) -> sparse.csr_matrix:
-    """(texels, P): sums of each texel's samples."""
-    return sparse.csr_matrix((np.ones(len(texel)), (texel, np.arange(len(texel)))))
-
-
 def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
     """The shared errors: which of them each sample has (-1: none), and the one channel that it is
     for (None: all three alike)."""
     frame, side = _shared(samples.frame), samples.cell
     extent = float(np.ptp(samples.position, axis=0).max())
+    place = samples.position - samples.position.min(axis=0)
     while True:
-        cells = [_cells(samples.position, size) for size in (side, 2.5 * side)]
-        small, large = (_shared(samples.frame * (1 << 40) + cell) for cell in cells)
+        cells = [np.floor(place / size).astype(np.int64) for size in (side, 2.5 * side)]
+        numbers = [(samples.frame << 40) + (cell << [26, 13, 0]).sum(axis=1) for cell in cells]
+        small, large = map(_shared, numbers)
         every: list[tuple[Long, int | None]] = [(frame, None), (small, None), (large, None)]
         every += [(which, channel) for which in (frame, large) for channel in range(3)]
         # Their number bounds memory and time. Each of many frames has some, whatever the cells.
@@ -339,13 +320,6 @@ def _effects(samples: ViewSamples) -> list[tuple[Long, int | None]]:
         if number <= _MOST_EFFECTS or side > extent:
             return every
         side *= 1.5
-
-
-def _cells(position: Float, size: float) -> Long:
-    """A number for the cube of that size in which each point lies."""
-    cell = np.floor((position - position.min(axis=0)) / size).astype(np.int64)
-    number: Long = (cell[:, 0] << 26) + (cell[:, 1] << 13) + cell[:, 2]
-    return number
 
 
 def _shared(group: Long) -> Long:

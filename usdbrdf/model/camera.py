@@ -9,13 +9,6 @@ import numpy as np
 from usdbrdf.model.arrays import Double, Float
 
 
-def pixel_centres(width: int, height: int, stride: int = 1) -> Double:
-    """(R, 2) x, y of every ``stride``-th pixel's centre, row by row."""
-    x = np.arange(0, width, stride) + 0.5
-    y = np.arange(0, height, stride) + 0.5
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Camera:
     """A pinhole camera and the size of its picture.
@@ -50,7 +43,9 @@ class Camera:
 
     def pixels(self, stride: int = 1) -> Double:
         """(R, 2) x, y of every ``stride``-th pixel's centre, row by row."""
-        return pixel_centres(self.width, self.height, stride)
+        x = np.arange(0, self.width, stride) + 0.5
+        y = np.arange(0, self.height, stride) + 0.5
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def rays(self, pixels: Double) -> tuple[Float, Float]:
         """Through pixel coordinates (R, 2): origins and unit directions, (R, 3) float32, world."""

@@ -43,11 +43,10 @@ class Frames:
 
     def camera(self, i: int) -> Camera:
         """The camera of frame i, named after its image."""
-        fx, fy, cx, cy = self.intrinsics[i].tolist()
         width, height = self.resolution[i].tolist()
         return Camera(
             world_from_camera=self.world_from_camera[i],
-            intrinsics=(fx, fy, cx, cy),
+            intrinsics=tuple(self.intrinsics[i].tolist()),
             width=width,
             height=height,
             name=self.image_paths[i].name,
@@ -58,12 +57,11 @@ class Frames:
 class Scan:
     """A capture, checked: what ``ingest`` writes into the stage.
 
-    meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses.
-    usd_geometry   the USD file that holds the meshes, if the geometry came as USD; then
-                   ``object_prims`` gives, per object, the mesh's path below that file's default
-                   prim
+    meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses; usd_geometry
+    and object_prims are ``ScanGeometry``'s.
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
+    is_open        frames look past the mesh at what lies around it
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -79,5 +77,6 @@ class Scan:
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
     turned_faces: Bool | None = None
+    is_open: bool = False
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

@@ -56,7 +56,6 @@ class DistantLight:
     half_angle: float
 
     def moved(self, world_from_here: Double) -> DistantLight:
-        """Under a rotation."""
         return replace(self, towards=world_from_here[:3, :3] @ self.towards)
 
 
@@ -72,7 +71,6 @@ class SkyLight:
     world_from_here: Double
 
     def moved(self, world_from_here: Double) -> SkyLight:
-        """Under a rotation."""
         return replace(self, world_from_here=world_from_here[:3, :3] @ self.world_from_here)
 
 
@@ -81,7 +79,5 @@ Light = ShapeLight | DistantLight | SkyLight
 
 @dataclass(frozen=True, kw_only=True)
 class RelitScene:
-    """Everything that is rendered."""
-
     surfaces: tuple[Surface, ...]
     lights: tuple[Light, ...]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from usdbrdf.model.arrays import Double, Float, Int
 
@@ -88,7 +87,9 @@ class Surface:
             name: getattr(self, name)
             for name in ("triangles", "corner_normals", "corner_uv", "corner_colour", "corner_f0")
         }
-        turned["corner_normals"] = _unit(self.corner_normals @ np.linalg.inv(linear))
+        normals = self.corner_normals @ np.linalg.inv(linear)
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        turned["corner_normals"] = np.asarray(normals / np.maximum(length, 1e-30), np.float32)
         if np.linalg.det(linear) < 0:
             turned = {
                 name: None if values is None else np.ascontiguousarray(values[:, [0, 2, 1]])
@@ -138,28 +139,14 @@ def preview_material(
     Metallic workflow: F0 = mix(((1 - ior) / (1 + ior))^2, diffuse, metallic), and metal has no
     diffuse term. Specular workflow, where ``specular`` (H, W, 3) is given: F0 is that colour.
     """
-    if specular is not None:
-        return Material(diffuse=diffuse, f0=specular, roughness=roughness, emission=emission)
     dielectric = normal_reflectance(ior)
-    if not metallic.any():  # the usual case, and the diffuse map may be large
-        return Material(
-            diffuse=diffuse,
-            f0=constant_map(float(dielectric)),
-            roughness=roughness,
-            emission=emission,
-        )
+    f0 = constant_map(float(dielectric)) if specular is None else specular
+    plain = Material(diffuse=diffuse, f0=f0, roughness=roughness, emission=emission)
+    # The usual case, and the diffuse map may be large.
+    if specular is not None or not metallic.any():
+        return plain
     height, width = np.maximum(diffuse.shape[:2], metallic.shape[:2])
-    diffuse, metallic = zoomed(diffuse, height, width), zoomed(metallic, height, width)
-    return Material(
-        diffuse=np.asarray(diffuse * (1 - metallic), np.float32),
-        f0=np.asarray(dielectric + metallic * (diffuse - dielectric), np.float32),
-        roughness=roughness,
-        emission=emission,
-        base=diffuse,
-        metallic=metallic,
-    )
-
-
-def _unit(vectors: npt.NDArray[Any]) -> Float:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-30), np.float32)
+    base, metallic = zoomed(diffuse, height, width), zoomed(metallic, height, width)
+    mixed = np.asarray(dielectric + metallic * (base - dielectric), np.float32)
+    diffuse = np.asarray(base * (1 - metallic), np.float32)
+    return replace(plain, diffuse=diffuse, f0=mixed, base=base, metallic=metallic)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.arrays import Array, Double, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +34,30 @@ class ScanMesh:
     triangles: Int
     corner_normals: Float
     face_object: Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanGeometry:
+    """The captured surface as a file holds it, in the file's own units.
+
+    mesh                      USD: world transforms applied; corner normals are NaN where the file
+                              has none to use
+    has_normals               (F,) bool: the file gives the face's normals; None: it gives none
+    usd_geometry              the file, if it is USD and is to be referenced, not copied
+    object_prims              of USD, per object, its path below the default prim ("." is the prim
+                              itself)
+    meters_per_unit, up_axis  "Y" or "Z"; None where the file does not say
+    warnings                  sentences about what was left out or simplified
+    """
+
+    mesh: ScanMesh
+    objects: tuple[ObjectLabel, ...]
+    has_normals: Bool | None = None
+    usd_geometry: Path | None = None
+    object_prims: tuple[str, ...] = ()
+    meters_per_unit: float | None = None
+    up_axis: str | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +110,25 @@ def triangulate(
     )
 
 
+def joined(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Int, Int]:
+    """Points (V, 3) and triangles (F, 3) of many meshes in one soup: its points, its triangles
+    int32, and (F,) int32 the mesh that each triangle is of."""
+    firsts = np.cumsum([0, *[len(points) for points, _ in parts]])
+    shifted = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
+    return (
+        np.concatenate([points for points, _ in parts]),
+        np.concatenate(shifted, dtype=np.int32),
+        np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in shifted]),
+    )
+
+
+def compact(points: Array, triangles: Array) -> tuple[Array, Array, Int]:
+    """The numbers of the points (V, 3) that triangles (F, 3) use, in order; these points; and the
+    triangles between them, int32."""
+    used, corners = np.unique(triangles, return_inverse=True)
+    return used, points[used], corners.reshape(-1, 3).astype(np.int32)
+
+
 def welded_ids(points: Float) -> Int:
     """(V,) int32: vertices with bit-equal positions (V, 3) float32 get the same number.
 
@@ -107,12 +152,7 @@ def welded(mesh: ScanMesh) -> ScanMesh:
     return replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
 
 
-_AT_A_TIME = 1 << 18
-
-
-def face_normals(points: Float, triangles: Int) -> Double:
-    """(F, 3) float64 unit normals, counter-clockwise; zero where a triangle has no area."""
-    return face_normals_and_angles(points, triangles)[0]
+_AT_A_TIME = 1 << 18  # triangles
 
 
 def doubled_areas(points: Float | Double, triangles: Int) -> Double:
@@ -128,8 +168,7 @@ def doubled_areas(points: Float | Double, triangles: Int) -> Double:
 def across_triangles(points: Float | Double, triangles: Int) -> Double:
     """(F, 3) float64 along the triangles' normals, as long as twice their areas."""
     first, second, third = (points[triangles[:, k]].astype(np.float64) for k in range(3))
-    across: Double = np.cross(second - first, third - first)
-    return across
+    return np.asarray(np.cross(second - first, third - first))
 
 
 def face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:

@@ -1,14 +1,65 @@
-"""The texel table: where on the surface each texel of each object's atlas lies."""
+"""The texel table: where on the surface each texel of each object's atlas lies, and what the frames
+know of its lit radiance.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.arrays import Bool, Float, Int, Long
+
+
+class Coverage(IntEnum):
+    """FILLED: no frame shows the texel, its radiance is taken from around it; CLIPPED: frames show
+    it, every one of them saturated, so that its radiance is a lower bound; MEASURED: at least one
+    frame gives its radiance."""
+
+    FILLED = 0
+    CLIPPED = 1
+    MEASURED = 2
+
+
+@dataclass(frozen=True)
+class CoverageMap:
+    """kind (T,) int8: the ``Coverage`` of every texel."""
+
+    kind: npt.NDArray[np.int8]
+
+    @classmethod
+    def of(cls, measured: Bool, clipped: Bool) -> CoverageMap:
+        """measured, clipped (T,): a frame measured the texel; all that show it saturated."""
+        kinds = (Coverage.MEASURED, Coverage.CLIPPED)
+        return cls(np.select([measured, clipped], kinds, Coverage.FILLED).astype(np.int8))
+
+    @classmethod
+    def from_stored(cls, values: Float) -> CoverageMap:
+        """The inverse of ``stored``."""
+        return cls(np.rint(values[:, 0] * Coverage.MEASURED).astype(np.int8))
+
+    def stored(self) -> Float:
+        """(T,) float32 as the map "coverage" has it: 0 filled, 0.5 clipped, 1 measured."""
+        return self.kind.astype(np.float32) / np.float32(Coverage.MEASURED)
+
+    @property
+    def measured(self) -> Bool:
+        """(T,): a frame gives the texel's radiance."""
+        return np.asarray(self.kind == Coverage.MEASURED, np.bool_)
+
+    @property
+    def clipped(self) -> Bool:
+        """(T,): what is known of the texel's radiance is a lower bound."""
+        return np.asarray(self.kind == Coverage.CLIPPED, np.bool_)
+
+    @property
+    def observed(self) -> Bool:
+        """(T,): measured or clipped; a frame shows the texel."""
+        return np.asarray(self.kind != Coverage.FILLED, np.bool_)
+
 
 Number = TypeVar("Number", bound=np.generic)
 
@@ -29,10 +80,11 @@ class Texels:
     first_texel     (num_objects + 1,) int64
     nearest_texel   (P,) int32: for every flat pixel the texel that it shows; its own, or (gutter)
                     the nearest one of the same atlas; -1 only in an atlas without texels
+    far_objects     numbers of the objects that are surroundings
     corner_pixel    (F, 3, 2) float32: x right, y down, in pixels of the face's atlas
     """
 
-    pixel: npt.NDArray[np.int64]
+    pixel: Long
     face: Int
     barycentric: Float
     position: Float
@@ -43,15 +95,16 @@ class Texels:
     area: Float
     interior: Bool
     resolution: Int
-    first_pixel: npt.NDArray[np.int64]
-    first_texel: npt.NDArray[np.int64]
+    first_pixel: Long
+    first_texel: Long
     nearest_texel: Int
     corner_pixel: Float
+    far_objects: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.face)
 
-    def take(self, index: npt.NDArray[np.int64]) -> Texels:
+    def take(self, index: Long) -> Texels:
         """The surface points of some texels; the atlas stays the whole one."""
         names = (
             "pixel", "face", "barycentric", "position", "normal", "geometric_normal", "step_x",
@@ -60,7 +113,6 @@ class Texels:
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def of_object(self, index: int) -> slice:
-        """The texels of one object."""
         return slice(int(self.first_texel[index]), int(self.first_texel[index + 1]))
 
     def image(self, index: int, values: npt.NDArray[Number]) -> npt.NDArray[Number]:
@@ -73,7 +125,7 @@ class Texels:
         return shown
 
     def from_image(self, index: int, image: npt.NDArray[Number]) -> npt.NDArray[Number]:
-        """The texels' values (T_i, ...) out of one object's picture (H, W, ...)."""
+        """The inverse of ``image``: (T_i, ...) out of (H, W, ...)."""
         own = self.pixel[self.of_object(index)] - self.first_pixel[index]
         values: npt.NDArray[Number] = image.reshape(-1, *image.shape[2:])[own]
         return values
@@ -82,6 +134,14 @@ class Texels:
         """(...): the mean over one object's surface of per-texel values (T, ...)."""
         own = self.of_object(index)
         return np.average(values[own], axis=0, weights=np.maximum(self.area[own], 1e-12))
+
+    @property
+    def is_far(self) -> Bool:
+        """(T,): the texel shows the surroundings, see ``SceneObject.far``."""
+        far = np.zeros(len(self), np.bool_)
+        for index in self.far_objects:
+            far[self.of_object(index)] = True
+        return far
 
     def object_index(self) -> Int:
         """(T,) int32, the object of each texel."""

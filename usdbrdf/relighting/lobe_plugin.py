@@ -17,12 +17,8 @@ def register(mi: Any) -> None:
     the lobe: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h), with the terms of ``brdf``. The back
     is black. B. Haefner et al. 2021, eq. 2 to 6.
     """
-    if mi.variant() not in _registered:
-        mi.register_bsdf(NAME, _plugin_class(mi))
-        _registered.add(mi.variant())
-
-
-def _plugin_class(mi: Any) -> Any:
+    if mi.variant() in _registered:
+        return
     # The base class exists only once a variant is set, so the class is made here.
     import drjit as dr
 
@@ -103,4 +99,5 @@ def _plugin_class(mi: Any) -> Any:
         def to_string(self) -> str:
             return f"{NAME}[]"
 
-    return lambda props: Lobe(props)
+    mi.register_bsdf(NAME, lambda props: Lobe(props))
+    _registered.add(mi.variant())

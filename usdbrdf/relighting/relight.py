@@ -26,9 +26,8 @@ from usdbrdf.job.progress import say, warn
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.options import RelightOptions
-from usdbrdf.relighting.mitsuba_scene import mitsuba_scene
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
-from usdbrdf.relighting.render import mitsuba_variant, render_view
+from usdbrdf.relighting.render import mitsuba_scene, mitsuba_variant, render_view
 from usdbrdf.transport.denoise import OIDN, chosen_filter, denoise_picture
 
 LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
@@ -54,20 +53,18 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         views = cameras_of_views(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
         views = tuple(view.at_width(options.width) for view in views)
-    targets = _targets(output, views, options)
+    targets = [output]
+    if options.views is not None:
+        targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
+        for target in targets:
+            _refuse_taken(target, folder=False)
     falls = any(insert.falls_from_eye_height for insert in options.inserts)
-    scene = relit_scene(
-        captured,
-        options.lights,
-        options.inserts,
-        keep_emitters=options.keep_emitters,
-        eye_height=eye_height(stage) if falls else 0.0,
-        allow_outside=options.allow_outside,
-    )
+    scene = relit_scene(captured, options, eye_height(stage) if falls else 0.0)
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):
         targets[0].parent.mkdir(parents=True, exist_ok=True)
-    exposure = _photograph(mitsuba, loaded, views, targets, options, denoise=noise == OIDN)
+    rendered = _rendered(mitsuba, loaded, views, options, denoise=noise == OIDN)
+    exposure = _write_pictures(rendered, targets, options.exposure)
     return {
         "pictures": [str(target) for target in targets],
         "variant": mitsuba.variant(),
@@ -80,27 +77,33 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     }
 
 
-def _photograph(
-    mitsuba: Any,
-    loaded: Any,
-    views: Sequence[Camera],
-    targets: Sequence[Path],
-    options: RelightOptions,
-    *,
-    denoise: bool,
+def _write_pictures(
+    rendered: Iterator[Float], targets: Sequence[Path], exposure: float | None
 ) -> float | None:
-    """Render and write all views; returns the exposure in stops of displayed pictures."""
-    rendered = _rendered(mitsuba, loaded, views, options, denoise=denoise)
+    """Write all views, in the order of the targets; returns the exposure in stops of displayed
+    pictures, which is automatic where none is given."""
     displayed = targets[0].suffix.lower() in DISPLAYED
-    if displayed and options.exposure is None:
-        stops = _write_exposed_alike(targets, rendered)
-    else:
-        stops = options.exposure or 0.0
+    if not displayed or exposure is not None:
+        stops = exposure or 0.0
         for target, picture in zip(targets, rendered, strict=True):
-            write_picture(target, picture, stops)
+            _write_picture(target, picture, stops)
+    else:
+        # One exposure for all, so that they can be compared. Until it is known the pictures wait on
+        # disk: many would not fit into memory.
+        beside, levels = targets[0].parent, []
+        with environment_failures(str(beside)):
+            folder = TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=beside)
+        with folder as waiting:
+            spilled = [Path(waiting) / f"{i}.exr" for i in range(len(targets))]
+            for spill, picture in zip(spilled, rendered, strict=True):
+                levels.append(exposure_levels(picture))
+                write_exr(spill, picture, half=False)
+            stops = float(np.log2(display_exposure(np.concatenate(levels))))
+            for target, spill in zip(targets, spilled, strict=True):
+                _write_picture(target, read_radiance(spill), stops)
     if not displayed:
         return None
-    say(f"exposure: {stops:+.2f} stops{' (automatic)' if options.exposure is None else ''}")
+    say(f"exposure: {stops:+.2f} stops{' (automatic)' if exposure is None else ''}")
     return stops
 
 
@@ -109,46 +112,19 @@ def _rendered(
 ) -> Iterator[Float]:
     """(H, W, 3) radiance of one view after the other."""
     for i, view in enumerate(views):
-        label = f"relight {i + 1} of {len(views)}"
-        seed = (options.seed, i)
+        label, seed = f"relight {i + 1} of {len(views)}", (options.seed, i)
         found = render_view(mitsuba, loaded, view, samples=options.samples, seed=seed, label=label)
-        if denoise:
-            yield denoise_picture(found.radiance, found.albedo, found.normal)
-        else:
-            yield found.radiance
-
-
-def _write_exposed_alike(targets: Sequence[Path], rendered: Iterator[Float]) -> float:
-    """Write the pictures with one exposure for all, so that they can be compared; returns it in
-    stops. Until it is known they wait on disk: many would not fit into memory."""
-    levels = []
-    beside = targets[0].parent
-    with environment_failures(str(beside)):
-        folder = TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=beside)
-    with folder as waiting:
-        spilled = [Path(waiting) / f"{i}.exr" for i in range(len(targets))]
-        for spill, picture in zip(spilled, rendered, strict=True):
-            levels.append(exposure_levels(picture))
-            write_exr(spill, picture, half=False)
-        stops = automatic_exposure(levels)
-        for target, spill in zip(targets, spilled, strict=True):
-            write_picture(target, read_radiance(spill), stops)
-    return stops
+        yield denoise_picture(*found) if denoise else found[0]
 
 
 def exposure_levels(picture: Float) -> Float:
-    """(N,) means of R, G and B at pixels all over the picture: what ``automatic_exposure`` needs
-    of it, at most 65536."""
+    """(N,) means of R, G and B at pixels all over the picture, at most 65536: what its exposure is
+    taken from."""
     means = picture.mean(axis=2).ravel()
     return np.ascontiguousarray(means[:: -(-means.size // _LEVELS)])
 
 
-def automatic_exposure(levels: list[Float]) -> float:
-    """Stops that bring the 90th percentile of the mean of R, G and B over all pictures to 0.8."""
-    return float(np.log2(display_exposure(np.concatenate(levels))))
-
-
-def write_picture(path: Path, radiance: Float, stops: float) -> None:
+def _write_picture(path: Path, radiance: Float, stops: float) -> None:
     """Float radiance as EXR; as PNG or JPEG times 2^stops, clipped, in sRGB."""
     if path.suffix.lower() in LINEAR:
         write_exr(path, radiance, half=False)
@@ -190,12 +166,3 @@ def _refuse_taken(path: Path, *, folder: bool) -> None:
         raise OwnershipConflict(
             f"{path}: {above} is not a folder. Name another place with -o. [relight.output]"
         )
-
-
-def _targets(output: Path, views: Sequence[Camera], options: RelightOptions) -> list[Path]:
-    if options.views is None:
-        return [output]
-    targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
-    for target in targets:
-        _refuse_taken(target, folder=False)
-    return targets

@@ -13,24 +13,210 @@ do not count as independent. Outliers weigh as under Student's t.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import minimize
 
 from usdbrdf import calibration
-from usdbrdf.model.arrays import Bool, Double
-from usdbrdf.shading.lamp_evidence import (
-    AMBIENT_SPREAD,
-    Evidence,
-    Segment,
-    lamp_share,
-    log_irradiance,
-    normal_equations,
-    restricted_cost,
-    segment_covariance,
-    segments_of,
-    weight_without_mean,
-)
+from usdbrdf.kernel import kernel
+from usdbrdf.model.arrays import Bool, Double, Float, Int
+
+
+@kernel
+def _factor(matrix: Double) -> Double:
+    """Upper triangular U with U^T U = matrix, row by row."""
+    upper = matrix.copy()
+    n = len(matrix)
+    for j in range(n):
+        for k in range(j):
+            share = upper[k, j]
+            for i in range(j, n):
+                upper[j, i] -= share * upper[k, i]
+        root = 1 / np.sqrt(upper[j, j])
+        for i in range(j, n):
+            upper[j, i] *= root
+        for i in range(j):
+            upper[j, i] = 0
+    return upper
+
+
+@kernel
+def _inverse_factor(upper: Double) -> Double:
+    """W = U^-T, lower triangular: matrix^-1 = W^T W."""
+    n = len(upper)
+    inverse = np.zeros((n, n))
+    for j in range(n):
+        inverse[j, j] = 1
+        for k in range(j):
+            share = upper[k, j]
+            for i in range(k + 1):
+                inverse[j, i] -= share * inverse[k, i]
+        for i in range(j + 1):
+            inverse[j, i] /= upper[j, j]
+    return inverse
+
+
+@kernel
+def weight_without_mean(matrix: Double) -> Double:
+    """Inverse (n, n) of the covariance after the values' own weighted mean was taken out."""
+    half = _inverse_factor(_factor(matrix))
+    n = len(half)
+    weight = np.zeros((n, n))
+    for k in range(n):
+        for j in range(k + 1):
+            share = half[k, j]
+            for i in range(k + 1):
+                weight[j, i] += share * half[k, i]
+    row = np.zeros(n)
+    for j in range(n):
+        for i in range(n):
+            row[j] += weight[j, i]
+    total = row.sum()
+    for j in range(n):
+        for i in range(n):
+            weight[j, i] -= row[j] * row[i] / total
+    return weight
+
+
+@kernel
+def restricted_cost(matrix: Double, residual: Double) -> float:
+    """-2 log of the restricted likelihood of residuals (n,) whose mean is free (H. Patterson and
+    R. Thompson, "Recovery of inter-block information when block sizes are unequal", 1971), up to a
+    constant."""
+    upper = _factor(matrix)
+    n = len(upper)
+    ones, solved = np.ones(n), residual.copy()
+    log_determinant = 0.0
+    for j in range(n):
+        ones[j] /= upper[j, j]
+        solved[j] /= upper[j, j]
+        for i in range(j + 1, n):
+            ones[i] -= upper[j, i] * ones[j]
+            solved[i] -= upper[j, i] * solved[j]
+        log_determinant += 2 * np.log(upper[j, j])
+    square, mixed, total = 0.0, 0.0, 0.0
+    for j in range(n):
+        square += solved[j] ** 2
+        mixed += solved[j] * ones[j]
+        total += ones[j] ** 2
+    cost: float = log_determinant + np.log(total) + square - mixed**2 / total
+    return cost
+
+
+_MIN_SEGMENT = calibration.count("lamps.min_segment")
+_AMBIENT = calibration.number("lamps.ambient")
+AMBIENT_SPREAD = calibration.number("lamps.ambient_spread")
+_AMBIENT_ERROR = calibration.number("lamps.ambient_error")
+_MOSTLY_AMBIENT = calibration.number("lamps.mostly_ambient")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What N texels of reflectors show of K lamps.
+
+    radiance        (N, 3) float32, measured L_d
+    irradiance      (N, 3) float32, S_0 in W/m^2: from all light but the K lamps'
+    lamp_irradiance (K, N, 3) float32, S_k: from lamp k alone, at its lower bound
+    position        (N, 3) float32, metres
+    segment         (N,) int32, equal where the albedo may be taken as alike
+    object          (N,) int32, equal where errors may agree beyond the segment
+    prior           (K, 2) float64, mean and standard deviation of log g_k before the evidence
+    """
+
+    radiance: Float
+    irradiance: Float
+    lamp_irradiance: Float
+    position: Float
+    segment: Int
+    object: Int
+    prior: Double
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """Texels of one segment: log of pi L_d without ambient specular light (n, 3), its change by
+    what that light may be wrong (n,), distances (n, n) in metres, variance relative to the common
+    noise of the texels (n,) and of the whole segment (scale), and what its own specular light may
+    differ by (specular, relative)."""
+
+    index: npt.NDArray[np.int64]
+    object: int
+    observed: Double
+    ambient: Double
+    distance: Double
+    variance: Double
+    scale: float
+    specular: float
+
+
+def segments_of(evidence: Evidence) -> list[Segment]:
+    """Segments with enough texels that are lit and not black."""
+    total = evidence.irradiance + evidence.lamp_irradiance.sum(axis=0)
+    usable = (evidence.radiance > 0).all(axis=1) & (total > 0).all(axis=1)
+    segments = []
+    for number in np.unique(evidence.segment[usable]):
+        index = np.flatnonzero(usable & (evidence.segment == number))
+        if len(index) < _MIN_SEGMENT:
+            continue
+        position = evidence.position[index].astype(np.float64)
+        whole = np.pi * evidence.radiance[index].astype(np.float64)
+        # log(pi L_d - share S_0), with the ambient share and with what it may be wrong by on top.
+        observed, more = (
+            np.log(whole - np.minimum(share * evidence.irradiance[index], _MOSTLY_AMBIENT * whole))
+            for share in (_AMBIENT, _AMBIENT + _AMBIENT_ERROR)
+        )
+        segments.append(
+            Segment(
+                index=index,
+                object=int(evidence.object[index[0]]),
+                observed=observed,
+                ambient=(more - observed).mean(axis=1),
+                distance=np.linalg.norm(position[:, None] - position, axis=-1),
+                variance=np.ones(len(index)),
+                scale=1.0,
+                specular=0.0,
+            )
+        )
+    return segments
+
+
+def log_irradiance(evidence: Evidence, index: npt.NDArray[np.int64], log_g: Double) -> Double:
+    """log S (n, 3) of the texels."""
+    lamps = np.einsum("kc,knc->nc", np.exp(log_g), evidence.lamp_irradiance[:, index])
+    return np.asarray(np.log(evidence.irradiance[index] + lamps))
+
+
+def segment_covariance(item: Segment, shape: Double) -> Double:
+    """(n, n), of the logarithms: noise^2 variance_i on the diagonal, and a part that agrees over a
+    length, of which there is more where the segment's own specular light differs.
+
+    shape (3,): logarithms of noise, agreeing part and length (metres)
+    """
+    noise, agreeing, length = np.exp(shape)
+    smooth = (agreeing**2 + item.specular**2) * np.exp(-item.distance / length)
+    return np.asarray(item.scale * np.asarray(smooth + np.diag(noise**2 * item.variance)))
+
+
+def lamp_share(evidence: Evidence, item: Segment, log_g: Double) -> Double:
+    """How much of S is whose lamp's, (K, n, 3): the derivative of log S by log g."""
+    lamps = np.exp(log_g)[:, None] * evidence.lamp_irradiance[:, item.index]
+    return np.asarray(lamps / (evidence.irradiance[item.index] + lamps.sum(axis=0)))
+
+
+def normal_equations(
+    evidence: Evidence, item: Segment, weight: Double, log_g: Double
+) -> tuple[Double, Double, Double]:
+    """Per channel: curvature (3, K, K), gradient (3, K) and weighted square (3,)."""
+    residual = item.observed - log_irradiance(evidence, item.index, log_g)
+    share = lamp_share(evidence, item, log_g)
+    weighted = np.einsum("nm,kmc->ckn", weight, share)
+    curvature = np.einsum("ckn,lnc->ckl", weighted, share)
+    gradient = np.einsum("ckn,nc->ck", weighted, residual)
+    square = np.einsum("nc,nm,mc->c", residual, weight, residual)
+    return curvature, gradient, square
+
 
 MAX_ERROR = calibration.number("lamps.max_error")
 _LEAST_ERROR = calibration.number("lamps.least_error")
@@ -41,6 +227,7 @@ _STEPS = 30
 LAMP_PRIOR = calibration.pair("lamps.prior")
 _START = np.log(calibration.numbers("lamps.errors.start"))
 _LIMITS = np.log(calibration.numbers("lamps.errors.limits")).reshape(3, 2)
+Weighed: TypeAlias = tuple[Segment, Double]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,16 +251,13 @@ def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
         return nothing_known(lamps)
     log_g, shape = np.repeat(evidence.prior[:, :1], 3, axis=1), _START
     for _ in range(_ROUNDS):
-        weights = [weight_without_mean(segment_covariance(item, shape)) for item in segments]
-        log_g = _solve(evidence, segments, weights, log_g)
-        segments = [
-            _judged(evidence, item, weight, log_g)
-            for item, weight in zip(segments, weights, strict=True)
-        ]
+        weighed = _weighed(segments, shape)
+        log_g = _solve(evidence, weighed, log_g)
+        segments = [_judged(evidence, item, weight, log_g) for item, weight in weighed]
         shape = _likeliest(evidence, segments, shape, log_g)
-    weights = [weight_without_mean(segment_covariance(item, shape)) for item in segments]
-    log_g = _solve(evidence, segments, weights, log_g)
-    error = _standard_error(evidence, segments, weights, log_g)
+    weighed = _weighed(segments, shape)
+    log_g = _solve(evidence, weighed, log_g)
+    error = _standard_error(evidence, weighed, log_g)
     brightest, channel = log_g.max(axis=1), log_g.argmax(axis=1)
     possible = brightest > -2 * error[np.arange(lamps), channel]
     return EstimatedRadiance(
@@ -92,17 +276,16 @@ def nothing_known(lamps: int) -> EstimatedRadiance:
     )
 
 
-def _solve(
-    evidence: Evidence, segments: list[Segment], weights: list[Double], log_g: Double
-) -> Double:
+def _weighed(segments: list[Segment], shape: Double) -> list[Weighed]:
+    return [(item, weight_without_mean(segment_covariance(item, shape))) for item in segments]
+
+
+def _solve(evidence: Evidence, weighed: list[Weighed], log_g: Double) -> Double:
     """Gauss-Newton with damping on the sum over the segments and the prior."""
     mean, precision = evidence.prior[:, :1], evidence.prior[:, 1] ** -2
 
     def at(log_g: Double) -> tuple[Double, Double, Double]:
-        parts = [
-            normal_equations(evidence, item, weight, log_g)
-            for item, weight in zip(segments, weights, strict=True)
-        ]
+        parts = [normal_equations(evidence, item, weight, log_g) for item, weight in weighed]
         off = (mean - log_g).T
         curvature = sum(part[0] for part in parts) + np.diag(precision)
         gradient = sum(part[1] for part in parts) + precision * off
@@ -162,43 +345,32 @@ def _likeliest(evidence: Evidence, segments: list[Segment], shape: Double, log_g
     return np.asarray(found.x)
 
 
-def _standard_error(
-    evidence: Evidence, segments: list[Segment], weights: list[Double], log_g: Double
-) -> Double:
+def _standard_error(evidence: Evidence, weighed: list[Weighed], log_g: Double) -> Double:
     """(K, 3), of log g."""
-    parts = [
-        normal_equations(evidence, item, weight, log_g)
-        for item, weight in zip(segments, weights, strict=True)
-    ]
+    segments = [item for item, _ in weighed]
+    parts = [normal_equations(evidence, item, weight, log_g) for item, weight in weighed]
     whole = np.asarray(sum(part[0] for part in parts)) + np.diag(evidence.prior[:, 1] ** -2)
     count = sum(len(item.index) - 1 for item in segments)
     misfit = np.asarray(sum(part[2] for part in parts)) / max(count - len(log_g), 1)
     inverse = np.linalg.inv(whole)
     curved = np.sqrt(np.einsum("ckk->kc", inverse) * np.maximum(misfit, 1))
-    jackknife = _jackknife(segments, parts, whole)
-    # And with more ambient specular light everywhere:
-    pull = sum(
-        np.einsum("knc,nm,m->ck", lamp_share(evidence, item, log_g), weight, item.ambient)
-        for item, weight in zip(segments, weights, strict=True)
-    )
-    ambient = np.einsum("ckl,cl->kc", inverse, pull)
-    whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + _LEAST_ERROR**2
-    return np.asarray(np.sqrt(whole_error))
-
-
-def _jackknife(
-    segments: list[Segment], parts: list[tuple[Double, Double, Double]], whole: Double
-) -> Double:
-    """(K, 3): error of log g if objects (segments where they are few) err as a whole."""
+    # And if objects (segments where they are few) err as a whole: without one of these blocks the
+    # solution would move by (H - H_block)^-1 gradient_block.
     owner = np.array([item.object for item in segments])
     if len(np.unique(owner)) < _FEW_OBJECTS:
         owner = np.arange(len(segments))
-    total = np.zeros((whole.shape[1], 3))
-    blocks = np.unique(owner)
+    moved, blocks = np.zeros((whole.shape[1], 3)), np.unique(owner)
     for block in blocks:
         own = [part for part, number in zip(parts, owner, strict=True) if number == block]
         curvature = whole - np.asarray(sum(part[0] for part in own))
         gradient = np.asarray(sum(part[1] for part in own))
-        # Without the block the solution would move by (H - H_block)^-1 gradient_block.
-        total += np.linalg.solve(curvature, gradient[..., None])[..., 0].T ** 2
-    return np.asarray(np.sqrt((1 - 1 / len(blocks)) * total))
+        moved += np.linalg.solve(curvature, gradient[..., None])[..., 0].T ** 2
+    jackknife = np.sqrt((1 - 1 / len(blocks)) * moved)
+    # And with more ambient specular light everywhere:
+    pull = sum(
+        np.einsum("knc,nm,m->ck", lamp_share(evidence, item, log_g), weight, item.ambient)
+        for item, weight in weighed
+    )
+    ambient = np.einsum("ckl,cl->kc", inverse, pull)
+    whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + _LEAST_ERROR**2
+    return np.asarray(np.sqrt(whole_error))

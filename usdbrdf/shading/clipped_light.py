@@ -17,18 +17,18 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,
     EstimatedRadiance,
+    Evidence,
     estimate_clipped_emitters,
     nothing_known,
 )
-from usdbrdf.shading.lamp_evidence import Evidence
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
+from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
@@ -81,8 +81,11 @@ def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> Cl
         whole = texels.area[candidates].sum() > texels.area[around].sum()
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:
-            bound = float(bright[part][clipped[part]].max())
-            lamp = whole or _stands_out(texels, bright, part, around, bound)
+            bound, lamp = float(bright[part][clipped[part]].max()), bool(whole)
+            if not lamp:  # one that stands out from what is around it
+                distance, _ = cKDTree(texels.position[part]).query(texels.position[around])
+                near = bright[around[distance < _AROUND]]
+                lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
     found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]
     group = np.full(len(texels), -1, np.int32)
@@ -106,12 +109,6 @@ def _connected(texels: Texels, candidates: Long) -> list[Long]:
     count, label = connected_components(graph, directed=False)
     parts = [candidates[label == k] for k in range(count)]
     return [part for part in parts if len(part) >= _MIN_TEXELS]
-
-
-def _stands_out(texels: Texels, bright: Float, part: Long, measured: Long, bound: float) -> bool:
-    distance, _ = cKDTree(texels.position[part]).query(texels.position[measured])
-    around = measured[distance < _AROUND]
-    return not len(around) or float(np.median(bright[around])) < _NEARLY * bound
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,29 +156,22 @@ def estimate_clipped_light(
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        measured = coverage.measured & ~surface.is_far
-        chosen, segment = _chosen(surface.texels, groups, measured, seed)
+        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
         if not len(chosen):
             return dict(vars(nothing_known(len(groups))))
         evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
         return dict(vars(estimate_clipped_emitters(evidence)))
 
     estimate = EstimatedRadiance(**run.checkpoint("clipped", compute))
-    return ClippedLight(
-        lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
-    )
-
-
-def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
-    changed = lit.copy()
+    lit = lit.copy()
     for k in np.flatnonzero(estimate.determined):
-        changed[groups.group == k] = groups.bound[k] * estimate.multiplier[k]
-    return changed
+        lit[groups.group == k] = groups.bound[k] * estimate.multiplier[k]
+    return ClippedLight(lit=lit, groups=groups, estimate=estimate)
 
 
 def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
     """Measured texels spread over all objects, denser near the lamps, and their segments."""
-    usable = np.flatnonzero(measured & texels.interior & (groups.group < 0))
+    usable = np.flatnonzero(measured & texels.interior & ~texels.is_far & (groups.group < 0))
     owner = texels.object_index()[usable]
     normal = texels.normal[usable]
     axis = np.abs(normal).argmax(axis=1)
@@ -217,36 +207,29 @@ def _evidence(
     environment: Environment,
     seed: int,
 ) -> Evidence:
-    dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
-    outside = black_environment()
+    texels = surface.texels
+
+    def traced(light: Float, outside: Environment, seed: int) -> Float:
+        """S (N, 3) at the chosen texels with the radiance ``light`` (T, 3)."""
+        return irradiance_at(
+            surface.rays, surface.texture(light),
+            lights_from_radiance(surface.scene, texels, light), outside,
+            texels.position[chosen], texels.normal[chosen], independent_tiles(len(chosen)),
+            replace(_SAMPLING, seed=seed), surface.diagonal_m,
+        ).mean  # fmt: skip
+
     lamps = []
     for k in range(len(groups)):
         alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
         light = np.repeat(alone, 3, axis=1).astype(np.float32)
-        lamps.append(_traced(surface, light, outside, chosen, seed + k + 1))
+        lamps.append(traced(light, black_environment(), seed + k + 1))
+    dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
     return Evidence(
         radiance=lit[chosen],
-        irradiance=_traced(surface, dark, environment, chosen, seed),
+        irradiance=traced(dark, environment, seed),
         lamp_irradiance=np.stack(lamps),
-        position=surface.texels.position[chosen],
+        position=texels.position[chosen],
         segment=segment,
-        object=surface.texels.object_index()[chosen].astype(np.int32),
+        object=texels.object_index()[chosen].astype(np.int32),
         prior=np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in groups.lamp]),
     )
-
-
-def _traced(
-    surface: TexturedScene, light: Float, environment: Environment, chosen: Long, seed: int
-) -> Float:
-    """S (N, 3) at the chosen texels with the radiance ``light`` (T, 3)."""
-    return irradiance_at(
-        surface.rays,
-        surface.texture(light),
-        surface.lights(light),
-        environment,
-        surface.texels.position[chosen],
-        surface.texels.normal[chosen],
-        independent_tiles(len(chosen)),
-        replace(_SAMPLING, seed=seed),
-        surface.diagonal_m,
-    ).mean

@@ -43,8 +43,20 @@ def lamp_shapes(points: Float, triangles: Int, radiance: Float) -> tuple[LampSha
     if not len(area) or not light.any():
         return ()
     normals = cross / (2 * area[:, None])
-    sphere = _sphere(corners, normals, area, light)
-    return (sphere,) if sphere else _flat_parts(corners, normals, area, light)
+    if sphere := _sphere(corners, normals, area, light):
+        return (sphere,)
+    # Flat parts, largest first; nothing unless all that matters is a rectangle or a disc.
+    power = area * light.sum(axis=1)
+    left = np.ones(len(area), np.bool_)
+    parts: list[LampShape] = []
+    while power[left].sum() > (1 - _COVERED) * power.sum():
+        own = _flat_part(corners, normals, power * left)
+        part = _flat_shape(corners[own], normals[own], area[own], light[own]) if own.any() else None
+        if part is None or len(parts) == _MAX_PARTS:
+            return ()
+        parts.append(part)
+        left &= ~own
+    return tuple(parts)
 
 
 def shapes_of_object(
@@ -85,29 +97,18 @@ def _sphere(corners: Double, normals: Double, area: Double, light: Double) -> La
     mean = (light * area[:, None]).sum(axis=0) / (4 * math.pi * around**2)
     pose = np.eye(4)
     pose[:3, 3] = origin + found[:3]
-    return _shape("sphere", (2 * around, 2 * around), pose, mean)
-
-
-def _flat_parts(
-    corners: Double, normals: Double, area: Double, light: Double
-) -> tuple[LampShape, ...]:
-    """Largest first; nothing unless all that matters is a rectangle or a disc."""
-    power = area * light.sum(axis=1)
-    left = np.ones(len(area), np.bool_)
-    parts: list[LampShape] = []
-    while power[left].sum() > (1 - _COVERED) * power.sum():
-        own = _flat_part(corners, normals, power * left)
-        part = _flat_shape(corners[own], normals[own], area[own], light[own]) if own.any() else None
-        if part is None or len(parts) == _MAX_PARTS:
-            return ()
-        parts.append(part)
-        left &= ~own
-    return tuple(parts)
+    return _shape("sphere", np.full(2, 2 * around), pose, mean)
 
 
 def _flat_part(corners: Double, normals: Double, power: Double) -> Bool:
     """The faces, among those with power, about the direction into which most of it goes."""
-    directions = _directions()
+    # The axes, then points of a Fibonacci lattice on the sphere, some 8 degrees apart.
+    count = 800
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, math.pi * (1 + math.sqrt(5)) * i
+    ring = np.sqrt(1 - z**2)
+    lattice = np.column_stack([ring * np.cos(turn), ring * np.sin(turn), z])
+    directions = np.concatenate([np.eye(3), -np.eye(3), lattice])
     towards = (normals @ directions.T > _SAME_DIRECTION).astype(np.float64)
     normal = directions[np.argmax(power @ towards)]
     own: Bool = (normals @ normal > _SAME_DIRECTION) & (power > 0)
@@ -141,50 +142,28 @@ def _flat_shape(corners: Double, normals: Double, area: Double, light: Double) -
     to_box, extents = oriented_bounds_2D(p[:, :2])
     fill = float(area.sum() / np.prod(extents))
     if fill >= _RECTANGLE_FILL:
+        kind, size = "rectangle", extents * math.sqrt(min(fill, 1.0))
         box = np.linalg.inv(to_box)
-        width, length = extents * math.sqrt(min(fill, 1.0))
-        return _facing("rectangle", (width, length), box[:2, 2], box[:2, 0], height, frame, mean)
-    weighted = (corners.mean(axis=1) @ frame.T)[:, :2] * area[:, None]
-    centre = weighted.sum(axis=0) / area.sum()
-    farthest = float(np.linalg.norm(p[:, :2] - centre, axis=1).max())
-    if area.sum() < _DISK_FILL * math.pi * farthest**2:
-        return None
-    diameter = 2 * math.sqrt(float(area.sum()) / math.pi)
-    return _facing("disk", (diameter,) * 2, centre, np.array([1.0, 0]), height, frame, mean)
-
-
-def _facing(
-    kind: str,
-    size: tuple[float, float],
-    centre: Double,
-    along: Double,
-    height: float,
-    frame: Double,
-    radiance: Double,
-) -> LampShape:
-    """A light in the plane ``frame``, its width along ``along`` (2,), its back towards the lamp."""
-    x = along @ frame[:2]
-    z = -frame[2]
+        centre, along = box[:2, 2], box[:2, 0]
+    else:
+        kind, size = "disk", np.full(2, 2 * math.sqrt(float(area.sum()) / math.pi))
+        weighted = (corners.mean(axis=1) @ frame.T)[:, :2] * area[:, None]
+        centre, along = weighted.sum(axis=0) / area.sum(), np.array([1.0, 0])
+        farthest = float(np.linalg.norm(p[:, :2] - centre, axis=1).max())
+        if area.sum() < _DISK_FILL * math.pi * farthest**2:
+            return None
+    # The width lies along the part's, the back towards the lamp.
+    x, z = along @ frame[:2], -frame[2]
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
     pose[:3, 3] = np.array([*centre, height]) @ frame
-    return _shape(kind, size, pose, radiance)
+    return _shape(kind, size, pose, mean)
 
 
-def _shape(kind: str, size: tuple[float, float], pose: Double, radiance: Double) -> LampShape:
+def _shape(kind: str, size: Double, pose: Double, radiance: Double) -> LampShape:
     # Digits beyond these depend on how many threads the linear algebra had.
     r, g, b = (float(f"{value:.6g}") for value in radiance)
     width, length = (round(float(value), 6) for value in size)
     return LampShape(
         kind=kind, size=(width, length), world_from_light=pose.round(6) + 0.0, radiance=(r, g, b)
     )
-
-
-def _directions() -> Double:
-    """(D, 3) the axes, then points of a Fibonacci lattice on the sphere, some 8 degrees apart."""
-    count = 800
-    i = np.arange(count) + 0.5
-    z, turn = 1 - 2 * i / count, math.pi * (1 + math.sqrt(5)) * i
-    ring = np.sqrt(1 - z**2)
-    lattice = np.column_stack([ring * np.cos(turn), ring * np.sin(turn), z])
-    return np.concatenate([np.eye(3), -np.eye(3), lattice])

@@ -1,30 +1,113 @@
-"""The lit texture becomes irradiance, albedo and emitters (paper, section 3.3)."""
+"""The lit texture becomes irradiance, albedo and emitters (paper, section 3.3).
+
+S holds everything but a texel's own emission, so pi L_d / S well above 1 is impossible for a
+reflector: such texels shine by themselves."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from scipy import ndimage
 
 from usdbrdf import calibration
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
-from usdbrdf.shading.emitters import Emitters, find_emitters
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
+from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 
+EMITTER_RATIO = calibration.number("emitters.ratio")
+_WHOLE_LAMP = calibration.number("emitters.whole_lamp")
+_MIN_PATCH = calibration.count("emitters.min_texels")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Emitters:
+    """emissive (T,) bool per texel; is_lamp (num_objects,) bool: the object shines as a whole;
+    radiance (num_objects, 3) float32: area-weighted mean of its emissive, seen texels (0 where
+    there are none); lower_bound (num_objects,) bool: less than a tenth of that area was ever seen
+    unsaturated, so the radiance can only be larger."""
+
+    emissive: Bool
+    is_lamp: Bool
+    radiance: Float
+    lower_bound: Bool
+
+
+def find_emitters(
+    texels: Texels,
+    radiance: Float,
+    irradiance: Float,
+    seen: Bool,
+    clipped: Bool,
+    unknown_lamp: float = 0.0,
+) -> Emitters:
+    """Emissive texels from L_d and S (T, 3), grouped per object.
+
+    seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound.
+    unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that. S is
+    then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
+    """
+    light = radiance.mean(axis=1)
+    shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
+    # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
+    far = texels.is_far
+    shines &= light > np.median(light[~far])
+    shines &= clipped | (light >= unknown_lamp)
+    # Surroundings reflect nothing that would be known; what they send shines.
+    shines |= far
+    known = seen | clipped
+    emissive = np.zeros(len(texels), np.bool_)
+    num_objects = len(texels.resolution)
+    is_lamp = np.zeros(num_objects, np.bool_)
+    mean = np.zeros((num_objects, 3), np.float32)
+    lower_bound = np.zeros(num_objects, np.bool_)
+    for i in range(num_objects):
+        own = texels.of_object(i)
+        area = np.where(known[own], texels.area[own], 0)
+        is_lamp[i] = area.sum() > 0 and (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
+        if is_lamp[i]:
+            emissive[own] = True
+        else:
+            emissive[own] = _connected(texels, i, shines[own] & known[own])
+        weight = area * emissive[own]
+        exact = weight * seen[own]
+        # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
+        lower_bound[i] = exact.sum() < 0.1 * weight.sum()
+        if not lower_bound[i]:
+            weight = exact
+        if weight.sum() > 0:
+            mean[i] = (radiance[own] * weight[:, None]).sum(axis=0) / weight.sum()
+    return Emitters(emissive=emissive, is_lamp=is_lamp, radiance=mean, lower_bound=lower_bound)
+
+
+def _connected(texels: Texels, index: int, shines: Bool) -> Bool:
+    """Keep only groups of at least _MIN_PATCH texels that touch each other in the atlas."""
+    if np.count_nonzero(shines) < _MIN_PATCH:
+        return np.zeros_like(shines)
+    width, height = texels.resolution[index]
+    picture = np.zeros(width * height, np.bool_)
+    local = texels.pixel[texels.of_object(index)] - texels.first_pixel[index]
+    picture[local] = shines
+    label, _ = ndimage.label(picture.reshape(height, width), np.ones((3, 3)))
+    large = np.bincount(label.ravel()) >= _MIN_PATCH
+    large[0] = False
+    return np.asarray(large[label.ravel()[local]], np.bool_)
+
+
+Arrays: TypeAlias = dict[str, Array]
 NEUTRAL = calibration.number("albedo.unseen")
 _DARK = calibration.number("albedo.dark")
 _TINY = float(np.finfo(np.float32).tiny)
@@ -45,15 +128,15 @@ def albedo_from_irradiance(
 
 
 def albedo_map(
-    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool, far: Bool
+    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool
 ) -> tuple[Float, float]:
     """(albedo (T, 3) in [0, 1], share of the known, non-emissive texels over 1).
 
     radiance, irradiance (T, 3); known (T,): the texel's radiance is not filled in, and its albedo
-    need not be; emissive (T,): it shines by itself, and its albedo is 0; far (T,): it shows the
-    surroundings. Objects of which nothing is known are NEUTRAL.
+    need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
+    is known are NEUTRAL.
     """
-    floor = _DARK * float(np.median(irradiance[~far].mean(axis=1)))
+    floor = _DARK * float(np.median(irradiance[~texels.is_far].mean(axis=1)))
     albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))
     reflects = known & ~emissive
     over = (albedo > 1).any(axis=1) & reflects & lit_enough
@@ -71,52 +154,47 @@ def albedo_map(
 _TILE = 1 << 15
 
 
-def trace_irradiance(
-    run: TaskRun, surface: TexturedScene, lit: Float, environment: Environment, sampling: Sampling
-) -> Irradiance:
-    """S at all texels with the radiance ``lit`` (T, 3) as the light, from where a kill left it."""
-    texels = surface.texels
-    radiance, lights = surface.texture(lit), surface.lights(lit)
-    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
-    # surfaces lit from outside the scan.
-    dark = np.pi * lit.mean(axis=1)
+def by_tiles(
+    run: TaskRun, texels: Texels, name: str, label: str, trace: Callable[[Array, Array], Arrays]
+) -> Arrays:
+    """Arrays of all texels, of which ``trace`` finds those of one tile after the other, given their
+    numbers and patches; each is kept under ``name``, for a run that goes on after a kill. Texels of
+    the surroundings, on which nothing shines, are 0."""
     order, patch = tiles_of_texels(texels)
-    near = ~surface.is_far[order]
+    near = ~texels.is_far[order]
     order, patch = order[near], patch[near]
-    tiles = tiles_of_patches(patch)
-    say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
-
-    def tile(part: slice) -> dict[str, Array]:
-        index = order[part]
-        found = irradiance_at(
-            surface.rays, radiance, lights, environment, texels.position[index],
-            texels.normal[index], patch[part], sampling, surface.diagonal_m, dark[index],
-        )  # fmt: skip
-        return dict(vars(found))
-
-    parts: dict[str, list[Array]] = {}
-    for number, part in enumerate(progress(tiles, total=len(tiles), label="shade", unit="tiles")):
-        done = run.checkpoint(f"tile-{number}", partial(tile, part))
-        for name, values in done.items():
-            parts.setdefault(name, []).append(values)
-    return Irradiance(
-        **{
-            name: at_texels(order, np.concatenate(found), len(texels))
-            for name, found in parts.items()
-        }
-    )
-
-
-def at_texels(order: Array, values: Array, count: int) -> Array:
-    """(count, ...): the values at the texels ``order``, zero elsewhere."""
-    everywhere = np.zeros((count, *values.shape[1:]), values.dtype)
-    everywhere[order] = values
+    tiles = whole_tiles(patch, _TILE)
+    found = [
+        run.checkpoint(f"{name}-{number}", partial(trace, order[part], patch[part]))
+        for number, part in enumerate(progress(tiles, total=len(tiles), label=label, unit="tiles"))
+    ]
+    everywhere = {}
+    for key in found[0]:
+        values = np.concatenate([some[key] for some in found])
+        everywhere[key] = np.zeros((len(texels), *values.shape[1:]), values.dtype)
+        everywhere[key][order] = values
     return everywhere
 
 
-def tiles_of_patches(patch: Array) -> list[slice]:
-    """Ranges of about _TILE texels that do not cut a patch."""
-    return whole_tiles(patch, _TILE)
+def trace_irradiance(
+    run: TaskRun, surface: TexturedScene, lit: Float, environment: Environment, sampling: Sampling
+) -> Irradiance:
+    """S at all texels with the radiance ``lit`` (T, 3) as the light."""
+    texels = surface.texels
+    radiance, lights = surface.texture(lit), lights_from_radiance(surface.scene, texels, lit)
+    # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
+    # surfaces lit from outside the scan.
+    dark = np.pi * lit.mean(axis=1)
+    say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
+
+    def tile(index: Array, patch: Array) -> Arrays:
+        found = irradiance_at(
+            surface.rays, radiance, lights, environment, texels.position[index],
+            texels.normal[index], patch, sampling, surface.diagonal_m, dark[index],
+        )  # fmt: skip
+        return dict(vars(found))
+
+    return Irradiance(**by_tiles(run, texels, "tile", "shade", tile))
 
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
@@ -131,7 +209,7 @@ def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
 _MANY_OVER_ONE, _MOSTLY_OPEN = 0.05, 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Shaded:
     """What is known of all texels.
 
@@ -166,8 +244,7 @@ class Shaded:
 
     def radiance_error(self, index: int) -> float:
         """Relative standard error of an object's estimated radiance, else NaN."""
-        bounded = self.emitters.lower_bound[index]
-        return self.light.error_of_object(index) if bounded else math.nan
+        return self.light.error_of_object(index) if self.emitters.lower_bound[index] else math.nan
 
     def doubts(self, identifiers: Sequence[str]) -> Iterator[str]:
         """Sentences about what a person should look at; identifiers: of the objects."""
@@ -231,34 +308,15 @@ def shade_surface(
     run  keeps what is done for a run that goes on
     """
     light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed)
-    if lightmap_filter == OIDN:
-        before = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
-        traced = trace_irradiance(run, surface, light.lit, environment, before)
-        irradiance = denoised_irradiance(surface.texels, traced.mean)
-    else:
-        traced = trace_irradiance(run, surface, light.lit, environment, sampling)
-        irradiance = traced.mean
-    emitters = find_emitters(
-        surface.texels,
-        light.lit,
-        irradiance,
-        coverage.measured,
-        light.may_shine(coverage.clipped),
-        surface.is_far,
-        light.least_of_lamps(),
-    )
-    albedo, over_one = albedo_map(
-        surface.texels, light.lit, irradiance, coverage.measured, emitters.emissive, surface.is_far
-    )
-    relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / np.maximum(
-        traced.mean.mean(axis=1), 1e-30
-    )
-    return Shaded(
-        light=light,
-        traced=traced,
-        relative_error=relative,
-        irradiance=irradiance,
-        emitters=emitters,
-        albedo=albedo,
-        over_one=over_one,
-    )
+    filtered = lightmap_filter == OIDN
+    if filtered:
+        sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
+    traced = trace_irradiance(run, surface, light.lit, environment, sampling)
+    irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
+    texels, seen = surface.texels, coverage.measured
+    may_shine, dimmest = light.may_shine(coverage.clipped), light.least_of_lamps()
+    emitters = find_emitters(texels, light.lit, irradiance, seen, may_shine, dimmest)
+    albedo, over_one = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
+    level = np.maximum(traced.mean.mean(axis=1), 1e-30)
+    relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
+    return Shaded(light, traced, relative, irradiance, emitters, albedo, over_one)

@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.layers.material_layer import write_material_layer
+from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import FittedObject, colour
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
+from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import ObjectFit, fitted_objects, judged, survey_frames
-from usdbrdf.material.refine import Lobes, refined_light
-from usdbrdf.model.scene import SceneObject
+from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
+from usdbrdf.material.refine import Lobes, frame_reader, refined_light
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
@@ -32,7 +31,7 @@ _READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
 
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps."""
-    maps = AssetMaps(open_before(asset, "material"))
+    maps = AssetMaps(open_weaker(asset, "material"))
     # S is refined as it was filtered, if the filter is here too.
     shading = read_provenance(asset.layer("shading")).get("parameters", {})
     filtered = options.method == "views" and shading.get("denoise") == OIDN
@@ -52,40 +51,33 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         environment = environment_from_file(options.environment, task.header.up_axis)
         lit = maps.lit_scene(environment)
         usable = maps.coverage.measured & ~maps.emissive
-        survey = survey_frames(run, lit, maps.texels, usable, maps.frames, options)
-        found = fitted_objects(run, lit, maps.texels, maps.frames, survey, options)
+        reader = frame_reader(lit, maps.frames, options.memory)
+        survey = survey_frames(run, lit, usable, reader, options)
+        found = fitted_objects(run, lit, reader, survey, options)
         objects = [
-            _record(obj, found[i], options, maps.is_observed(i))
-            for i, obj in enumerate(maps.scene.objects)
+            FittedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                cost=own.cost,
+                evidence=own.evidence,
+                target_frame=own.target if math.isfinite(own.phi) else -1,
+                num_pixels=own.num_samples,
+                method=options.method,
+                mapping=options.mapping,
+                **vars(judged(own, obj, options.method, maps.is_observed(i))),
+            )
+            for i, (obj, own) in enumerate(zip(maps.scene.objects, found, strict=True))
         ]
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
         if options.method == "views":
-            objects = _refined(run, asset, maps, lit, objects, lightmap_filter, options)
-        materialx = f"layers/{asset.materialx_layer.name}"
-        write_material_layer(
-            run.output(f"layers/{asset.layer('material').name}"),
-            task.draft,
-            objects,
-            materialx=run.output(materialx) if options.materialx else None,
-        )
+            objects = _refined(run, asset, maps, lit, reader, objects, lightmap_filter, options)
+        layer = run.output(f"layers/{asset.layer('material').name}")
+        networks = run.output(f"layers/{asset.materialx_layer.name}") if options.materialx else None
+        write_material_layer(layer, task.draft, objects, materialx=networks)
         return {"objects": {item.identifier: item.summary for item in objects}}
 
     return task.run(work)
-
-
-def _record(obj: SceneObject, found: ObjectFit, options: FitOptions, seen: bool) -> FittedObject:
-    return FittedObject(
-        prim_path=obj.prim_path,
-        identifier=obj.identifier,
-        cost=found.cost,
-        evidence=found.evidence,
-        target_frame=found.target if math.isfinite(found.phi) else -1,
-        num_pixels=found.num_samples,
-        method=options.method,
-        mapping=options.mapping,
-        **vars(judged(found, obj, options.method, seen)),
-    )
 
 
 def _refined(
@@ -93,6 +85,7 @@ def _refined(
     asset: Asset,
     maps: AssetMaps,
     lit: LitScene,
+    reader: FrameReader,
     objects: list[FittedObject],
     lightmap_filter: str,
     options: FitOptions,
@@ -100,20 +93,19 @@ def _refined(
     """The objects with maps of L_d, S and base colour that are free of their specular light."""
     numbers = [item.phi for item in objects], [item.psi for item in objects]
     lobes = Lobes(*np.array(numbers, np.float32))
-    texels = maps.texels
     refined = refined_light(
-        run, lit, texels, maps.frames, maps, lobes, lightmap_filter, options.memory, options.seed
+        run, lit, reader, maps, lobes, lightmap_filter, options.memory, options.seed
     )
     written = {
         "diffuse": TexelMap(refined.diffuse, 1.0, "W/(m^2 sr)"),
         "refined_irradiance": TexelMap(refined.irradiance, 1 / np.pi, "W/m^2"),
         "base_color": TexelMap(refined.base_color, 1.0, "1"),
     }
-    writer = MapWriter(run, asset, maps.scene, texels)
+    writer = MapWriter(run, asset, maps.scene, maps.texels)
     with_maps = []
     for i, item in enumerate(objects):
-        mean = colour(texels.mean_of_object(i, refined.base_color))
+        mean = colour(maps.texels.mean_of_object(i, refined.base_color))
         with_maps.append(replace(item, aovs=writer.write(i, written), mean_color=mean))
     view = overview(maps.scene, lit.rays, maps.frames)
-    view.write(run.output("previews/base_color.png"), texels, refined.base_color, exposure=1)
+    view.write(run.output("previews/base_color.png"), maps.texels, refined.base_color, exposure=1)
     return with_maps

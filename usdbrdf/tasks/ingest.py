@@ -7,19 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.header import Draft, StageHeader
-from usdbrdf.asset.layers.root_layer import check_root, write_edits, write_pending_layer, write_root
-from usdbrdf.asset.layers.scan_layer import write_scan_layer
+from usdbrdf.asset.layers.scan_layer import (
+    check_root,
+    write_edits,
+    write_pending_layer,
+    write_root,
+    write_scan_layer,
+)
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.capture.parts import USD_SUFFIXES
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn
+from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.untrusted.usd_files import layers_of_usd
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
 def ingest(
@@ -30,10 +34,8 @@ def ingest(
     *,
     plugins: bool = True,
 ) -> TaskResult:
-    """Read and check a capture and write it as the weakest layer of ``asset``.
-
-    Raises InputRefused for a capture that cannot be used; nothing is published then.
-    """
+    """Read and check a capture and write it as the weakest layer of ``asset``. Raises InputRefused
+    for a capture that cannot be used; nothing is published then."""
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -88,11 +90,11 @@ def _inputs(
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
-    inputs = {"capture": _hash_of_folder(folder, asset.folder)}
-    places = {"capture": capture, "mesh": options.mesh}
-    for i, outside in enumerate(options.allow_outside):
-        inputs[f"outside-{i}"] = _hash_of_folder(outside.resolve(), asset.folder)
-        places[f"outside-{i}"] = outside
+    outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
+    inputs = {
+        label: hash_of_files(files_below(place, without=asset.folder), place)
+        for label, place in ({"capture": folder} | outside).items()
+    }
     mesh, objects = options.mesh, options.objects
     if mesh is not None and mesh.is_file():
         # What a USD mesh refers to may lie beside it, out of the capture.
@@ -101,10 +103,7 @@ def _inputs(
         inputs["mesh"] = hash_of_files(layers)
     if objects is not None and objects.is_file():
         inputs["objects"] = hash_of_files([objects])
+    named = {"mesh": mesh.resolve()} if mesh is not None else {}
+    places = {"capture": capture.resolve()} | named | outside
     here = asset.layer("scan").parent
-    named = {name: place.resolve() for name, place in places.items() if place is not None}
-    return inputs, {name: relative_path(place, here) for name, place in named.items()}
-
-
-def _hash_of_folder(folder: Path, asset: Path) -> str:
-    return hash_of_files(files_below(folder, without=asset), folder)
+    return inputs, {name: relative_path(place, here) for name, place in places.items()}

@@ -8,16 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
-from usdbrdf.asset.layers.shading_layer import write_shading_layer
+from usdbrdf.asset.layers.task_layers import (
+    Lamp,
+    world_from_root,
+    write_lights_layer,
+    write_shading_layer,
+)
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
-from usdbrdf.asset.properties import Aov, ShadedObject, colour
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
+from usdbrdf.asset.properties import ShadedObject, colour
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.model.arrays import Float
 from usdbrdf.options import ShadeOptions
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface
@@ -30,7 +32,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
-    maps = AssetMaps(open_before(asset, "shading"))
+    maps = AssetMaps(open_weaker(asset, "shading"))
     task = Task(
         asset=asset,
         name="shade",
@@ -49,7 +51,19 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         )  # fmt: skip
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = _write_maps(writer, shaded)
-        _write_layers(run, task, maps, objects, shaded.emission)
+        layer = run.output(f"layers/{asset.layer('shading').name}")
+        write_shading_layer(layer, task.draft, objects)
+        lamps = [
+            Lamp(
+                prim_path=item.prim_path,
+                identifier=item.identifier,
+                shapes=shapes_of_object(maps.scene, maps.texels, shaded.emission, i),
+            )
+            for i, item in enumerate(objects)
+            if item.emitter
+        ]
+        lights = run.output(f"layers/{asset.lights_layer.name}")
+        write_lights_layer(lights, task.draft, lamps, world_from_root(maps.stage))
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
@@ -72,47 +86,24 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
     if shaded.irradiance is not traced.mean:
         maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
-    objects = []
-    for i in range(len(writer.scene.objects)):
-        emits = shaded.emitters.emissive[writer.texels.of_object(i)].any()
-        aovs = writer.write(i, maps | emission if emits else maps)
-        objects.append(_record(writer, shaded, i, aovs))
-    return objects
-
-
-def _record(writer: MapWriter, shaded: Shaded, i: int, aovs: tuple[Aov, ...]) -> ShadedObject:
-    obj, own = writer.scene.objects[i], writer.texels.of_object(i)
-    emitters, traced = shaded.emitters, shaded.traced
-    mean = partial(writer.texels.mean_of_object, i)
-    return ShadedObject(
-        prim_path=obj.prim_path,
-        identifier=obj.identifier,
-        aovs=aovs,
-        emitter=bool(emitters.is_lamp[i]),
-        radiance=colour(emitters.radiance[i]),
-        radiance_status=shaded.radiance_status(i),
-        radiance_error=shaded.radiance_error(i),
-        area_fraction=float(mean(emitters.emissive)),
-        mean_albedo=colour(mean(shaded.albedo)),
-        rays_per_texel=float(traced.rays[own].mean()),
-        standard_error=float(np.median(shaded.relative_error[own])),
-        escaped_fraction=float(mean(traced.escaped)),
-    )
-
-
-def _write_layers(
-    run: TaskRun, task: Task, maps: AssetMaps, objects: list[ShadedObject], emission: Float
-) -> None:
-    asset = task.asset
-    write_shading_layer(run.output(f"layers/{asset.layer('shading').name}"), task.draft, objects)
-    lamps = [
-        Lamp(
-            prim_path=item.prim_path,
-            identifier=item.identifier,
-            shapes=shapes_of_object(maps.scene, maps.texels, emission, i),
+    emitters, objects = shaded.emitters, []
+    for i, obj in enumerate(writer.scene.objects):
+        own = writer.texels.of_object(i)
+        mean = partial(writer.texels.mean_of_object, i)
+        objects.append(
+            ShadedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                aovs=writer.write(i, maps | emission if emitters.emissive[own].any() else maps),
+                emitter=bool(emitters.is_lamp[i]),
+                radiance=colour(emitters.radiance[i]),
+                radiance_status=shaded.radiance_status(i),
+                radiance_error=shaded.radiance_error(i),
+                area_fraction=float(mean(emitters.emissive)),
+                mean_albedo=colour(mean(shaded.albedo)),
+                rays_per_texel=float(traced.rays[own].mean()),
+                standard_error=float(np.median(shaded.relative_error[own])),
+                escaped_fraction=float(mean(traced.escaped)),
+            )
         )
-        for i, item in enumerate(objects)
-        if item.emitter
-    ]
-    lights = run.output(f"layers/{asset.lights_layer.name}")
-    write_lights_layer(lights, task.draft, lamps, world_from_root(maps.stage))
+    return objects

@@ -35,7 +35,6 @@ class Task:
 
     @property
     def provenance(self) -> Provenance:
-        """What the task's layers say of how they came about."""
         return Provenance(
             role=self.role, version=code_version(), parameters=self.parameters, inputs=self.inputs
         )

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.layers.texturing_layer import write_texturing_layer
+from usdbrdf.asset.layers.task_layers import write_texturing_layer
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap
-from usdbrdf.asset.previews import overview
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
-from usdbrdf.asset.readers.compose import hashes_of_inputs, open_before
+from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
@@ -30,7 +29,7 @@ from usdbrdf.transport.rays import RayScene
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
-    maps = AssetMaps(open_before(asset, "texturing"))
+    maps = AssetMaps(open_weaker(asset, "texturing"))
     task = Task(
         asset=asset,
         name="texture",
@@ -42,13 +41,11 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     def work(run: TaskRun) -> dict[str, Any]:
         scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
-        sizes = (
-            TexelSizes.even(scene, options.texel_size)
-            if options.texel_size
-            else texel_sizes_from_frames(
-                scene, rays, frames, options.max_texels or most_texels(options.memory)
-            )
-        )
+        if options.texel_size:
+            sizes = TexelSizes.even(scene, options.texel_size)
+        else:
+            most = options.max_texels or most_texels(options.memory)
+            sizes = texel_sizes_from_frames(scene, rays, frames, most)
         given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
         charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, sizes))
         scene = replace(scene, corner_uv=charts["corner_uv"])

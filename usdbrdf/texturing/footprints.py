@@ -17,7 +17,7 @@ from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import doubled_areas, face_normals
+from usdbrdf.model.mesh import doubled_areas, face_normals_and_angles
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.samples import MIN_COSINE, Projection, project
@@ -53,26 +53,20 @@ def blurred(texels: Texels, values: Float, covariance: Float) -> Float:
     the texel's own area. covariance (T, 3): xx, xy, yy, in texels. What lies off a texel's chart
     counts as the texel itself.
     """
-    owner, chart = texels.object_index(), _chart_of_pixels(texels)
-    picture = np.ascontiguousarray(values[np.maximum(texels.nearest_texel, 0)])
-    blurry = np.zeros_like(values)
-    _blur(
-        picture, chart, texels.pixel, texels.first_pixel[owner], texels.resolution[owner],
-        covariance, RINGS, blurry,
-    )  # fmt: skip
-    return blurry
-
-
-def _chart_of_pixels(texels: Texels) -> Int:
-    """Number of the chart that each flat pixel shows, (P,): texels that touch share one."""
     occupied = np.zeros(len(texels.nearest_texel), np.bool_)
     occupied[texels.pixel] = True
+    # Number of the chart that each flat pixel lies on, (P,): texels that touch share one.
     chart = np.zeros(len(occupied), np.int32)
     for i, (width, height) in enumerate(texels.resolution):
         own = slice(int(texels.first_pixel[i]), int(texels.first_pixel[i + 1]))
         chart[own] = ndimage.label(occupied[own].reshape(height, width), np.ones((3, 3)))[0].ravel()
-    shown: Int = chart[texels.pixel[np.maximum(texels.nearest_texel, 0)]]
-    return shown
+    owner, nearest = texels.object_index(), np.maximum(texels.nearest_texel, 0)
+    blurry = np.zeros_like(values)
+    _blur(
+        np.ascontiguousarray(values[nearest]), chart[texels.pixel[nearest]], texels.pixel,
+        texels.first_pixel[owner], texels.resolution[owner], covariance, RINGS, blurry,
+    )  # fmt: skip
+    return blurry
 
 
 @parallel_kernel
@@ -182,7 +176,7 @@ def texel_sizes_from_frames(
     Raises InputRefused if no camera ray meets the mesh.
     """
     count = len(scene.triangles)
-    normals = face_normals(scene.points, scene.triangles)
+    normals = face_normals_and_angles(scene.points, scene.triangles)[0]
     logarithm, pixels = np.zeros(count), np.zeros(count)
     far = scene.is_far[scene.face_object]
     for i in range(len(frames)):

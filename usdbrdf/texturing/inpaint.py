@@ -36,7 +36,11 @@ def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
 def inpaint_alike(texels: Texels, maps: Sequence[Float], known: Bool) -> list[Float]:
     """``inpaint`` of several maps that are known at the same texels."""
     filled = [np.where(known[:, None], values, 0).astype(np.float32) for values in maps]
-    floors = [_floor(values) for values in filled]
+    floors = []
+    for values in filled:
+        positive = values[values > 0]
+        middle = np.median(positive, overwrite_input=True) if len(positive) else 0
+        floors.append(float(_ZERO * middle))
     orphans = []
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
@@ -52,12 +56,6 @@ def inpaint_alike(texels: Texels, maps: Sequence[Float], known: Bool) -> list[Fl
     if orphans and known.any():
         _fill(texels, filled, floors, np.flatnonzero(known), np.concatenate(orphans), 0.0)
     return filled
-
-
-def _floor(values: Float) -> float:
-    """What zero counts as among ``values`` (T, 3); 0 where they are all black."""
-    positive = values[values > 0]
-    return float(_ZERO * np.median(positive, overwrite_input=True)) if len(positive) else 0.0
 
 
 def _fill(

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import read_frames
+from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.coverage import CoverageMap
-from usdbrdf.model.texels import Texels
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
@@ -65,31 +65,26 @@ def lit_texture_from_frames(
 
     Raises InputRefused where no frame shows any surface.
     """
-    groups = groups_of_texels(surface.texels, surface.scene, frames, memory)
+    texels = surface.texels
 
     def measured(part: slice) -> dict[str, Array]:
-        return _observed(run, surface, frames, quantile, part).measured(quantile)
+        """Some texels in all frames, going on from the last saved state of an interrupted run."""
+        name = f"frames-{part.start}-{part.stop}"
+        observed = Observation.empty(part, Probes.empty(len(texels), len(frames), part))
+        start, saved = 0, run.latest(name)
+        if saved is not None:
+            start = saved[0] + 1
+            observed.restore(saved[1])
+        images = read_frames(partial(read_frame, frames), range(start, len(frames)))
+        sampled = samples_from_frames(surface, frames, images, part)
+        for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
+            observed.add(some, quantile)
+            run.save_latest_in_time(name, some.frame, observed.arrays)
+        return observed.measured(quantile)
 
+    groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, "texels", groups, measured))
-    return _filled_in(surface.texels, found, contradicting_frames(frames, found.probes))
-
-
-def _observed(
-    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, part: slice
-) -> Observation:
-    """Some texels in all frames, going on from the last saved state of an interrupted run."""
-    name = f"frames-{part.start}-{part.stop}"
-    observed = Observation.empty(part, Probes.empty(len(surface.texels), len(frames), part))
-    start, saved = 0, run.latest(name)
-    if saved is not None:
-        start = saved[0] + 1
-        observed.restore(saved[1])
-    images = read_frames(frames, range(start, len(frames)))
-    sampled = samples_from_frames(surface.texels, surface.scene, surface.rays, frames, images, part)
-    for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
-        observed.add(some, quantile)
-        run.save_latest_in_time(name, some.frame, observed.arrays)
-    return observed
+    return _filled_in(texels, found, contradicting_frames(frames, found.probes))
 
 
 def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float]) -> LitTexture:

@@ -18,7 +18,6 @@ from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.exposures import Probes
@@ -31,7 +30,7 @@ from usdbrdf.texturing.samples import (
     first_surfaces,
     samples_from_frame,
 )
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.transport.lit_scene import TexturedScene
 
 # Texels to a side of a tile.
 _SIDE = 8
@@ -80,29 +79,18 @@ def blocks_of_texels(texels: Texels, part: slice) -> TexelBlocks:
     width = texels.resolution[owner, 0]
     tile = (local // width // _SIDE) * (MAX_SIDE // _SIDE) + local % width // _SIDE
     key = (owner.astype(np.int64) * (MAX_SIDE // _SIDE) ** 2 + tile) * 6
-    key += _longest_axis(texels.geometric_normal[part])
+    # 0 to 5: x, y, z and their opposites.
+    normal = texels.geometric_normal[part]
+    axis = np.abs(normal).argmax(axis=1)
+    key += axis + 3 * (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0)
     order = np.argsort(key, kind="stable")
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     order = (order + part.start).astype(np.int32)
-    vectors, scalars = (len(first), 3), len(first)
-    blocks = TexelBlocks(
-        order=order,
-        first=np.append(first, len(order)),
-        centre=np.zeros(vectors, np.float32),
-        radius=np.zeros(scalars, np.float32),
-        axis=np.zeros(vectors, np.float32),
-        spread=np.zeros(scalars, np.float32),
-    )
+    centre, axis = np.zeros((2, len(first), 3), np.float32)
+    radius, spread = np.zeros((2, len(first)), np.float32)
+    blocks = TexelBlocks(order, np.append(first, len(order)), centre, radius, axis, spread)
     _bound(texels.position, texels.geometric_normal, *blocks)
     return blocks
-
-
-def _longest_axis(normal: Float) -> Long:
-    """0 to 5: x, y, z and their opposites."""
-    axis = np.abs(normal).argmax(axis=1)
-    along = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0]
-    longest: Long = axis + 3 * (along < 0)
-    return longest
 
 
 @parallel_kernel
@@ -163,8 +151,7 @@ def _in_view(blocks: TexelBlocks, planes: Double, eye: Double, widest: float) ->
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameSamples:
+class FrameSamples(NamedTuple):
     """What one frame shows: texels with a sample (M,) int32 and their radiance (M, 3) float32;
     texels that it saw saturated, clipped (K,) int32, and the radiance that saturates it."""
 
@@ -260,9 +247,7 @@ class Observation:
 
 
 def samples_from_frames(
-    texels: Texels,
-    scene: Scene,
-    rays: RayScene,
+    surface: TexturedScene,
     frames: Frames,
     images: Iterable[tuple[int, FramePixels]],
     part: slice | None = None,
@@ -271,21 +256,18 @@ def samples_from_frames(
 
     images  numbers and pixels of the frames, see ``read_frames``
     """
+    texels = surface.texels
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
     for i, pixels in images:
         camera = frames.camera(i)
         which = blocks.texels_in_view(camera, MIN_COSINE)
-        surfaces = first_surfaces(rays, scene.face_object, camera)
+        surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
         picture = Picture(pixels.radiance, pixels.valid, pixels.clipped)
         kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
-        yield FrameSamples(
-            frame=i,
-            texel=which[kind == SAMPLE],
-            radiance=radiance[kind == SAMPLE],
-            clipped=which[kind == CLIPPED],
-            saturation=float(frames.saturation_radiance[i]),
-        )
+        sampled, saturation = kind == SAMPLE, float(frames.saturation_radiance[i])
+        clipped = which[kind == CLIPPED]
+        yield FrameSamples(i, which[sampled], radiance[sampled], clipped, saturation)
 
 
 def spread_order(count: int) -> list[int]:

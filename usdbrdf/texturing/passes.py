@@ -19,8 +19,9 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 
-# Without --memory this share of the machine's.
-_SHARE = 0.75
+# Without --memory this share of the machine's; and of what one pass over all texels leaves, the
+# share that decoded frames may take.
+_SHARE, _OF_FRAMES = 0.75, 0.5
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
@@ -84,14 +85,7 @@ def groups_of_texels(
 
     Raises EnvironmentFailure where not even the smallest groups do.
     """
-    limit = memory * GIB if memory else _SHARE * machine_bytes()
-    held = _PROCESS + _bytes(scene) + _PER_TRIANGLE * len(scene.triangles) + _bytes(texels)
-    held += need.always * len(texels)
-    # Whoever called may hold more, and an allocator keeps some of what was freed.
-    give_back_freed()
-    held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
-    after = held + need.after * len(texels)
-    held += need.result * len(texels)
+    limit, held, after = _budget(texels, scene, frames, memory, need)
     smallest = _smallest(len(texels))
     needed = max(held + need.grouped * smallest, after)
     if needed > limit:
@@ -101,6 +95,29 @@ def groups_of_texels(
             "choose a larger --texel-size, or fewer triangles with --decimate. [texturing.memory]"
         )
     return _groups(len(texels), max(smallest, int((limit - held) / need.grouped), 1))
+
+
+def bytes_for_frames(
+    texels: Texels, scene: Scene, frames: Frames, memory: float | None, need: BytesPerTexel
+) -> int:
+    """What may hold decoded frames without making one pass over all texels into several."""
+    limit, held, after = _budget(texels, scene, frames, memory, need)
+    return max(0, int(_OF_FRAMES * (limit - max(held + need.grouped * len(texels), after))))
+
+
+def _budget(
+    texels: Texels, scene: Scene, frames: Frames, memory: float | None, need: BytesPerTexel
+) -> tuple[float, float, float]:
+    """Bytes: the limit, what is held beside the present group, and when all groups are done."""
+    limit = memory * GIB if memory else _SHARE * machine_bytes()
+    tables = [*vars(scene).values(), *vars(texels).values()]
+    held = _PROCESS + sum(table.nbytes for table in tables if isinstance(table, np.ndarray))
+    held += _PER_TRIANGLE * len(scene.triangles) + need.always * len(texels)
+    # Whoever called may hold more, and an allocator keeps some of what was freed.
+    give_back_freed()
+    held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
+    after = held + need.after * len(texels)
+    return limit, held + need.result * len(texels), after
 
 
 def most_texels(memory: float | None) -> int:
@@ -125,7 +142,3 @@ def _groups(count: int, most: int) -> list[slice]:
     number = -(-count // most)
     ends = [k * count // number for k in range(number + 1)]
     return [slice(low, high) for low, high in pairwise(ends)]
-
-
-def _bytes(table: Scene | Texels) -> int:
-    return sum(a.nbytes for a in vars(table).values() if isinstance(a, np.ndarray))

@@ -19,7 +19,7 @@ from numba import prange
 
 from usdbrdf import calibration
 from usdbrdf.kernel import kernel, parallel_kernel
-from usdbrdf.model.arrays import Array, Float, Int
+from usdbrdf.model.arrays import Float, Int
 from usdbrdf.texturing.passes import by_parts
 
 # Samples that are added at a time.
@@ -67,9 +67,6 @@ class MeanState(NamedTuple):
             footprint=zeros(3),
         )
 
-    def arrays(self) -> dict[str, Array]:
-        return self._asdict()
-
 
 class RobustMean(NamedTuple):
     """mean (T, 3), NaN where a texel has no sample; variance (T,), the mean over the channels, of a
@@ -115,28 +112,22 @@ def robust_mean(state: MeanState) -> RobustMean:
     """Of all samples so far; ``state`` stays as it is."""
     count = len(state.samples)
     parts = [slice(start, start + _AT_A_TIME) for start in range(0, max(count, 1), _AT_A_TIME)]
-    arrays = state.arrays()
 
     def means(part: slice) -> dict[str, Float]:
-        return _means(MeanState(**{name: values[part] for name, values in arrays.items()}))
+        some = MeanState._make(values[part] for values in state)
+        mean, weight, scatter = some.mean.copy(), some.weight.copy(), some.scatter.copy()
+        _add_rest(some.waiting, some.samples, mean, weight, scatter)
+        # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
+        pull, inlying = scatter.T.astype(np.float64) / 3
+        count = np.maximum(some.samples, 1)
+        variance = pull / np.maximum(np.maximum(inlying, some.precision / count), 1e-30) ** 2
+        return {
+            "mean": np.where(some.samples[:, None] > 0, mean, np.nan),
+            "variance": variance.astype(np.float32),
+            "footprint": some.footprint / np.maximum(some.precision, 1e-30)[:, None],
+        }
 
     return RobustMean(**by_parts(parts, means))
-
-
-def _means(state: MeanState) -> dict[str, Float]:
-    whole = state._replace(
-        mean=state.mean.copy(), weight=state.weight.copy(), scatter=state.scatter.copy()
-    )
-    _add_rest(*whole[:5])
-    # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
-    pull, inlying = whole.scatter.T.astype(np.float64) / 3
-    count = np.maximum(state.samples, 1)
-    variance = pull / np.maximum(np.maximum(inlying, state.precision / count), 1e-30) ** 2
-    return {
-        "mean": np.where(state.samples[:, None] > 0, whole.mean, np.nan),
-        "variance": variance.astype(np.float32),
-        "footprint": state.footprint / np.maximum(state.precision, 1e-30)[:, None],
-    }
 
 
 @parallel_kernel

@@ -15,6 +15,5 @@ Its face, which is all that the rest of the package calls:
     denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things
 
-Behind it are random numbers (tile_draws) and the estimators' loops
-(cosine_sampling, light_sampling), which hold occlusion as well.
+Behind it are random numbers (tile_draws) and the estimators' loops (sampling_loops).
 """

@@ -51,32 +51,21 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
     if picture is None:
         return black_environment()
     image = picture_from_file(picture)
-    _refuse_what_is_not_light(picture, image)
-    image = to_working_space(image, WORKING_SPACE)
-    return Environment(image=image, z_up=up_axis == "Z")
-
-
-def _refuse_what_is_not_light(picture: Path, image: Float) -> None:
-    unknown = int(np.count_nonzero(~np.isfinite(image).all(axis=2)))
-    if unknown:
-        raise InputRefused(
-            f"{picture}: {unknown} pixels are infinite, NaN or missing, so the light from there is "
-            "unknown; repair the picture given as --environment. [shading.environment]"
-        )
-    negative = int(np.count_nonzero((image < 0).any(axis=2)))
-    if negative:
-        raise InputRefused(
-            f"{picture}: {negative} pixels are negative, which no light is; repair the picture "
-            "given as --environment. [shading.environment]"
-        )
-    if picture.suffix.lower() not in _HDR_SUFFIXES and _holds_integers(image):
+    for wrong, what in (
+        (~np.isfinite(image), "infinite, NaN or missing, so the light from there is unknown"),
+        (image < 0, "negative, which no light is"),
+    ):
+        if number := int(np.count_nonzero(wrong.any(axis=2))):
+            raise InputRefused(
+                f"{picture}: {number} pixels are {what}; repair the picture given as "
+                "--environment. [shading.environment]"
+            )
+    # Integer files are read as k / 65535, which k / 255 is too.
+    levels = image * np.float64(65535)
+    integers = image.max() <= 1 and (np.abs(levels - np.round(levels)) < 0.01).all()
+    if picture.suffix.lower() not in _HDR_SUFFIXES and integers:
         raise InputRefused(
             f"{picture}: an 8- or 16-bit picture ends at white and holds no radiance; give an "
             "OpenEXR or Radiance HDR file as --environment. [shading.environment]"
         )
-
-
-def _holds_integers(image: Float) -> bool:
-    """True if all values are k / 65535, which k / 255 is too: what integer files are read as."""
-    levels = image * np.float64(65535)
-    return bool(image.max() <= 1 and (np.abs(levels - np.round(levels)) < 0.01).all())
+    return Environment(image=to_working_space(image, WORKING_SPACE), z_up=up_axis == "Z")

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -30,11 +30,16 @@ from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
-from usdbrdf.transport.cosine_sampling import add_cosine_samples
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.light_sampling import Met, PointDraws, Receivers, add_light_samples
 from usdbrdf.transport.lights import LightGroups, Lights, TilePicks, weighed_groups
 from usdbrdf.transport.rays import RayScene, lift_from_surface
+from usdbrdf.transport.sampling_loops import (
+    Met,
+    PointDraws,
+    Receivers,
+    add_cosine_samples,
+    add_light_samples,
+)
 from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.tile_draws import (
     STRATA_BY_PLACE,
@@ -168,8 +173,8 @@ def irradiance_at(
     count = min(_POINTS, max(1, len(tile) // (4 * threads)))
     with ThreadPoolExecutor(max_workers=threads) as pool:
         found = list(pool.map(traced, whole_tiles(tile, count)))
-    names = [field.name for field in fields(Irradiance)]
-    return Irradiance(**{n: np.concatenate([getattr(part, n) for part in found]) for n in names})
+    names = vars(found[0])
+    return Irradiance(**{n: np.concatenate([vars(part)[n] for part in found]) for n in names})
 
 
 def _irradiance_of(
@@ -181,13 +186,27 @@ def _irradiance_of(
     share, done = np.zeros(count, np.float32), np.zeros(count, np.int32)
     sums, escaped = np.zeros((2, _BLOCKS, count, 4)), np.zeros(count)
     active: Any = slice(None)
-    picks = _picks(light, points)
+    if light.techniques == 2:
+        first_point = np.searchsorted(points.row, np.arange(points.row[-1] + 2))
+        picks = weighed_groups(light.groups, points.origin, points.normal, first_point)
+    else:
+        nothing = np.zeros((0, 0), np.float32)
+        picks = TilePicks(nothing.astype(np.float64), nothing.astype(np.int16), nothing)
     for first, last in rounds:
+        # The first round fills all four blocks; each later one the last two, and the first two
+        # hold what came before.
+        sample = np.arange(first, last)
         if first:
             sums[:, 0] += sums[:, 1]
             sums[:, 1] = sums[:, 2] + sums[:, 3]
             sums[:, 2:] = 0
-        _add_samples(light, points, picks, (first, last), sums, escaped)
+            block = 2 + (sample - first) * 2 // (last - first)
+        else:
+            block = sample * _BLOCKS // last
+        receivers = _receivers(points, light, picks)
+        add_cosine_samples(light.met, receivers, first, block, sums[0], escaped)
+        if light.techniques == 2:
+            add_light_samples(light.met, receivers, first, block, sums[1])
         found, scatter = mean_and_error(sums, last)
         mean[active], error[active], share[active] = found, scatter, escaped / last
         done[active] = light.techniques * last
@@ -202,6 +221,13 @@ def _irradiance_of(
             # In one piece, as the compiled loops know them.
             sums = np.take(sums, noisy, axis=2)
     return Irradiance(mean=mean, standard_error=error, rays=done, escaped=share)
+
+
+def _receivers(points: _Points, light: _Light, picks: TilePicks) -> Receivers:
+    sobol, seed, shared = light.draws.sobol, light.draws.seed, light.draws.shared
+    scrambles = scrambles_of_points(points.identity, points.stratum, seed, shared)
+    draws = PointDraws(sobol, scrambles, seed, points.identity)
+    return Receivers(points.origin, points.normal, draws, light.groups, points.row, picks)
 
 
 def _rounds(sampling: Sampling, techniques: int) -> list[tuple[int, int]]:
@@ -223,43 +249,6 @@ def _noisy(tile: Int, mean: Double, error: Double, target: float, dark: Double) 
     square = np.bincount(index, (error**2).sum(axis=1) / 3) / points
     floor = np.maximum(np.bincount(index, dark) / points, 1e-30)
     return (np.sqrt(square) > target * np.maximum(level, floor))[index]
-
-
-def _picks(light: _Light, points: _Points) -> TilePicks:
-    """How the points' tiles pick lights."""
-    if light.techniques == 1:
-        return TilePicks(np.zeros((0, 0)), np.zeros((0, 0), np.int16), np.zeros((0, 0), np.float32))
-    first_point = np.searchsorted(points.row, np.arange(points.row[-1] + 2))
-    picks: TilePicks = weighed_groups(light.groups, points.origin, points.normal, first_point)
-    return picks
-
-
-def _add_samples(
-    light: _Light,
-    points: _Points,
-    picks: TilePicks,
-    samples: tuple[int, int],
-    sums: Double,
-    escaped: Double,
-) -> None:
-    """Trace samples first to last of each point and add them to sums (2, 4, P, 4), one for each
-    technique, and escaped (P,)."""
-    sobol, seed, shared = light.draws.sobol, light.draws.seed, light.draws.shared
-    scrambles = scrambles_of_points(points.identity, points.stratum, seed, shared)
-    draws = PointDraws(sobol, scrambles, seed, points.identity)
-    receivers = Receivers(points.origin, points.normal, draws, light.groups, points.row, picks)
-    start, block = samples[0], _block_of(np.arange(*samples), *samples)
-    add_cosine_samples(light.met, receivers, start, block, sums[0], escaped)
-    if light.techniques == 2:
-        add_light_samples(light.met, receivers, start, block, sums[1])
-
-
-def _block_of(sample: Long, first: int, last: int) -> Long:
-    """The first round fills all four blocks; each later one the last two (the first two then hold
-    what came before)."""
-    if first == 0:
-        return sample * _BLOCKS // last
-    return 2 + (sample - first) * 2 // (last - first)
 
 
 @loop

@@ -95,7 +95,38 @@ class Lights:
 
     @cached_property
     def groups(self) -> LightGroups:
-        return light_groups(self.face, self.cumulative, self.density, self.corners, self.normals)
+        """Split where power times extent is largest."""
+        power = np.diff(self.cumulative, prepend=0)
+        corners, normals = self.corners.astype(np.float64), self.normals.astype(np.float64)
+        centres = corners.mean(axis=1)
+        # Lights that face apart are as good as far apart.
+        size = np.linalg.norm(np.ptp(centres, axis=0)) if len(centres) else 0.0
+        features = np.concatenate([centres, normals * size / 4], axis=1)
+        parts = _split(features, power)
+        order = np.concatenate(parts) if parts else np.zeros(0, np.int64)
+        cumulative = np.cumsum(power[order])
+        ends = np.cumsum([0, *[len(part) for part in parts]])
+        of_face = np.full(len(self.density), -1, np.int32)
+        of_face[self.face[order]] = np.arange(len(order))
+        # Several steps per light: picking then seldom has to look further.
+        steps = np.linspace(0, 1, 8 * len(order), endpoint=False)
+        triangles = np.zeros((len(order), 16), np.float32)
+        triangles[:, _CORNER:_EDGE_U] = corners[order, 0]
+        triangles[:, _EDGE_U:_EDGE_V] = corners[order, 1] - corners[order, 0]
+        triangles[:, _EDGE_V:_NORMAL] = corners[order, 2] - corners[order, 0]
+        triangles[:, _NORMAL:DENSITY] = normals[order]
+        triangles[:, DENSITY] = self.density[self.face[order]]
+        triangles[:, GROUP] = np.repeat(np.arange(len(parts)), np.diff(ends))
+        return LightGroups(
+            face=self.face[order],
+            cumulative=cumulative,
+            guide=np.searchsorted(cumulative, steps, side="right").astype(np.int32),
+            start=np.concatenate([[0.0], cumulative])[ends],
+            of_face=of_face,
+            bounds=_bounds(parts, power, corners, normals),
+            triangles=triangles,
+            is_light=np.packbits(self.density > 0, bitorder="little"),
+        )
 
 
 def lights_from_radiance(
@@ -112,8 +143,16 @@ def lights_from_radiance(
     num_faces = len(scene.triangles)
     power = np.bincount(texels.face, brightness * weight, num_faces).astype(np.float64)
     covered = np.bincount(texels.face, weight, num_faces).astype(np.float64)
-    mean = _mean_per_face(scene, texels, brightness, power, covered)
-
+    mean = power / np.maximum(covered, 1e-30)
+    bare = np.flatnonzero(covered <= 0)
+    if len(bare):
+        owner = scene.face_object[bare]
+        size = texels.resolution[owner]
+        centre = np.floor(texels.corner_pixel[bare].mean(axis=1)).astype(np.int64)
+        x, y = np.clip(centre, 0, size - 1).T
+        mean[bare] = brightness[
+            texels.nearest_texel[texels.first_pixel[owner] + y * size[:, 0] + x]
+        ]
     doubled = doubled_areas(scene.points, scene.triangles)
     area = doubled / 2
     counted = area.copy()
@@ -136,58 +175,6 @@ def lights_from_radiance(
         density=density,
         corners=scene.points[triangles].astype(np.float32),
         normals=normals.astype(np.float32),
-    )
-
-
-def _mean_per_face(
-    scene: Scene, texels: Texels, brightness: Float, power: Double, covered: Double
-) -> Double:
-    """Mean brightness of each face; one without a texel centre reads the texel at its centroid."""
-    mean = power / np.maximum(covered, 1e-30)
-    bare = np.flatnonzero(covered <= 0)
-    if len(bare):
-        centre = np.floor(texels.corner_pixel[bare].mean(axis=1)).astype(np.int64)
-        size = texels.resolution[scene.face_object[bare]]
-        centre = np.clip(centre, 0, size - 1)
-        pixel = texels.first_pixel[scene.face_object[bare]] + centre[:, 1] * size[:, 0]
-        mean[bare] = brightness[texels.nearest_texel[pixel + centre[:, 0]]]
-    return mean
-
-
-def light_groups(
-    face: Int, cumulative: Double, density: Float, of_corners: Float, of_normals: Float
-) -> LightGroups:
-    """Groups of ``Lights``, split where power times extent is largest."""
-    power = np.diff(cumulative, prepend=0)
-    corners, normals = of_corners.astype(np.float64), of_normals.astype(np.float64)
-    centres = corners.mean(axis=1)
-    # Lights that face apart are as good as far apart.
-    size = np.linalg.norm(np.ptp(centres, axis=0)) if len(centres) else 0.0
-    features = np.concatenate([centres, normals * size / 4], axis=1)
-    parts = _split(features, power)
-    order = np.concatenate(parts) if parts else np.zeros(0, np.int64)
-    cumulative = np.cumsum(power[order])
-    ends = np.cumsum([0, *[len(part) for part in parts]])
-    of_face = np.full(len(density), -1, np.int32)
-    of_face[face[order]] = np.arange(len(order))
-    # Several steps per light: picking then seldom has to look further.
-    steps = np.linspace(0, 1, 8 * len(order), endpoint=False)
-    triangles = np.zeros((len(order), 16), np.float32)
-    triangles[:, _CORNER:_EDGE_U] = corners[order, 0]
-    triangles[:, _EDGE_U:_EDGE_V] = corners[order, 1] - corners[order, 0]
-    triangles[:, _EDGE_V:_NORMAL] = corners[order, 2] - corners[order, 0]
-    triangles[:, _NORMAL:DENSITY] = normals[order]
-    triangles[:, DENSITY] = density[face[order]]
-    triangles[:, GROUP] = np.repeat(np.arange(len(parts)), np.diff(ends))
-    return LightGroups(
-        face=face[order],
-        cumulative=cumulative,
-        guide=np.searchsorted(cumulative, steps, side="right").astype(np.int32),
-        start=np.concatenate([[0.0], cumulative])[ends],
-        of_face=of_face,
-        bounds=_bounds(parts, power, corners, normals),
-        triangles=triangles,
-        is_light=np.packbits(density > 0, bitorder="little"),
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,28 +34,20 @@ class TexturedScene:
         """Of the scene's bounding box, metres."""
         return self.scene.diagonal_m
 
-    @cached_property
-    def is_far(self) -> Bool:
-        """(T,): the texel shows the surroundings."""
-        return self.scene.is_far[self.texels.object_index()]
-
     def texture(self, values: Float) -> SurfaceTexture:
         """Per-texel values (T, 3) as a texture that rays can look up."""
         return surface_texture(self.texels, self.scene.face_object, values)
 
-    def lights(self, radiance: Float, brighter_than: float | None = None) -> Lights:
-        """The bright triangles of a radiance (T, 3), see ``lights_from_radiance``."""
-        if brighter_than is None:
-            return lights_from_radiance(self.scene, self.texels, radiance)
-        return lights_from_radiance(self.scene, self.texels, radiance, brighter_than)
+    def owner(self, face: Int) -> Int:
+        """The object of each face (R,), -1 where the face is -1."""
+        return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
 
 
 # Lobes pick among all lights alike, by power: each of the few rays is to meet one that shows.
 _BRIGHTER_THAN = 6.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurfacePoints:
+class SurfacePoints(NamedTuple):
     """What R rays meet: face (R,) int32 (-1: nothing), position, shading normal turned to where the
     ray came from (a camera), and direction there, each (R, 3) float32, the latter two unit."""
 
@@ -66,34 +59,21 @@ class SurfacePoints:
     to_camera: Float
 
     def take(self, index: npt.NDArray[np.int64]) -> SurfacePoints:
-        """Some of the points."""
-        return SurfacePoints(**{name: values[index] for name, values in vars(self).items()})
+        return SurfacePoints._make(values[index] for values in self)
 
     @staticmethod
     def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
-        """Points after points."""
-        names = vars(parts[0])
-        return SurfacePoints(
-            **{name: np.concatenate([vars(part)[name] for part in parts]) for name in names}
-        )
+        return SurfacePoints._make(map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class LitScene:
-    """All that light transport needs: geometry, L_d as texture and as lights, surroundings, the
-    emission mask, and the diagonal of the scene's box."""
+class LitScene(TexturedScene):
+    """With its light: L_d as texture and as lights, the emission mask, and the surroundings."""
 
-    scene: Scene
-    rays: RayScene
     radiance: SurfaceTexture
     lights: Lights
     emission: SurfaceTexture
     environment: Environment
-    diagonal_m: float
-
-    def owner(self, face: Int) -> Int:
-        """The object of each face (R,), -1 where the face is -1."""
-        return np.where(face >= 0, self.scene.face_object[face], -1).astype(np.int32)
 
     def emits(self, place: SurfacePoints | Hits) -> Bool:
         """(R,): is there an emitter?"""
@@ -114,14 +94,9 @@ def points_of_rays(lit: LitScene, origins: Float, directions: Float) -> SurfaceP
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     towards = np.einsum("rd,rd->r", normal, directions) > 0
     position = origins + directions * np.where(hits.face >= 0, hits.distance, 0)[:, None]
-    return SurfacePoints(
-        face=hits.face,
-        u=hits.u,
-        v=hits.v,
-        position=position.astype(np.float32),
-        normal=np.where(towards[:, None], -normal, normal).astype(np.float32),
-        to_camera=-directions,
-    )
+    normal = np.where(towards[:, None], -normal, normal).astype(np.float32)
+    position = position.astype(np.float32)
+    return SurfacePoints(hits.face, hits.u, hits.v, position, normal, -directions)
 
 
 def lit_scene(
@@ -133,12 +108,12 @@ def lit_scene(
     shines = np.repeat(emissive[:, None].astype(np.float32), 3, axis=1)
     return LitScene(
         scene=surface.scene,
+        texels=surface.texels,
         rays=surface.rays,
         radiance=radiance,
-        lights=surface.lights(light, _BRIGHTER_THAN),
+        lights=lights_from_radiance(surface.scene, surface.texels, light, _BRIGHTER_THAN),
         emission=radiance.showing(surface.texels, shines),
         environment=environment,
-        diagonal_m=surface.diagonal_m,
     )
 
 

@@ -324,13 +324,10 @@ def trace_lobe_samples(
     )  # fmt: skip
     draw_directions(aimed, origin, draws, mixture, groups)
     hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
-    samples = LobeSamples(
-        cos_in=np.zeros((count, total), np.float32),
-        sin2_half=np.zeros((count, total), np.float32),
-        grazing=np.zeros((count, total), np.float32),
-        weighted=lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3),
-        cos_out=np.einsum("rd,rd->r", points.normal, points.to_camera),
-    )
+    cos_in, sin2_half, graze = np.zeros((3, count, total), np.float32)
+    arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
+    cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)
+    samples = LobeSamples(cos_in, sin2_half, graze, arriving, cos_out)
     hits = Hits._make(values.reshape(count, total) for values in hits)
     weigh(aimed, hits, mixture, groups, lit.environment, samples)
     return samples

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import os
 import weakref
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -52,10 +51,7 @@ _FUNCTIONS: dict[str, tuple[object, list[object]]] = {
     "rtcCommitScene": (None, [_pointer]),
     "rtcReleaseScene": (None, [_pointer]),
     "rtcNewGeometry": (_pointer, [_pointer, _number]),
-    "rtcSetSharedGeometryBuffer": (
-        None,
-        [_pointer, _number, _number, _number, _pointer, _size, _size, _size],
-    ),
+    "rtcSetSharedGeometryBuffer": (None, [_pointer, *[_number] * 3, _pointer, *[_size] * 3]),
     "rtcCommitGeometry": (None, [_pointer]),
     "rtcAttachGeometry": (_number, [_pointer, _pointer]),
     "rtcReleaseGeometry": (None, [_pointer]),
@@ -97,47 +93,6 @@ def _device() -> int:
             "PyPI"
         )
     return device
-
-
-class EmbreeScene:
-    """A committed scene of one mesh, for the loops below.
-
-    points (V, 3) float32; triangles (F, 3) int32 inside [0, V)
-
-    ``points``, ``triangles``  as Embree reads them, for as long as this object lives; triangles
-                               are the caller's own, points a copy
-    ``address``                what the loops know it by
-    """
-
-    def __init__(self, points: Float, triangles: Int) -> None:
-        """Raises EnvironmentFailure where memory does not suffice."""
-        padded = np.zeros(3 * len(points) + _FLOATS_BEHIND_VERTICES, np.float32)
-        self.points: Float = padded[: 3 * len(points)].reshape(-1, 3)
-        self.points[:] = points
-        self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
-        embree, device = _embree(), _device()
-        mesh = embree.rtcNewGeometry(device, _TRIANGLES)
-        for kind, form, values in (
-            (_INDICES, _UINT3, self.triangles),
-            (_VERTICES, _FLOAT3, self.points),
-        ):
-            embree.rtcSetSharedGeometryBuffer(
-                mesh, kind, 0, form, values.ctypes.data, 0, values.strides[0], len(values)
-            )
-        embree.rtcCommitGeometry(mesh)
-        self.address: int = embree.rtcNewScene(device)
-        weakref.finalize(self, embree.rtcReleaseScene, self.address)
-        embree.rtcSetSceneFlags(self.address, _ROBUST)
-        embree.rtcSetSceneBuildQuality(self.address, _HIGH)
-        embree.rtcAttachGeometry(self.address, mesh)
-        embree.rtcReleaseGeometry(mesh)
-        embree.rtcCommitScene(self.address)
-        error = embree.rtcGetDeviceError(device)
-        if error:
-            raise EnvironmentFailure(
-                f"Embree cannot take a mesh of {len(triangles):,} triangles (its error {error}): "
-                "free some memory or use a smaller mesh"
-            )
 
 
 _intersect = types.ExternalFunction("rtcIntersect1", types.void(types.intp, types.intp, types.intp))
@@ -286,23 +241,51 @@ BOX_FACES = 64
 
 
 class RayScene:
-    """A committed Embree scene. Results do not depend on the number of threads.
+    """A committed Embree scene of one mesh. Results do not depend on the number of threads.
 
-    points (V, 3) float32, triangles (F, 3) int32: what it was made of
+    ``points``, ``triangles``  as Embree reads them, for as long as this object lives; triangles
+                               are the caller's own, points a copy
+    ``address``                what the compiled loops know it by, as long as this object lives
     """
 
     def __init__(self, points: Float, triangles: Int) -> None:
         """points (V, 3) float32 finite; triangles (F, 3) int32 inside [0, V).
 
-        Embree reports neither bad indices nor NaN triangles, so both are refused here.
+        Embree reports neither bad indices nor NaN triangles, so both are refused here. Raises
+        EnvironmentFailure where memory does not suffice.
         """
         if triangles.size == 0:
             raise UsdBrdfError("a ray scene needs at least one triangle")
         if triangles.min() < 0 or triangles.max() >= len(points) or not np.isfinite(points).all():
             raise UsdBrdfError("a ray scene got a face index out of range or a non-finite vertex")
-        self._scene = EmbreeScene(points, triangles)
-        self.points, self.triangles = self._scene.points, self._scene.triangles
+        padded = np.zeros(3 * len(points) + _FLOATS_BEHIND_VERTICES, np.float32)
+        self.points: Float = padded[: 3 * len(points)].reshape(-1, 3)
+        self.points[:] = points
+        self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
+        embree, device = _embree(), _device()
+        mesh = embree.rtcNewGeometry(device, _TRIANGLES)
+        for kind, form, values in (
+            (_INDICES, _UINT3, self.triangles),
+            (_VERTICES, _FLOAT3, self.points),
+        ):
+            embree.rtcSetSharedGeometryBuffer(
+                mesh, kind, 0, form, values.ctypes.data, 0, values.strides[0], len(values)
+            )
+        embree.rtcCommitGeometry(mesh)
+        self.address: int = embree.rtcNewScene(device)
+        weakref.finalize(self, embree.rtcReleaseScene, self.address)
+        embree.rtcSetSceneFlags(self.address, _ROBUST)
+        embree.rtcSetSceneBuildQuality(self.address, _HIGH)
+        embree.rtcAttachGeometry(self.address, mesh)
+        embree.rtcReleaseGeometry(mesh)
+        embree.rtcCommitScene(self.address)
+        error = embree.rtcGetDeviceError(device)
+        if error:
+            raise EnvironmentFailure(
+                f"Embree cannot take a mesh of {len(triangles):,} triangles (its error {error}): "
+                "free some memory or use a smaller mesh"
+            )
 
     @cached_property
     def boxes(self) -> Float:
@@ -316,35 +299,28 @@ class RayScene:
             high = np.maximum(high, np.maximum.reduceat(at, first))
         return np.stack([low, high], axis=1)
 
-    @property
-    def address(self) -> int:
-        """What the compiled loops of ``embree`` know the scene by, as long as this object lives."""
-        return self._scene.address
-
     def closest(self, origins: Float, directions: Float) -> Hits:
         """First hit of R rays: directions (R, 3), origins (P, 3), 1 <= P <= R, ray r from r % P,
         all float32 in the world frame."""
         count = len(directions)
         hits: Hits = empty_hits(count)
         in_turn = len(origins) < count
+        # Of origins that are used in turn each chunk takes all, so often as fits.
+        whole = len(origins) if in_turn else 1
+        step = max(1, _CHUNK // whole) * whole
 
-        def trace(part: slice) -> None:
+        def trace(start: int) -> None:
+            part = slice(start, min(start + step, count))
             closest_hits(
                 self.address, origins if in_turn else origins[part], directions[part],
                 Hits._make(values[part] for values in hits),
             )  # fmt: skip
 
-        self._in_chunks(count, len(origins) if in_turn else 1, trace)
-        return hits
-
-    def _in_chunks(self, count: int, whole: int, trace: Callable[[slice], None]) -> None:
-        """Rays 0 to count in parts of a multiple of ``whole``."""
-        step = max(1, _CHUNK // whole) * whole
-        parts = [slice(start, min(start + step, count)) for start in range(0, count, step)]
-        if len(parts) == 1:
-            trace(parts[0])
+        if 0 < count <= step:
+            trace(0)
         else:
-            list(self._pool.map(trace, parts))
+            list(self._pool.map(trace, range(0, count, step)))
+        return hits
 
 
 def lift_from_surface(positions: Float, normals: Float, diagonal_m: float) -> Float:

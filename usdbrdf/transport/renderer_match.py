@@ -38,6 +38,7 @@ from usdbrdf.transport.brdf import (
 
 # Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
 _VIEWS, _SLOPES, _AZIMUTHS, _COSINES, _CANDIDATES = 24, 120, 32, 128, 400
+_WH = (np.arange(_COSINES) + 0.5) / _COSINES
 # The diffuse colour for which the sum of both terms is kept.
 _TYPICAL = 0.5
 _PHI = np.linspace(0, 1, 25) ** 2
@@ -74,8 +75,19 @@ def measured_lobe(phi: float, shown_f0: float) -> tuple[float, float]:
 
 @cache
 def _table() -> Shown:
-    rows = [_matched(float(phi)) for phi in _PHI]
-    return Shown(np.array([row.f0 for row in rows]), np.array([row.diffuse for row in rows]))
+    """F0' and k, (phi, F0) each."""
+    candidates = np.linspace(1e-3, np.sqrt(_F0[-1]), _CANDIDATES) ** 2
+    rows = []
+    for phi in _PHI.tolist():
+        fitted = fitted_albedo(phi, _F0)
+        shown = [renderer(phi, candidates) for renderer in (cycles_albedo, storm_albedo)]
+        error = sum(
+            ((s.lobe[:, None, :] / fitted[:, :, None] - 1) ** 2).mean(axis=0) for s in shown
+        )  # (F0, candidates)
+        f0 = _least(np.asarray(error), np.sqrt(candidates)) ** 2
+        lobe, kept = (part.mean(axis=0) for part in cycles_albedo(phi, f0))
+        rows.append((f0, (_TYPICAL + fitted.mean(axis=0) - lobe) / (_TYPICAL * kept)))
+    return Shown(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def _bilinear(values: Double, phi: Double, f0: Double) -> Double:
@@ -88,21 +100,6 @@ def _bilinear(values: Double, phi: Double, f0: Double) -> Double:
     low_phi = (1 - v) * values[i, j] + v * values[i, j + 1]
     high_phi = (1 - v) * values[i + 1, j] + v * values[i + 1, j + 1]
     return np.asarray((1 - u) * low_phi + u * high_phi)
-
-
-def _matched(phi: float) -> Shown:
-    """F0' and k for one phi and all F0 of the table."""
-    fitted = fitted_albedo(phi, _F0)
-    candidates = np.linspace(1e-3, np.sqrt(_F0[-1]), _CANDIDATES) ** 2
-    renderers = (cycles_albedo, storm_albedo)
-    shown = [renderer(phi, candidates) for renderer in renderers]
-    error = sum(
-        ((s.lobe[:, None, :] / fitted[:, :, None] - 1) ** 2).mean(axis=0) for s in shown
-    )  # (F0, candidates)
-    f0 = _least(np.asarray(error), np.sqrt(candidates)) ** 2
-    lobe, kept = (part.mean(axis=0) for part in cycles_albedo(phi, f0))
-    diffuse = (_TYPICAL + fitted.mean(axis=0) - lobe) / (_TYPICAL * kept)
-    return Shown(f0, np.asarray(diffuse))
 
 
 def _least(error: Double, x: Double) -> Double:
@@ -131,20 +128,23 @@ def fitted_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Doub
     lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
     y = masking_width(phi)
     g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
-    return np.asarray(_over_cosines(lobe, g) @ fresnel(f0, _wh()[:, None]))
+    return np.asarray(_over_cosines(lobe, g) @ fresnel(f0, _WH[:, None]))
 
 
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:
     """Of the lobe of Blender's Principled BSDF, which scatters between the facets too."""
     alpha = max(MIN_ALPHA, phi)
 
+    def shadowing(x: Double) -> Double:
+        return np.asarray(0.5 * (np.sqrt(1 + alpha**2 * (1 / x**2 - 1)) - 1))
+
     def single(at: Double | None) -> Double:
         lobe = _half_vectors(alpha, at)
-        g = 1 / (1 + _lambda(lobe.cos_out, alpha) + _lambda(lobe.cos_in, alpha))
+        g = 1 / (1 + shadowing(lobe.cos_out) + shadowing(lobe.cos_in))
         return _over_cosines(lobe, g / (4 * lobe.cos_out * lobe.cos_in))
 
     weights = single(cosines)
-    white, reflected = weights.sum(axis=1)[:, None], weights @ _dielectric(f0, _wh())
+    white, reflected = weights.sum(axis=1)[:, None], weights @ _dielectric(f0, _WH)
     white_mean = single(None).sum(axis=1).mean()
     fresnel_mean = _dielectric(f0, view_cosines()).mean(axis=0)
     between = fresnel_mean * white_mean / (1 - fresnel_mean * (1 - white_mean))
@@ -169,7 +169,7 @@ def storm_albedo(
     everywhere = _over_cosines(
         half, half.cos_in * 0 + 1 / np.pi / distribution(1 - half.cos_half**2, 1.0)
     )
-    f = fresnel(f0, _wh()[:, None])
+    f = fresnel(f0, _WH[:, None])
     kept = everywhere @ (1 - f) / everywhere.sum(axis=1)[:, None]
     return Albedo(excess * (_over_cosines(lobe, g) @ f), kept)
 
@@ -217,10 +217,6 @@ def _over_cosines(lobe: _HalfVectors, rest: Double) -> Double:
     )
 
 
-def _wh() -> Double:
-    return np.asarray((np.arange(_COSINES) + 0.5) / _COSINES)
-
-
 def _dielectric(f0: Double, cosine: Double) -> Double:
     """(C, N) Fresnel's equations for the index of refraction that has F0."""
     ior = (1 + np.sqrt(f0)) / (1 - np.sqrt(f0))
@@ -231,22 +227,15 @@ def _dielectric(f0: Double, cosine: Double) -> Double:
     )
 
 
-def _lambda(x: Double, alpha: float) -> Double:
-    return np.asarray(0.5 * (np.sqrt(1 + alpha**2 * (1 / x**2 - 1)) - 1))
-
-
 @cache
 def matching_factor(phi: float, f0: float) -> float:
     """Factor on a GGX lobe with Smith's masking that gives it the hemispherical albedo of the
-    fitted lobe, both with alpha = max(0.001, phi) and the same f0."""
+    fitted lobe, both with alpha = max(0.001, phi) and the same f0.
+
+    The share of uniform light that D G1(., y) G1(., y) F reflects, by the midpoint rule over half
+    vectors: with h drawn from D(h) cos h, what remains of f cos_o is G F 4 (wo.h) cos_o / cos h.
+    """
     alpha = max(MIN_ALPHA, phi)
-    fitted, smith = (_uniform_albedo(alpha, f0, y) for y in (masking_width(phi), alpha))
-    return fitted / smith
-
-
-def _uniform_albedo(alpha: float, f0: float, y: float) -> float:
-    """Share of uniform light that D G1(., y) G1(., y) F reflects, by the midpoint rule over half
-    vectors: with h drawn from D(h) cos h, what remains of f cos_o is G F 4 (wo.h) cos_o / cos h."""
     mid = [(np.arange(n) + 0.5) / n for n in (24, 48, 24)]
     cos_i2, u, azimuth = np.meshgrid(*mid, indexing="ij")  # cos^2 uniform: cosine-weighted
     cos_i = np.sqrt(cos_i2)
@@ -257,6 +246,10 @@ def _uniform_albedo(alpha: float, f0: float, y: float) -> float:
     cos_o = 2 * wi_h * cos_h - cos_i
     front = (wi_h > 0) & (cos_o > 0)
     cos_o = np.where(front, cos_o, 1.0)
-    g = masking(cos_i, y) * masking(cos_o, y)  # holds 1 / (4 cos_i cos_o)
-    weight = g * fresnel(f0, np.clip(wi_h, 0, 1)) * 4 * wi_h * cos_o / cos_h
-    return float(np.where(front, weight, 0.0).mean())
+
+    def albedo(y: float) -> float:
+        g = masking(cos_i, y) * masking(cos_o, y)  # holds 1 / (4 cos_i cos_o)
+        weight = g * fresnel(f0, np.clip(wi_h, 0, 1)) * 4 * wi_h * cos_o / cos_h
+        return float(np.where(front, weight, 0.0).mean())
+
+    return albedo(masking_width(phi)) / albedo(alpha)

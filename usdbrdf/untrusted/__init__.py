@@ -6,11 +6,6 @@ amount of memory. So each file is refused by its size before it is opened, and r
 process within limits of time and memory (``bounds.LIMITS``); what it names must lie beside it or in
 folders that the user allows. A child is no sandbox: it has the rights of the user.
 
-    mesh_files  mesh_from_file, model_from_file                    PLY, OBJ, GLB
-    usd_files   layers_of_usd, meshes_from_usd, render_scene_of_usd
-    pictures    picture_from_file                                  environments
-    bounds      problem_of_plugin                                  modules of other packages
-
 The frames of a capture do not come through here. They are hundreds of large files that threads
 decode as fast as the disk gives them, again and again; a process for each, and a second copy of
 each on its way back, would cost more than the decoding. OpenImageIO reads them in-process behind

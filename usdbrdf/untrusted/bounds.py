@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -58,10 +58,9 @@ def read_in_child(
     """What ``reader`` ("package.module:name") makes of a foreign file, as f(path, **parameters) in
     a child process; InputRefused where the file is larger than the kind's limit.
 
-    kind        of LIMITS; also begins the names of the rules
-    returns     the type of the result: a dataclass, array or tuple
-    parts       dataclasses that may be inside
-    parameters  JSON
+    kind     of LIMITS; also begins the names of the rules
+    returns  the type of the result: a dataclass, array or tuple
+    parts    dataclasses that may be inside
     """
     refuse_large(kind, path)
     _, seconds, memory_bytes = LIMITS[kind]
@@ -118,31 +117,22 @@ def refuse_large(kind: str, path: Path) -> None:
         )
 
 
-def allowed_folders(path: Path, allow: Iterable[Path]) -> list[str]:
-    """The folders in which a file may name others, absolute: its own, and ``allow``."""
-    return [str(folder.resolve()) for folder in (path.resolve().parent, *allow)]
-
-
 def packed(value: object) -> dict[str, Array]:
-    """A value of dataclasses, tuples, dictionaries, plain values and arrays as named arrays."""
+    """A value of dataclasses, tuples, plain values and arrays as named arrays."""
     arrays: dict[str, Array] = {}
     names: dict[int, str] = {}  # an array that many share travels once
 
-    def tree(node: Any) -> Any:
+    def plain(node: Any) -> Any:
         if isinstance(node, np.ndarray):
             name = names.setdefault(id(node), str(len(names)))
             arrays[name] = node
             return {"array": name}
-        if is_dataclass(node):
-            members = {field.name: tree(getattr(node, field.name)) for field in fields(node)}
-            return {"class": type(node).__name__, "members": members}
-        if isinstance(node, dict):
-            return {"pairs": [[tree(key), tree(member)] for key, member in node.items()]}
         if isinstance(node, Path):
             return str(node)
-        return [tree(member) for member in node] if isinstance(node, tuple | list) else node
+        members = {field.name: getattr(node, field.name) for field in fields(node)}
+        return {"class": type(node).__name__, "members": members}
 
-    text = json.dumps(tree(value)).encode()
+    text = json.dumps(value, default=plain).encode()
     return {**arrays, "tree": np.frombuffer(text, np.uint8)}
 
 
@@ -153,13 +143,11 @@ def unpacked(arrays: Mapping[str, Array], classes: Iterable[type]) -> Any:
 
     def value(node: Any) -> Any:
         if isinstance(node, list):
-            return tuple(value(member) for member in node)
+            return tuple(map(value, node))
         if not isinstance(node, dict):
             return node
         if "array" in node:
             return arrays[node["array"]]
-        if "pairs" in node:
-            return {value(key): value(member) for key, member in node["pairs"]}
         members = {name: value(member) for name, member in node["members"].items()}
         return known[node["class"]](**members)
 

@@ -41,7 +41,7 @@ class FileMesh:
     points       (V, 3) float32, scene units
     triangles    (F, 3) int32 inside [0, V)
     face_label   (F,) int64 the file's own object numbers, or None
-    label_names  the file's names of these numbers, where it has names
+    label_names  the file's names of the numbers from 0 on, where it has names
     kept         (triangles of the file,) bool: False where a triangle was left out because of
                  non-finite vertices or indices out of range; None where nothing was
     """
@@ -49,7 +49,7 @@ class FileMesh:
     points: Float
     triangles: Int
     face_label: npt.NDArray[np.int64] | None = None
-    label_names: dict[int, str]
+    label_names: tuple[str, ...] = ()
     kept: Bool | None = None
 
 
@@ -97,8 +97,9 @@ def _parsed(path: Path, read: Callable[[BinaryIO], Any]) -> Any:
     # The readers raise whatever a damaged file makes them stumble over.
     except Exception as error:
         raise InputRefused(
-            f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({_one_line(error)}). "
-            "Export it again; a face must have three or four corners. [mesh.read]"
+            f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({type(error).__name__}: "
+            f"{' '.join(str(error).split())[:160]}). Export it again; a face must have three or "
+            "four corners. [mesh.read]"
         ) from error
 
 
@@ -154,10 +155,6 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
         )
 
 
-def _one_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
-
-
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
     arrays: dict[str, Any] = load_ply(file)
     elements = arrays["metadata"]["_ply_raw"]
@@ -165,22 +162,17 @@ def _mesh_from_ply(file: BinaryIO) -> FileMesh:
         return _no_faces(len(arrays.get("vertices", ())))
     data = elements["face"]["data"]
     stored = np.asarray(arrays["faces"])
-    names = data.keys() if isinstance(data, dict) else data.dtype.names
+    columns = data if isinstance(data, dict) else {name: data[name] for name in data.dtype.names}
     label = None
-    if LABEL_PROPERTY in names:
-        label = np.asarray(data[LABEL_PROPERTY]).reshape(-1).astype(np.int64)
+    if LABEL_PROPERTY in columns:
+        label = np.asarray(columns[LABEL_PROPERTY]).reshape(-1).astype(np.int64)
     expected = {name: int(elements[name]["length"]) for name in ("vertex", "face")}
-    # An ASCII file that ends early reads as a shorter one.
-    if len(arrays["vertices"]) != expected["vertex"] or len(_rows(data)) != expected["face"]:
+    held = {"vertex": len(arrays["vertices"]), "face": len(next(iter(columns.values())))}
+    if held != expected:  # an ASCII file that ends early reads as a shorter one
         raise ValueError(f"the header announces {expected}, the file holds less")
     if label is not None and len(label) != len(stored):
         raise ValueError("labelled faces must all have the same number of corners")
-    return _file_mesh(arrays["vertices"], stored, label, {})
-
-
-def _rows(data: Any) -> Any:
-    """One column of a PLY element, whose length is the number of the element's rows."""
-    return next(iter(data.values())) if isinstance(data, dict) else data
+    return _file_mesh(arrays["vertices"], stored, label)
 
 
 def _mesh_from_obj(file: BinaryIO) -> FileMesh:
@@ -211,15 +203,15 @@ def _joined(parts: list[tuple[str, Any, Any]]) -> FileMesh:
         return _no_faces(0)
     firsts = np.cumsum([0, *[len(points) for _, points, _ in parts]])
     faces = [np.asarray(f) + firsts[i] for i, (_, _, f) in enumerate(parts)]
-    label = np.repeat(np.arange(len(parts)), [len(f) for f in faces])
-    names = {i: name for i, (name, _, _) in enumerate(parts)}
     points = np.concatenate([np.asarray(points) for _, points, _ in parts])
     if len(parts) == 1:
-        return _file_mesh(points, faces[0], None, {})
-    return _file_mesh(points, np.concatenate(faces), label.astype(np.int64), names)
+        return _file_mesh(points, faces[0])
+    label = np.repeat(np.arange(len(parts), dtype=np.int64), [len(f) for f in faces])
+    names = tuple(name for name, _, _ in parts)
+    return _file_mesh(points, np.concatenate(faces), label, names)
 
 
-def _file_mesh(points: Any, faces: Any, label: Any, names: dict[int, str]) -> FileMesh:
+def _file_mesh(points: Any, faces: Any, label: Any = None, names: tuple[str, ...] = ()) -> FileMesh:
     polygons = np.asarray(faces, np.int64)
     if polygons.ndim != 2 or polygons.shape[1] not in (3, 4):
         raise ValueError(f"faces have the shape {polygons.shape}")
@@ -237,11 +229,7 @@ def _file_mesh(points: Any, faces: Any, label: Any, names: dict[int, str]) -> Fi
 
 
 def _no_faces(vertices: int) -> FileMesh:
-    return FileMesh(
-        points=np.zeros((vertices, 3), np.float32),
-        triangles=np.zeros((0, 3), np.int32),
-        label_names={},
-    )
+    return _file_mesh(np.zeros((vertices, 3)), np.zeros((0, 3)))
 
 
 _READERS = {".ply": _mesh_from_ply, ".obj": _mesh_from_obj, ".glb": _mesh_from_glb}
@@ -307,9 +295,11 @@ def _surface(name: str, mesh: Any, normals: Any) -> Surface:
     corner_uv = None
     if uv is not None and len(uv) == len(points):
         corner_uv = np.asarray(uv, np.float32)[triangles]
-    colours = _vertex_colours(mesh.visual)
     material = _material(mesh.visual, textured=corner_uv is not None)
-    if colours is not None:
+    corner_colour = None
+    if mesh.visual.kind == "vertex":
+        colours = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / np.float32(255)
+        corner_colour = to_working_space(colours[None], "srgb_rec709_scene")[0][triangles]
         material = _plain_material(diffuse=constant_map(1.0), roughness=material.roughness)
     corner_normals = np.full((*triangles.shape, 3), np.nan, np.float32)
     if normals is not None and len(normals) == len(points):
@@ -323,17 +313,9 @@ def _surface(name: str, mesh: Any, normals: Any) -> Surface:
         triangles=triangles,
         corner_normals=corner_normals,
         corner_uv=corner_uv,
-        corner_colour=None if colours is None else colours[triangles],
+        corner_colour=corner_colour,
         material=material,
     )
-
-
-def _vertex_colours(visual: Any) -> Float | None:
-    """(V, 3) linear; None where the file has none."""
-    if visual.kind != "vertex":
-        return None
-    colours = np.asarray(visual.vertex_colors, np.float32)[:, :3] / np.float32(255)
-    return np.asarray(to_working_space(colours[None], "srgb_rec709_scene")[0])
 
 
 def _plain_material(*, diffuse: Float, roughness: Float) -> Material:

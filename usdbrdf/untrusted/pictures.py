@@ -31,7 +31,6 @@ def picture_from_file(path: Path) -> Float:
 
 
 def read_here(path: Path) -> Float:
-    """The same in this process."""
     if len(image_size(path)[2]) == 1:
         return np.repeat(read_exr(path), 3, axis=2)
     return read_radiance(path)

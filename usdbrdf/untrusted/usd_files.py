@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,36 +18,24 @@ import numpy as np
 from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.model.arrays import Double, Float, Int
-from usdbrdf.model.mesh import ScanMesh, Triangulation, triangulate
-from usdbrdf.untrusted.bounds import LIMITS, allowed_folders, read_in_child
+from usdbrdf.model.mesh import (
+    ObjectLabel,
+    ScanGeometry,
+    ScanMesh,
+    Triangulation,
+    joined,
+    triangulate,
+)
+from usdbrdf.untrusted.bounds import LIMITS, read_in_child
 
-_LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
+USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
 _MAX_LAYERS = 1000
 # What fills the sky or lies below an atom is no scan's unit.
 _MIN_UNIT, _MAX_UNIT = 1e-9, 1e9
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, kw_only=True)
-class UsdMeshes:
-    """The captured surface as a USD file holds it, in the file's own units.
-
-    mesh                       world transforms applied; its corner normals are NaN where the file
-                               has none to use
-    labels                     per object, the mesh's display name or its own
-    object_prims               per object, its path below the default prim ("." is the prim itself)
-    meters_per_unit, up_axis   of the stage; the axis is "Y" or "Z"
-    warnings                   sentences about what was left out or simplified
-    """
-
-    mesh: ScanMesh
-    labels: tuple[str, ...]
-    object_prims: tuple[str, ...]
-    meters_per_unit: float
-    up_axis: str
-    warnings: tuple[str, ...]
 
 
 def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
@@ -58,12 +45,13 @@ def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(Path(layer) for layer in layers)
 
 
-def meshes_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> UsdMeshes:
-    """Every visible mesh below the default prim, one object each; instances count one by one.
+def meshes_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> ScanGeometry:
+    """Every visible mesh below the default prim, one object each, by its display name or its own;
+    instances count one by one.
 
     allow  folders outside the file's own that its asset paths may lead into
     """
-    return _in_child("meshes", path, allow, UsdMeshes, parts=(ScanMesh,))
+    return _in_child("meshes", path, allow, ScanGeometry, parts=(ScanMesh, ObjectLabel))
 
 
 def render_scene_of_usd(
@@ -79,7 +67,9 @@ def _in_child(
 ) -> T:
     """``read_here`` in a child."""
     refuse_nameless(path)
-    parameters = {"reader": reader, "allowed": allowed_folders(path, allow)}
+    # Absolute and without links.
+    allowed = [str(folder.resolve()) for folder in (path.resolve().parent, *allow)]
+    parameters = {"reader": reader, "allowed": allowed}
     return read_in_child(
         "stage", f"{__name__}:read_here", path, returns, parts=parts, parameters=parameters
     )
@@ -92,7 +82,13 @@ def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
         layers = check_asset_paths(path, allowed)
         if reader == "layers":
             return tuple(layers)
-        stage = _opened(path)
+        stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+        problems = stage.GetCompositionErrors()
+        if problems:
+            raise InputRefused(
+                f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
+                "layers along, or flatten it. [stage.input]"
+            )
         if reader == "meshes":
             return _meshes(stage, path)
         _check_units(stage, path)
@@ -111,7 +107,7 @@ def _usd_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _meshes(stage: Usd.Stage, path: Path) -> UsdMeshes:
+def _meshes(stage: Usd.Stage, path: Path) -> ScanGeometry:
     root = stage.GetDefaultPrim()
     if not root:
         raise InputRefused(
@@ -122,24 +118,24 @@ def _meshes(stage: Usd.Stage, path: Path) -> UsdMeshes:
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     meshes, warnings = _meshes_below(root, path)
-    parts = []
-    for mesh in meshes:
-        matrix = np.array(transforms.GetLocalToWorldTransform(mesh.GetPrim()), np.float64)
-        parts.append(_world_part(mesh, matrix, time, path))
-    firsts = np.cumsum([0, *[len(points) for points, _, _ in parts]])
+    parts = [
+        _world_part(mesh, transforms.GetLocalToWorldTransform(mesh.GetPrim()), time, path)
+        for mesh in meshes
+    ]
+    points, triangles, face_object = joined([part[:2] for part in parts])
     prims = [mesh.GetPrim() for mesh in meshes]
-    return UsdMeshes(
+    labels = [prim.GetDisplayName() or prim.GetName() for prim in prims]
+    return ScanGeometry(
         mesh=ScanMesh(
-            points=np.concatenate([points for points, _, _ in parts]),
-            triangles=np.concatenate(
-                [triangles + firsts[i] for i, (_, triangles, _) in enumerate(parts)], dtype=np.int32
-            ),
+            points=points,
+            triangles=triangles,
             corner_normals=np.concatenate([normals for _, _, normals in parts]),
-            face_object=np.repeat(
-                np.arange(len(parts), dtype=np.int32), [len(faces) for _, faces, _ in parts]
-            ),
+            face_object=face_object,
         ),
-        labels=tuple(prim.GetDisplayName() or prim.GetName() for prim in prims),
+        objects=tuple(
+            ObjectLabel(identifier=identifier, label=label)
+            for identifier, label in zip(unique_identifiers(labels), labels, strict=True)
+        ),
         object_prims=tuple(str(p.GetPath().MakeRelativePath(root.GetPath())) for p in prims),
         meters_per_unit=meters_per_unit,
         up_axis=up_axis,
@@ -167,26 +163,17 @@ def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
                 f"{path}: more than {_MAX_LAYERS} layers or {LIMITS['stage'].file_bytes} bytes of "
                 "layers. Flatten the stage, or name the part that was captured. [stage.input_size]"
             )
-        if layer.suffix.lower() == ".usdz":
-            _check_package(layer)
-        for reference in _references(layer):
+        package = Sdf.ZipFile.Open(str(layer)) if layer.suffix.lower() == ".usdz" else None
+        for name in package.GetFileNames() if package else ():
+            if name.startswith(("/", "\\")) or ".." in Path(name).parts:
+                raise _outside(layer, name, "is an entry that leaves the package")
+        with _usd_errors(layer):
+            found = UsdUtils.ExtractExternalReferences(str(layer))
+        for reference in sorted({reference for kind in found for reference in kind if reference}):
             target = _target(layer, reference, allowed)
-            if target.suffix.lower() in _LAYER_SUFFIXES and target.is_file():
+            if target.suffix.lower() in USD_SUFFIXES and target.is_file():
                 waiting.append(target)
     return seen
-
-
-def _references(layer: Path) -> list[str]:
-    with _usd_errors(layer):
-        found = UsdUtils.ExtractExternalReferences(str(layer))
-    return sorted({reference for kind in found for reference in kind if reference})
-
-
-def _check_package(layer: Path) -> None:
-    package = Sdf.ZipFile.Open(str(layer))
-    for name in package.GetFileNames() if package else ():
-        if name.startswith(("/", "\\")) or ".." in Path(name).parts:
-            raise _outside(layer, name, "is an entry that leaves the package")
 
 
 def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
@@ -209,18 +196,6 @@ def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
         f"{layer}: the asset path {reference[:200]!r} {reason}. Keep what belongs to the stage "
         "beside it and name it by relative paths. [paths.outside]"
     )
-
-
-def _opened(path: Path) -> Usd.Stage:
-    """The composed stage."""
-    stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
-    problems = stage.GetCompositionErrors()
-    if problems:
-        raise InputRefused(
-            f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
-            "layers along, or flatten it. [stage.input]"
-        )
-    return stage
 
 
 def _one_line(error: object) -> str:
@@ -267,7 +242,9 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
             )
         if not prim.IsA(UsdGeom.Gprim):
             continue
-        if not _is_visible(prim):
+        shape = UsdGeom.Imageable(prim)
+        shown = shape.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
+        if not shown or shape.ComputePurpose() in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):
             hidden += 1
         elif prim.IsA(UsdGeom.Mesh):
             meshes.append(UsdGeom.Mesh(prim))
@@ -286,60 +263,36 @@ def _warnings(
 ) -> list[str]:
     """What a file's meshes lose on the way, and what else it holds: prims of other types, and the
     number of hidden ones."""
-    warnings = []
-    if other:
-        warnings.append(
-            f"{name}: {len(other)} prims are not meshes and are ignored, first {other[0]}. "
-            "[stage.not_mesh]"
-        )
     schemes = [mesh.GetSubdivisionSchemeAttr().Get() for mesh in meshes]
-    cages = sum(scheme != UsdGeom.Tokens.none for scheme in schemes)
-    if cages:
-        warnings.append(
-            f"{name}: {cages} meshes are subdivision cages (what USD assumes where no scheme "
-            "is set); the cage is taken as the surface. [stage.subdivision]"
-        )
-    moving = [mesh for mesh in meshes if _is_moving(mesh, root)]
-    if moving:
-        warnings.append(
-            f"{name}: {len(moving)} meshes move or change with time, first "
-            f"<{moving[0].GetPath()}>; each is taken, and stays, as its first time sample has it. "
-            "The photographs must show that state. [stage.animated]"
-        )
-    skinned = sum(mesh.GetPrim().HasAPI(UsdSkel.BindingAPI) for mesh in meshes)
-    if skinned:
-        warnings.append(
-            f"{name}: {skinned} meshes may be bound to a skeleton, which is not applied: they "
-            "are taken in their rest pose. Bake the pose that the photographs show. "
-            "[stage.skinned]"
-        )
-    if hidden:
-        warnings.append(f"{name}: {hidden} invisible or guide prims are left out. [stage.hidden]")
-    return warnings
+    moving = []
+    for mesh in meshes:
+        prim, moves = mesh.GetPrim(), is_deforming(mesh)
+        while prim and prim.GetPath().HasPrefix(root.GetPath()):
+            moves, prim = moves or is_moving(prim), prim.GetParent()
+        moving += [f"<{mesh.GetPath()}>"] if moves else []
+    sentences = {
+        f"prims are not meshes and are ignored, first {other[0] if other else ''}. "
+        "[stage.not_mesh]": len(other),
+        "meshes are subdivision cages (what USD assumes where no scheme is set); the cage is taken "
+        "as the surface. [stage.subdivision]": sum(s != UsdGeom.Tokens.none for s in schemes),
+        f"meshes move or change with time, first {moving[0] if moving else ''}; each is taken, and "
+        "stays, as its first time sample has it. The photographs must show that state. "
+        "[stage.animated]": len(moving),
+        "meshes may be bound to a skeleton, which is not applied: they are taken in their rest "
+        "pose. Bake the pose that the photographs show. [stage.skinned]": sum(
+            mesh.GetPrim().HasAPI(UsdSkel.BindingAPI) for mesh in meshes
+        ),
+        "invisible or guide prims are left out. [stage.hidden]": hidden,
+    }
+    return [f"{name}: {number} {said}" for said, number in sentences.items() if number]
 
 
-def _is_moving(mesh: Any, root: Any) -> bool:
-    prim, chain = mesh.GetPrim(), []
-    while prim and prim.GetPath().HasPrefix(root.GetPath()):
-        chain.append(prim)
-        prim = prim.GetParent()
-    return is_deforming(mesh) or any(is_moving(prim) for prim in chain)
-
-
-def _is_visible(prim: Any) -> bool:
-    imageable = UsdGeom.Imageable(prim)
-    time = Usd.TimeCode.EarliestTime()
-    return bool(
-        imageable.ComputeVisibility(time) != UsdGeom.Tokens.invisible
-        and imageable.ComputePurpose() not in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)
-    )
-
-
-def _world_part(mesh: Any, matrix: Double, time: Any, path: Path) -> tuple[Float, Int, Float]:
+def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float, Int, Float]:
     """One mesh in the world: points, triangles, corner normals (NaN where none are authored).
 
-    matrix is USD's, for row vectors: p_world = p @ matrix.
+    transform is USD's, for row vectors: p_world = p @ matrix.
     """
+    matrix = np.array(transform, np.float64)
     points, counts, indices = _topology(mesh, time, path)
     mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
@@ -396,14 +349,8 @@ def _authored_normals(
     else:
         values, interpolation = mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation()
     normals = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
-    tokens = UsdGeom.Tokens
-    expected = {
-        tokens.constant: 1,
-        tokens.uniform: num_faces,
-        tokens.vertex: num_points,
-        tokens.varying: num_points,
-        tokens.faceVarying: num_corners,
-    }
+    expected = {"constant": 1, "uniform": num_faces, "vertex": num_points, "varying": num_points}
+    expected["faceVarying"] = num_corners
     if len(normals) != expected.get(interpolation, -1):
         return None
     return np.asarray(normals[fans.element_of_corner(interpolation)], np.float64)

@@ -1,4 +1,5 @@
-"""Rules about files: named so that the asset can move, there, and needed."""
+"""Rules about the files of an asset: its layers are there, in order and of one mind; what they
+name is named so that the asset can move, there, and needed."""
 
 from __future__ import annotations
 
@@ -10,37 +11,124 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd
 
-from usdbrdf.asset.readers.frames import asset_file
-from usdbrdf.validation.asset_stage import AssetStage, located, record_of
-from usdbrdf.validation.rule import Fault, Severity, Site, rule
+from usdbrdf.asset.layout import ROLES
+from usdbrdf.asset.properties import SCHEMA_VERSION
+from usdbrdf.asset.readers.scene import asset_file
+from usdbrdf.job.ownership import edited_files
+from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
 
+_HEADER = ("metersPerUnit", "upAxis", "timeCodesPerSecond")
 _UDIM = "<UDIM>"
 # A letter before a colon is a drive.
 _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 
 
-@rule(
-    Severity.ERROR,
-    advice="Bring the file into the asset's folder and name it relative to the layer.",
-)
+@rule(Severity.ERROR)
+def layer_missing(scene: AssetStage) -> Iterator[Fault]:
+    """The root layer names edits.usda and the layers of all stages, and they are there. USD passes
+    over a missing sublayer with a message that is easily lost.
+
+    Run usdbrdf convert again, which makes what is missing; or restore the sublayers of the root
+    layer."""
+    named, expected = _sublayers(scene)
+    for layer in expected:
+        if layer not in named:
+            yield Fault(scene.asset_root, f"@{layer}@ is not among its sublayers.")
+        elif not layer.is_file():
+            yield Fault(scene.asset_root, f"its sublayer @{layer}@ is not there.")
+
+
+@rule(Severity.ERROR)
+def layer_order(scene: AssetStage) -> Iterator[Fault]:
+    """Strongest first the sublayers are edits.usda, material, shading, texturing, scan. In another
+    order the lobe of a material is hidden by the stage before it, or the artist's edits by a
+    measurement. Other layers may stand between them. lights, texturing_uv and materialx are no
+    sublayers of the root, but of the layers that own them.
+
+    Restore the order in the root layer; mute a layer instead of moving it."""
+    named, expected = _sublayers(scene)
+    found = [layer for layer in named if layer in expected]
+    if found != [layer for layer in expected if layer in found]:
+        yield Fault(
+            scene.asset_root,
+            f"the sublayers are in the order {', '.join(p.name for p in found)}; "
+            f"strongest first it is {', '.join(p.name for p in expected)}.",
+        )
+
+
+def _sublayers(scene: AssetStage) -> tuple[list[Path], list[Path]]:
+    """Those that the root layer names, and those that it should, strongest first."""
+    root, asset = scene.asset_root, scene.asset
+    if not root or not asset:
+        return [], []
+    named = [located(root, path) for path in root.subLayerPaths]
+    return named, [asset.edits_layer, *(asset.layer(role) for role in reversed(ROLES))]
+
+
+@rule(Severity.ERROR)
+def layer_header(scene: AssetStage) -> Iterator[Fault]:
+    """No layer states other units, another up axis or another rate of time codes than the root
+    layer. USD believes the root for the first two, so that the layer's content has the wrong size
+    or lies on its side, and rescales its time samples for the third: photographs then meet the
+    wrong poses.
+
+    Correct the metadata of the layer, or bring it in by a reference with a correcting transform."""
+    root = scene.asset_root
+    if root:
+        stated = [name for name in _HEADER if root.pseudoRoot.HasInfo(name)]
+        for layer in scene.layers:
+            for name in (name for name in stated if layer.pseudoRoot.HasInfo(name)):
+                theirs, ours = (x.pseudoRoot.GetInfo(name) for x in (layer, root))
+                if theirs != ours:
+                    yield Fault(layer, f"{name} is {theirs}, but {ours} in @{root.realPath}@.")
+
+
+@rule(Severity.ERROR)
+def schema_version(scene: AssetStage) -> Iterator[Fault]:
+    """The layers state a version of the usdBrdf schemas (customLayerData.usdbrdf.schemaVersion)
+    that this usdbrdf knows. In a newer one an attribute may mean something else.
+
+    Install the version of usdbrdf that wrote the asset."""
+    for layer in scene.layers:
+        # The layers of the first version do not state it.
+        version = record_of(layer).get("schemaVersion", 1)
+        if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
+            problem = (
+                f"its schema version is {version!r}; this usdbrdf knows 1 to {SCHEMA_VERSION}."
+            )
+            yield Fault(layer, problem)
+
+
+@rule(Severity.WARNING)
+def layer_edited(scene: AssetStage) -> Iterator[Fault]:
+    """Layers and textures that the pipeline wrote are as it wrote them. Edits belong into
+    edits.usda: those made elsewhere stop the next run, or are lost with it.
+
+    Keep them with usdbrdf convert --adopt, or give them up with --discard."""
+    if scene.asset and scene.asset_root:
+        for relative in edited_files(scene.asset.folder):
+            yield Fault(
+                scene.asset_root,
+                f"@{scene.asset.folder / relative}@ was edited by hand: the next run would "
+                "write it again, and refuses to.",
+            )
+
+
+@rule(Severity.ERROR)
 def anchored_path(scene: AssetStage) -> Iterator[Fault]:
     """Every path in a layer begins with ./ or ../ . Absolute paths lead nowhere on another machine;
     paths without a dot are looked up wherever a site's resolver is set up to, and packages rename
     them. A path with a scheme, such as https:, is a warning alone, and no other rule looks for its
-    file."""
-    if scene.asset:
-        for layer, path, value in scene.asset_paths:
-            if _URI.match(value):
-                yield Fault(
-                    _site(scene.stage, layer, path),
-                    f"@{value}@ in @{layer.realPath}@ is for a resolver that others may not have.",
-                    severity=Severity.WARNING,
-                )
-            elif not value.startswith(("./", "../")):
-                yield Fault(
-                    _site(scene.stage, layer, path),
-                    f"@{value}@ in @{layer.realPath}@ does not begin with ./ or ../ .",
-                )
+    file.
+
+    Bring the file into the asset's folder and name it relative to the layer."""
+    for layer, path, value in scene.asset_paths if scene.asset else ():
+        site, said = _site(scene.stage, layer, path), f"@{value}@ in @{layer.realPath}@"
+        if _URI.match(value):
+            problem = f"{said} is for a resolver that others may not have."
+            yield Fault(site, problem, severity=Severity.WARNING)
+        elif not value.startswith(("./", "../")):
+            yield Fault(site, f"{said} does not begin with ./ or ../ .")
 
 
 def _site(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> Site:
@@ -49,50 +137,46 @@ def _site(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> Site:
     return found if found else layer
 
 
-@rule(Severity.WARNING, advice="Bring the file into the asset's folder.")
+@rule(Severity.WARNING)
 def path_outside(scene: AssetStage) -> Iterator[Fault]:
     """What the layers name lies in the asset's folder, apart from the photographs and from geometry
-    that came as USD. An asset that is copied or packed leaves the rest behind."""
+    that came as USD. An asset that is copied or packed leaves the rest behind.
+
+    Bring the file into the asset's folder."""
     if not scene.asset:
         return
-    folder = Path(os.path.realpath(scene.asset.folder))
-    scan = scene.asset.layer("scan")
+    folder, scan = Path(os.path.realpath(scene.asset.folder)), scene.asset.layer("scan")
     for layer, path, value in scene.asset_paths:
         # The photographs, and geometry that came as USD, stay where the capture has them.
         if value.startswith(("./", "../")) and Path(layer.realPath) != scan:
             file = Path(os.path.realpath(located(layer, value)))
             if not file.is_relative_to(folder):
-                yield Fault(
-                    _site(scene.stage, layer, path),
-                    f"@{value}@ in @{layer.realPath}@ leads out of the asset's folder.",
-                )
+                problem = f"@{value}@ in @{layer.realPath}@ leads out of the asset's folder."
+                yield Fault(_site(scene.stage, layer, path), problem)
 
 
-@rule(
-    Severity.ERROR,
-    advice="Run usdbrdf convert again, which makes missing textures anew; or restore the file.",
-)
+@rule(Severity.ERROR)
 def missing_texture(scene: AssetStage) -> Iterator[Fault]:
     """Every texture that the composed stage names exists, and every file that a layer names in its
     metadata, such as clips and thumbnails. Renderers show the fallback, or black, in place of a
-    texture that does not."""
-    for file, sites in sorted(_missing(scene).items()):
-        if not any(_of_camera(scene, site) for site in sites):
+    texture that does not.
+
+    Run usdbrdf convert again, which makes missing textures anew; or restore the file."""
+    for file, sites, cameras in _missing(scene):
+        if not cameras:
             more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
             yield Fault(sites[0], f"@{file}@ does not exist.{more}")
 
 
-@rule(
-    Severity.WARNING,
-    advice="Put the capture back where it was; ignore it where the asset is only shown.",
-)
+@rule(Severity.WARNING)
 def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
     """The photographs that the capture camera names exist. They are not needed to render the asset,
-    but to evaluate it and to measure anything anew."""
+    but to evaluate it and to measure anything anew.
+
+    Put the capture back where it was; ignore it where the asset is only shown."""
     # Each file once, and one fault for all files that an attribute is the first to name.
     gone: dict[Site, list[Path]] = defaultdict(list)
-    for file, sites in sorted(_missing(scene).items()):
-        cameras = [site for site in sites if _of_camera(scene, site)]
+    for file, _, cameras in _missing(scene):
         if cameras:
             gone[cameras[0]].append(file)
     for site, files in gone.items():
@@ -100,32 +184,27 @@ def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
         yield Fault(site, f"@{files[0]}@ does not exist.{more}")
 
 
-def _of_camera(scene: AssetStage, site: Site) -> bool:
-    return isinstance(site, Usd.Attribute) and site.GetPrim() in scene.cameras
-
-
-def _missing(scene: AssetStage) -> dict[Path, list[Site]]:
-    """Files that are not there, and where the composed stage, or a variant, names them."""
+def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site], list[Site]]]:
+    """Files that are not there, where the composed stage, or a variant, names them, and which of
+    these places are attributes of a capture camera."""
     missing: dict[Path, list[Site]] = defaultdict(list)
     for prim in scene.stage.Traverse() if scene.asset else ():
         for attribute in prim.GetAuthoredAttributes():
-            if attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
-                continue
-            times = [Usd.TimeCode.Default(), *attribute.GetTimeSamples()]
-            files = {asset_file(attribute, t) for t in times if not _is_uri(attribute.Get(t))}
-            for file in files:
-                if file is not None and not _is_there(file):
-                    missing[file].append(attribute)
+            if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset:
+                times = [Usd.TimeCode.Default(), *attribute.GetTimeSamples()]
+                known = {time: attribute.Get(time) for time in times}
+                local = [time for time, v in known.items() if v is None or not _URI.match(v.path)]
+                for file in {asset_file(attribute, time) for time in local}:
+                    if file is not None and not _is_there(file):
+                        missing[file].append(attribute)
     for layer, path, value in scene.asset_paths:
         file = located(layer, value)
         uncomposed = path.isEmpty or path.ContainsPrimVariantSelection()
         if uncomposed and not _URI.match(value) and file not in missing and not _is_there(file):
             missing[file].append(layer)
-    return missing
-
-
-def _is_uri(value: Sdf.AssetPath | None) -> bool:
-    return value is not None and bool(_URI.match(value.path))
+    for file, sites in sorted(missing.items()):
+        named = [site for site in sites if isinstance(site, Usd.Attribute)]
+        yield file, sites, [site for site in named if site.GetPrim() in scene.cameras]
 
 
 def _is_there(file: Path) -> bool:
@@ -142,10 +221,12 @@ def _pattern(name: str) -> re.Pattern[str]:
     return re.compile(re.escape(name).replace(re.escape(_UDIM), r"\d{4}"))
 
 
-@rule(Severity.WARNING, advice="Remove the file, or name it in edits.usda.")
+@rule(Severity.WARNING)
 def orphan_texture(scene: AssetStage) -> Iterator[Fault]:
     """Every file in the folder textures is named by some layer. One that is not is left over from
-    an earlier run or from another tool, and makes packages larger."""
+    an earlier run or from another tool, and makes packages larger.
+
+    Remove the file, or name it in edits.usda."""
     folder = scene.asset.folder / "textures" if scene.asset else None
     if folder is None or scene.asset_root is None or not folder.is_dir():
         return
@@ -158,6 +239,3 @@ def orphan_texture(scene: AssetStage) -> Iterator[Fault]:
         known = file.name in named or any(tile.fullmatch(file.name) for tile in tiles)
         if not known and file.is_file() and not file.name.startswith("."):
             yield Fault(scene.asset_root, f"no layer names @{file}@.")
-
-
-RULES = (anchored_path, path_outside, missing_texture, missing_photograph, orphan_texture)

@@ -12,8 +12,7 @@ from typing import Any
 import omni.asset_validator as validator
 from pxr import Sdf, Usd
 
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Fault, Rule, Severity
+from usdbrdf.validation.rule import AssetStage, Rule, Severity
 from usdbrdf.validation.validate import RULES
 
 CATEGORY = "usdbrdf"
@@ -39,21 +38,17 @@ def _checker(rule: Rule) -> type[Any]:
 
     # What is no coroutine it would run in another thread, while it switches the stage's variants.
     async def check_stage(self: Any, stage: Usd.Stage) -> None:
+        adders = {
+            # "failed check" is its word for a broken rule; "error" for one that cannot run.
+            Severity.ERROR: self._AddFailedCheck,
+            Severity.WARNING: self._AddWarning,
+            Severity.INFO: self._AddInfo,
+        }
         for fault in rule.check(AssetStage(stage)):
-            _report(self, rule, fault)
+            layer = isinstance(fault.site, Sdf.Layer)
+            message = f"@{fault.site.realPath}@: {fault.message}" if layer else fault.message
+            at = None if layer else fault.site
+            adders[fault.severity or rule.severity](message=message, at=at)
 
     body = {"__doc__": f"{rule.description} {rule.advice}", "CheckStage": check_stage}
     return type(f"UsdBrdf{rule.name}", (validator.BaseRuleChecker,), body)
-
-
-def _report(checker: Any, rule: Rule, fault: Fault) -> None:
-    adders = {
-        # "failed check" is its word for a rule that is broken; "error" for one that cannot run.
-        Severity.ERROR: checker._AddFailedCheck,
-        Severity.WARNING: checker._AddWarning,
-        Severity.INFO: checker._AddInfo,
-    }
-    layer = isinstance(fault.site, Sdf.Layer)
-    message = f"@{fault.site.realPath}@: {fault.message}" if layer else fault.message
-    at = None if layer else fault.site
-    adders[fault.severity or rule.severity](message=message, at=at)

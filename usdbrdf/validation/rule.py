@@ -1,19 +1,178 @@
-"""What a rule is, and what it finds. The rules themselves know of no framework that runs them."""
+"""A stage as the rules look at it, what a rule is, and what it finds. The rules themselves know of
+no framework that runs them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeAlias
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from pxr import Sdf, Usd
+from pxr import Ar, Sdf, Usd, UsdShade
 
-from usdbrdf.validation.asset_stage import AssetStage
+from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.readers.compose import named_files
+from usdbrdf.asset.readers.scene import authored
 
-Site: TypeAlias = "Usd.Prim | Usd.Property | Sdf.Layer"
 # Before the name of a rule of ours, where it stands among those of others.
 PREFIX = "usdbrdf"
+_ASSET_TYPES = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
+
+
+@dataclass(frozen=True)
+class AssetStage:
+    """A stage whose root layer, or one of its sublayers, is that of an asset of ours; or any other
+    stage, of which nearly all that follows is empty."""
+
+    stage: Usd.Stage
+
+    @cached_property
+    def layers(self) -> tuple[Sdf.Layer, ...]:
+        """The root layer and its sublayers, strongest first."""
+        return tuple(self.stage.GetLayerStack(includeSessionLayers=False))
+
+    @cached_property
+    def own_layers(self) -> tuple[Sdf.Layer, ...]:
+        """Those that the pipeline writes again: not the root layer, nor the artist's.
+
+        The record alone does not tell: an adopted copy of a layer of ours is the artist's.
+        """
+        folder = self.asset.folder / "layers" if self.asset else None
+        return tuple(
+            layer
+            for layer in self.layers
+            if record_of(layer) and layer.realPath and Path(layer.realPath).parent == folder
+        )
+
+    @cached_property
+    def asset_root(self) -> Sdf.Layer | None:
+        """NAME.usda; None where it is not in the stage, or does not say that it is."""
+        roots = [layer for layer in self.layers if record_of(layer).get("role") == "root"]
+        return roots[0] if roots and roots[0].realPath else None
+
+    @cached_property
+    def asset(self) -> Asset | None:
+        """The asset folder; None for a stage that is not one of ours."""
+        if self.asset_root:
+            return Asset(Path(self.asset_root.realPath).parent, str(self.asset_root.defaultPrim))
+        for layer in self.layers:
+            path = Path(layer.realPath)
+            if record_of(layer).get("role") in ROLES and path.parent.name == "layers":
+                return Asset(path.parents[1], str(layer.defaultPrim))
+        return None
+
+    @cached_property
+    def scopes(self) -> Scopes | None:
+        return Scopes.of(self.asset) if self.asset else None
+
+    @cached_property
+    def root_prim(self) -> Usd.Prim | None:
+        """The prim that has the looks."""
+        prim = self.stage.GetPrimAtPath(self.scopes.root) if self.scopes else None
+        return prim if prim and prim.IsValid() else None
+
+    @cached_property
+    def recorded(self) -> tuple[Usd.Prim, ...]:
+        """All prims that have an attribute of ours, wherever the stage got them from."""
+        prims = self.stage.Traverse()
+        return tuple(p for p in prims if p.GetAuthoredPropertiesInNamespace("usdBrdf"))
+
+    @cached_property
+    def objects(self) -> tuple[Usd.Prim, ...]:
+        """The meshes that are objects of the capture."""
+        return tuple(prim for prim in self.recorded if authored(prim, "usdBrdf:label") is not None)
+
+    @cached_property
+    def cameras(self) -> tuple[Usd.Prim, ...]:
+        """The cameras with photographs."""
+        return tuple(p for p in self.recorded if p.GetAttribute("usdBrdf:capture:image"))
+
+    @cached_property
+    def asset_paths(self) -> tuple[tuple[Sdf.Layer, Sdf.Path, str], ...]:
+        """Every path that a layer of the stage names, or one of the asset's folder that it reaches
+        by a reference, payload or clip, of all variants: (layer, spec, path). In metadata the spec
+        is the empty path. A package names its own content, and does not count."""
+        stack = self.stage.GetLayerStack(includeSessionLayers=True)
+        reached = [
+            layer
+            for layer in self.stage.GetUsedLayers()
+            if self.asset
+            and layer not in stack
+            and not layer.GetFileFormat().IsPackage()
+            and not Ar.IsPackageRelativePath(layer.identifier)
+            and Path(layer.realPath).is_relative_to(self.asset.folder)
+        ]
+        reached.sort(key=lambda layer: str(layer.realPath))
+        layers = (*self.layers, *reached)
+        return tuple((layer, *found) for layer in layers for found in _asset_paths(layer))
+
+    def shaders(self, scope: str, identifier: str) -> Iterator[UsdShade.Shader]:
+        """The shaders with an ``info:id`` below a scope of ours ("materials" or "looks")."""
+        prim = self.stage.GetPrimAtPath(self.scopes.path(scope)) if self.scopes else None
+        for below in Usd.PrimRange(prim) if prim else ():
+            shader = UsdShade.Shader(below)
+            if shader and shader.GetShaderId() == identifier:
+                yield shader
+
+    def surface_of(self, item: Usd.Prim) -> UsdShade.Shader | None:
+        """The UsdPreviewSurface of an object's measured material; None where there is none."""
+        identifier = str(authored(item, "usdBrdf:identifier") or "")
+        if not self.scopes or not Sdf.Path.IsValidIdentifier(identifier):
+            return None
+        path = self.scopes.path("materials", identifier)
+        material = UsdShade.Material(self.stage.GetPrimAtPath(path))
+        shader = material.ComputeSurfaceSource()[0] if material else None
+        return shader if shader and shader.GetShaderId() == "UsdPreviewSurface" else None
+
+    def is_measured(self, attribute: Usd.Attribute) -> bool:
+        """Whether the opinion that wins comes from a layer of ours, not from the artist."""
+        stack = attribute.GetPropertyStack(Usd.TimeCode.Default())
+        return bool(stack) and stack[0].layer in self.own_layers
+
+    def own_variants(self, name: str) -> set[str]:
+        """Those that layers of ours have of a set of the root prim; the artist may add others."""
+        root = self.root_prim
+        specs = [layer.GetPrimAtPath(root.GetPath()) for layer in self.own_layers] if root else []
+        sets = [spec.variantSets.get(name) for spec in specs if spec]
+        return set[str]().union(*(found.variants.keys() for found in sets if found))
+
+
+def record_of(layer: Sdf.Layer) -> dict[str, Any]:
+    """``customLayerData.usdbrdf`` of a layer; empty where it has none."""
+    record = layer.customLayerData.get("usdbrdf", {})
+    return record if isinstance(record, dict) else {}
+
+
+def located(layer: Sdf.Layer, asset_path: str) -> Path:
+    """Where a path that a layer names leads, whether or not there is a file."""
+    return Path(os.path.normpath(Path(layer.realPath).parent / asset_path))
+
+
+def _asset_paths(layer: Sdf.Layer) -> list[tuple[Sdf.Path, str]]:
+    found = [(Sdf.Path.absoluteRootPath, path) for path in layer.subLayerPaths]
+
+    def visit(path: Sdf.Path) -> None:
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.PrimSpec):
+            for arcs in (spec.referenceList, spec.payloadList):
+                found.extend((path, arc.assetPath) for arc in arcs.GetAddedOrExplicitItems())
+        elif isinstance(spec, Sdf.AttributeSpec) and spec.typeName in _ASSET_TYPES:
+            times = layer.ListTimeSamplesForPath(path)
+            for value in (spec.default, *(layer.QueryTimeSample(path, time) for time in times)):
+                items = [value] if isinstance(value, Sdf.AssetPath) else value or []
+                found.extend((path, x.path) for x in items if isinstance(x, Sdf.AssetPath))
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    metadata = named_files(layer) - {value for _, value in found}
+    found.extend((Sdf.Path.emptyPath, value) for value in sorted(metadata))
+    return [(path, value) for path, value in found if value]
+
+
+Site: TypeAlias = "Usd.Prim | Usd.Property | Sdf.Layer"
 
 
 class Severity(str, Enum):
@@ -46,7 +205,7 @@ class Cure:
     apply: Callable[[Site], bool]
 
 
-Check: TypeAlias = Callable[[AssetStage], Iterable[Fault]]
+Check: TypeAlias = Callable[[AssetStage], Iterator[Fault]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,17 +230,18 @@ def cure(description: str) -> Callable[[Callable[[Site], bool]], Cure]:
     return lambda apply: Cure(name=_title(apply), description=description, apply=apply)
 
 
-def rule(severity: Severity, *, advice: str, cure: Cure | None = None) -> Callable[[Check], Rule]:
-    """Decorates a check: the rule of its name (``layer_missing`` becomes LayerMissing), whose
-    description is its docstring."""
-    return lambda check: Rule(
-        name=_title(check),
-        severity=severity,
-        description=" ".join((check.__doc__ or "").split()),
-        advice=advice,
-        check=check,
-        cure=cure,
-    )
+def rule(severity: Severity, cure: Cure | None = None) -> Callable[[Check], Rule]:
+    """Decorates a check: the rule of its name (``layer_missing`` becomes LayerMissing). The last
+    paragraph of its docstring is the advice, what stands before is the description."""
+
+    def made(check: Check) -> Rule:
+        text, advice = (" ".join(part.split()) for part in str(check.__doc__).rsplit("\n\n", 1))
+        name = _title(check)
+        return Rule(
+            name=name, severity=severity, description=text, advice=advice, check=check, cure=cure
+        )
+
+    return made
 
 
 def _title(function: Callable[..., object]) -> str:
@@ -105,30 +265,29 @@ class Finding:
     def __str__(self) -> str:
         return f"{self.severity.value}: {self.site} {self.layer}: {self.message} [{self.rule}]"
 
+    @staticmethod
+    def at(sites: Sequence[Site], severity: Severity, message: str, rule: str) -> Finding:
+        """Of one or several sites, the first of which tells the layer."""
+        paths = [
+            f"/{site.defaultPrim.lstrip('/')}" if isinstance(site, Sdf.Layer) else site.GetPath()
+            for site in sites
+        ]
+        layer = first = sites[0]
+        if not isinstance(first, Sdf.Layer):
+            layer = first.GetStage().GetRootLayer()
+        if isinstance(first, Usd.Property):
+            stack = first.GetPropertyStack(Usd.TimeCode.Default())
+            layer = stack[0].layer if stack else layer
+        return Finding(
+            severity=severity,
+            site=", ".join(f"<{path}>" for path in paths),
+            layer=f"@{layer.realPath or layer.identifier}@",
+            message=message,
+            rule=rule,
+        )
+
 
 def finding_of(rule: Rule, fault: Fault) -> Finding:
     """A fault of one of our rules in words."""
-    return Finding(
-        severity=fault.severity or rule.severity,
-        site=site_in_words(fault.site),
-        layer=layer_in_words(fault.site),
-        message=fault.message,
-        rule=f"{PREFIX}.{rule.name}",
-    )
-
-
-def site_in_words(site: Site) -> str:
-    """<path> of a prim or a property; of a layer that of its default prim, </> without one."""
-    if isinstance(site, Sdf.Layer):
-        return f"</{site.defaultPrim.lstrip('/')}>"
-    return f"<{site.GetPath()}>"
-
-
-def layer_in_words(site: Site) -> str:
-    """@file@ of a layer, of the one whose opinion of a property wins, or of a prim's stage."""
-    if isinstance(site, Usd.Property):
-        stack = site.GetPropertyStack(Usd.TimeCode.Default())
-        layer = stack[0].layer if stack else site.GetStage().GetRootLayer()
-    else:
-        layer = site if isinstance(site, Sdf.Layer) else site.GetStage().GetRootLayer()
-    return f"@{layer.realPath or layer.identifier}@"
+    severity = fault.severity or rule.severity
+    return Finding.at([fault.site], severity, fault.message, f"{PREFIX}.{rule.name}")

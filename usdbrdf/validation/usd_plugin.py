@@ -4,15 +4,13 @@ which USD knows of them before it loads them."""
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 from pxr import Sdf, Usd, UsdValidation
 
-from usdbrdf.asset.schema import validators_path
+from usdbrdf.asset.properties import validators_path
 from usdbrdf.files.atomic import write_text_atomic
-from usdbrdf.validation.asset_stage import AssetStage
-from usdbrdf.validation.rule import Rule, Severity, Site
+from usdbrdf.validation.rule import AssetStage, Cure, Rule, Severity
 from usdbrdf.validation.validate import RULES
 
 # USD imports the module of this name, and begins the names of its validators with it.
@@ -38,12 +36,8 @@ def plug_info() -> str:
     return json.dumps({"Plugins": [plugin]}, indent=4, sort_keys=True) + "\n"
 
 
-def write_plug_info(folder: Path) -> None:
-    write_text_atomic(folder / "plugInfo.json", plug_info())
-
-
 if __name__ == "__main__":
-    write_plug_info(validators_path())
+    write_text_atomic(validators_path() / "plugInfo.json", plug_info())
 
 # The first version that takes fixers from Python.
 _PYTHON_FIXERS = (0, 26, 11)
@@ -57,72 +51,58 @@ _TYPES = {
 def register_validators() -> None:
     """Tell USD what each of the validators that plugInfo.json lists does."""
     registry = UsdValidation.ValidationRegistry()
-    for rule in RULES:
-        name = f"{PLUGIN}:{rule.name}"
-        fixers = [_fixers(rule)] if Usd.GetVersion() >= _PYTHON_FIXERS else []
-        registry.RegisterPluginStageValidator(name, _stage_task(rule), *fixers)
     names = [f"{PLUGIN}:{rule.name}" for rule in RULES]
+    for name, rule in zip(names, RULES, strict=True):
+        fixers = []
+        if Usd.GetVersion() >= _PYTHON_FIXERS:
+            fixers.append([_fixer(rule.cure, rule.name)] if rule.cure else [])
+        registry.RegisterPluginStageValidator(name, _stage_task(rule), *fixers)
     validators = registry.GetOrLoadValidatorsByName(names)
     registry.RegisterPluginValidatorSuite(f"{PLUGIN}:{SUITE}", validators)
 
 
 def _stage_task(rule: Rule) -> Any:
     def check(stage: Usd.Stage, _times: Any) -> list[UsdValidation.ValidationError]:
-        return [
-            UsdValidation.ValidationError(
-                rule.name,
-                _TYPES[fault.severity or rule.severity],
-                [_error_site(stage, fault.site)],
-                fault.message,
-            )
-            for fault in rule.check(AssetStage(stage))
-        ]
+        errors = []
+        for fault in rule.check(AssetStage(stage)):
+            place = fault.site, Sdf.Path.absoluteRootPath
+            if not isinstance(fault.site, Sdf.Layer):
+                place = stage, fault.site.GetPath()
+            kind = _TYPES[fault.severity or rule.severity]
+            site = UsdValidation.ValidationErrorSite(*place)
+            errors.append(UsdValidation.ValidationError(rule.name, kind, [site], fault.message))
+        return errors
 
     return check
 
 
-def _error_site(stage: Usd.Stage, site: Site) -> UsdValidation.ValidationErrorSite:
-    if isinstance(site, Sdf.Layer):
-        return UsdValidation.ValidationErrorSite(site, Sdf.Path.absoluteRootPath)
-    return UsdValidation.ValidationErrorSite(stage, site.GetPath())
-
-
-def _fixers(rule: Rule) -> list[UsdValidation.ValidationFixer]:
-    cure = rule.cure
-    if cure is None:
-        return []
-
+def _fixer(cure: Cure, error_name: str) -> UsdValidation.ValidationFixer:
     def can_apply(error: Any, target: Usd.EditTarget, _time: Any) -> bool:
         sites = [site for site in error.GetSites() if site.IsPrim() or site.IsProperty()]
-        return bool(sites) and all(_is_free(target.GetLayer(), site.GetStage()) for site in sites)
+        # What the pipeline writes is lost with the next run, and the root layer, a stage's edit
+        # target unless one says otherwise, is to stay as it was made.
+        scenes = [AssetStage(site.GetStage()) for site in sites]
+        kept = [layer for scene in scenes for layer in (*scene.own_layers, scene.asset_root)]
+        return bool(sites) and target.GetLayer() not in kept
 
     def apply(error: Any, target: Usd.EditTarget, _time: Any) -> bool:
-        done = []
         if not can_apply(error, target, _time):
             return False
+        done = []
         for site in error.GetSites():
             subject = site.GetPrim() if site.IsPrim() else site.GetProperty()
             with Usd.EditContext(subject.GetStage(), target):
                 done.append(cure.apply(subject))
         return bool(done) and all(done)
 
-    return [
-        UsdValidation.ValidationFixer(
-            name=cure.name,
-            description=cure.description,
-            fixerImplFn=apply,
-            canApplyFn=can_apply,
-            keywords=[],
-            errorName=rule.name,
-        )
-    ]
-
-
-def _is_free(layer: Sdf.Layer, stage: Usd.Stage) -> bool:
-    """Whether cures may go there: what the pipeline writes is lost with the next run, and the root
-    layer, a stage's edit target unless one says otherwise, is to stay as it was made."""
-    scene = AssetStage(stage)
-    return layer not in (*scene.own_layers, scene.asset_root)
+    return UsdValidation.ValidationFixer(
+        name=cure.name,
+        description=cure.description,
+        fixerImplFn=apply,
+        canApplyFn=can_apply,
+        keywords=[],
+        errorName=error_name,
+    )
 
 
 register_validators()

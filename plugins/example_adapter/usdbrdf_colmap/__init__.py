@@ -22,9 +22,10 @@ from usdbrdf.capture.parts import (
 )
 from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import InputRefused
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
-from usdbrdf_colmap.text_model import Camera, Image, read_cameras, read_images
+from usdbrdf_colmap.text_model import Image, read_cameras, read_images
 
 NAME = "colmap"
 DESCRIPTION = "COLMAP text model (cameras.txt, images.txt), scene-linear images and a mesh"
@@ -66,7 +67,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
             options,
             findings,
             capture_root=path,
-            meters_per_unit=options.meters_per_unit or 1.0,
         ),
         options,
         findings,

@@ -14,7 +14,7 @@ from pxr import Sdf, Usd
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import make_capture
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions

@@ -7,12 +7,12 @@ anywhere but these calls, and equal calls give equal bytes."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
@@ -20,19 +20,6 @@ from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.files.atomic import temporary_beside
 
 Types = Sdf.ValueTypeNames
-# From plain values, which may be numpy's, to those that USD takes for attributes of a type.
-_USD_VALUE: dict[str, Callable[[Any], Any]] = {
-    "asset": Sdf.AssetPath,
-    "bool": bool,
-    "color3f": lambda rgb: Gf.Vec3f(*map(float, rgb)),
-    "double": float,
-    "double4": lambda values: Gf.Vec4d(*map(float, values)),
-    "float": float,
-    "int": int,
-    "int2": lambda values: Gf.Vec2i(*map(int, values)),
-    "string": str,
-    "token": str,
-}
 
 
 def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
@@ -93,10 +80,8 @@ def attribute_per_frame(
     *,
     always: bool = False,
 ) -> None:
-    """An attribute that has ``values[i]`` at time code i + 1, and the first by default.
-
-    Without ``always`` a constant gets no samples: it is easier to override then.
-    """
+    """An attribute that has ``values[i]`` at time code i + 1, and the first by default. Without
+    ``always`` a constant gets no samples: it is easier to override then."""
     varies = always or any(value != values[0] for value in values)
     samples = {float(i + 1): value for i, value in enumerate(values)} if varies else {}
     attribute(prim, name, type_name, values[0], samples=samples)
@@ -106,7 +91,11 @@ def author_fact(prim: Sdf.PrimSpec, fact: Fact, value: Any, instance: str = "") 
     """One attribute of ours with its schema; of a fact with samples a value per frame."""
     apply_schema(prim, fact.schema.applied(instance))
     name, type_name = fact.attribute(instance), Types.Find(fact.type)
-    convert = _USD_VALUE[fact.type]
+    made = type(type_name.defaultValue)
+
+    def convert(plain: Any) -> Any:
+        return made(*np.asarray(plain).tolist()) if hasattr(made, "dimension") else made(plain)
+
     if fact.samples:
         values, always = [convert(each) for each in value], fact.samples == "every"
         attribute_per_frame(prim, name, type_name, values, always=always)
@@ -164,22 +153,19 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
             raise failure from error
         if not stored or stored.defaultPrim != layer.defaultPrim:
             raise failure
-        _check_composition(stored, path, folder)
+
+        def absolute(asset: str) -> str:
+            return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
+
+        UsdUtils.ModifyAssetPaths(stored, absolute)
+        # Each layer is checked when it is written; what lies there now may be damaged, about to be
+        # replaced, or the artist's.
+        stored.subLayerPaths = []
+        stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
+        problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
+        if problems:
+            raise UsdBrdfError(
+                f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of "
+                "usdbrdf; please report it. [stage.composition]"
+            )
         os.replace(written, path)
-
-
-def _check_composition(stored: Sdf.Layer, path: Path, folder: Path) -> None:
-    def absolute(asset: str) -> str:
-        return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset
-
-    UsdUtils.ModifyAssetPaths(stored, absolute)
-    # Each layer is checked when it is written; what lies there now may be damaged, about to be
-    # replaced, or the artist's.
-    stored.subLayerPaths = []
-    stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
-    problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
-    if problems:
-        raise UsdBrdfError(
-            f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of usdbrdf; "
-            "please report it. [stage.composition]"
-        )

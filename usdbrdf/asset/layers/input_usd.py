@@ -13,7 +13,7 @@ others are listed there, and every look binds them as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import attribute, over, relationship
-from usdbrdf.asset.layout import Asset, relative_path
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.scene import authored_normals, triangulation_of
 from usdbrdf.errors import InputRefused
@@ -32,8 +32,7 @@ from usdbrdf.untrusted.usd_files import is_deforming, is_moving
 
 Types = Sdf.ValueTypeNames
 BINDING = "material:binding"
-# Relationships to bind besides the mesh's own: path -> the collection it is about, or "".
-Competing = Mapping[str, str]
+_FIRST = Usd.TimeCode.EarliestTime()
 
 
 def open_input(file: Path) -> Usd.Stage:
@@ -52,19 +51,17 @@ def open_input(file: Path) -> Usd.Stage:
     return stage
 
 
-def author_reference(layer: Sdf.Layer, root: str, file: Path, folder: Path) -> None:
-    """Reference the input's default prim on ours, by a path relative to the layer's folder."""
-    reference = Sdf.Reference(relative_path(file, folder))
-    over(layer, root).referenceList.prependedItems = [reference]
-
-
-def input_mesh(source: Usd.Prim, below: str) -> Usd.Prim:
-    """The mesh ``below`` the input's default prim ``source``; "." is the default prim itself."""
-    path = source.GetPath() if below == "." else source.GetPath().AppendPath(below)
-    prim = source.GetStage().GetPrimAtPath(path)
-    if not prim or not prim.IsA(UsdGeom.Mesh):
-        raise InputRefused(f"<{path}>: the input stage has no mesh there. [stage.input_mesh]")
-    return prim
+def input_meshes(source: Usd.Prim, places: Sequence[str], root: str) -> dict[str, Usd.Prim]:
+    """The meshes at ``places`` below the input's default prim ``source``, by their paths in our
+    stage, in this order; "." is the default prim itself."""
+    meshes = {}
+    for below in places:
+        path = source.GetPath() if below == "." else source.GetPath().AppendPath(below)
+        prim = source.GetStage().GetPrimAtPath(path)
+        if not prim or not prim.IsA(UsdGeom.Mesh):
+            raise InputRefused(f"<{path}>: the input stage has no mesh there. [stage.input_mesh]")
+        meshes[str(path.ReplacePrefix(source.GetPath(), Sdf.Path(root)))] = prim
+    return meshes
 
 
 def author_overrides(
@@ -81,7 +78,10 @@ def author_overrides(
         # Opinions inside an instance are ignored, so the instance must become a plain prim.
         if prim.IsInstanceable():
             over(layer, str(target)).SetInfo("instanceable", False)
-        _hold_still(layer, str(target), prim)
+        # What moves stays where it is first: the capture has one state.
+        for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if is_moving(prim) else []:
+            first = op.GetAttr().Get(_FIRST)
+            attribute(over(layer, str(target)), op.GetName(), op.GetAttr().GetTypeName(), first)
         target, prim = target.GetParentPath(), prim.GetParent()
     # The photographs show the surface as it is: the cage is taken as the surface everywhere.
     none = UsdGeom.Tokens.none
@@ -90,37 +90,24 @@ def author_overrides(
     # Texture coordinates of ours fit no other points and faces than those that were photographed.
     fixed = has_variants or is_deforming(geometry)
     if fixed:
-        _author_points(over(layer, path), geometry)
+        points = geometry.GetPointsAttr().Get(_FIRST)
+        attribute(over(layer, path), "points", Types.Point3fArray, points)
+        extent = UsdGeom.PointBased.ComputeExtent(points)
+        attribute(over(layer, path), "extent", Types.Float3Array, extent)
     _author_triangles(layer, path, geometry, turned, always=fixed)
     if fixed or turned.any() or authored_normals(geometry, triangulation_of(geometry)) is None:
         _author_normals(over(layer, path), geometry, normals)
 
 
-def _hold_still(layer: Sdf.Layer, path: str, prim: Usd.Prim) -> None:
-    """A prim of the input that moves stays where it is first: the capture has one state."""
-    for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if is_moving(prim) else []:
-        source = op.GetAttr()
-        first = source.Get(Usd.TimeCode.EarliestTime())
-        attribute(over(layer, path), source.GetName(), source.GetTypeName(), first)
-
-
-def _author_points(prim: Sdf.PrimSpec, mesh: UsdGeom.Mesh) -> None:
-    points = mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime())
-    attribute(prim, "points", Types.Point3fArray, points)
-    extent = UsdGeom.PointBased.ComputeExtent(points)
-    attribute(prim, "extent", Types.Float3Array, extent)
-
-
 def _author_normals(prim: Sdf.PrimSpec, mesh: UsdGeom.Mesh, in_world: Float) -> None:
     """Normals per corner, so that everybody shades the surface as it is measured here."""
-    time = Usd.TimeCode.EarliestTime()
-    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(time))[:3, :3].T
+    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_FIRST))[:3, :3].T
     # Normals go to the world by the inverse transpose.
     local = in_world.astype(np.float64) @ world_from_local
     size = np.linalg.norm(local, axis=2, keepdims=True)
     if not (np.isfinite(local).all() and (size > 0).all()):
         return
-    left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
+    left_handed = mesh.GetOrientationAttr().Get(_FIRST) == UsdGeom.Tokens.leftHanded
     if left_handed != bool(np.linalg.det(world_from_local) < 0):
         local = local[:, [0, 2, 1]]  # the triangles in the world are wound the other way
     unit = (local / size).reshape(-1, 3).astype(np.float32)
@@ -136,12 +123,11 @@ def _author_triangles(
 ) -> None:
     """Replace polygons by triangles, and everything that is stored per polygon or corner; where
     there are triangles only, and none is ``turned``, do so if ``always``."""
-    time = Usd.TimeCode.EarliestTime()
-    counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(time), np.int32)
-    holes = np.asarray(mesh.GetHoleIndicesAttr().Get(time) or [], np.int32)
+    counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(_FIRST), np.int32)
+    holes = np.asarray(mesh.GetHoleIndicesAttr().Get(_FIRST) or [], np.int32)
     if (counts == 3).all() and not len(holes) and not turned.any() and not always:
         return
-    indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time), np.int32)
+    indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(_FIRST), np.int32)
     # The winding stays as the file says: its orientation still applies.
     fans = triangulate(counts, indices, holes=holes)
     for corners in (fans.triangles, fans.corners):
@@ -157,7 +143,7 @@ def _author_triangles(
     _author_gathered(prim, mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation(), fans)
     for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.face:
-            chosen = np.isin(fans.polygon, np.asarray(subset.GetIndicesAttr().Get(time) or []))
+            chosen = np.isin(fans.polygon, np.asarray(subset.GetIndicesAttr().Get(_FIRST) or []))
             child = over(layer, f"{path}/{subset.GetPrim().GetName()}")
             attribute(child, "indices", Types.IntArray, np.flatnonzero(chosen).astype(np.int32))
 
@@ -169,31 +155,34 @@ def _author_gathered(
         UsdGeom.Tokens.faceVarying: fans.corners.reshape(-1),
         UsdGeom.Tokens.uniform: fans.polygon,
     }
-    values = source.Get(Usd.TimeCode.EarliestTime()) if source else None
-    if values is None or interpolation not in gather:
+    values = source.Get(_FIRST) if source else None
+    chosen = gather.get(interpolation)
+    # Where there are too few of them the file is wrong about this one.
+    if values is None or chosen is None or chosen.max(initial=-1) >= len(values):
         return
-    if gather[interpolation].max(initial=-1) >= len(values):
-        return  # too few of them: the file is wrong about this one
-    chosen = [values[int(i)] for i in gather[interpolation]]
-    attribute(prim, source.GetName(), source.GetTypeName(), type(values)(chosen))
+    gathered = [values[int(i)] for i in chosen]
+    attribute(prim, source.GetName(), source.GetTypeName(), type(values)(gathered))
 
 
-def has_transform(prim: Usd.Prim) -> bool:
-    """True where the input's default prim moves what lies below it."""
-    if not prim.IsA(UsdGeom.Xformable):
+def has_transform(prim: Usd.Prim | None) -> bool:
+    """True where there is an input, whose default prim moves what lies below it."""
+    if not prim or not prim.IsA(UsdGeom.Xformable):
         return False
-    matrix = UsdGeom.Xformable(prim).GetLocalTransformation(Usd.TimeCode.EarliestTime())
+    matrix = UsdGeom.Xformable(prim).GetLocalTransformation(_FIRST)
     return not Gf.IsClose(matrix, Gf.Matrix4d(1.0), 1e-12)
 
 
 def competing_bindings(mesh: Usd.Prim, source: Usd.Prim, root: str) -> dict[str, str]:
-    """For one mesh of the input; paths below ``source``, its default prim, become ours."""
-    purposes = {
-        purpose
-        for prim in _with_ancestors(mesh, source)
-        for binding in _bindings(prim)
-        if (purpose := _purpose(binding)) != ""
-    }
+    """Relationships to bind besides the own one of a mesh of the input: path -> the collection it
+    is about, or ""; paths below ``source``, the input's default prim, become ours."""
+    purposes = set()
+    for prim in _with_ancestors(mesh, source):
+        for binding in _bindings(prim):
+            # Names are BINDING[:purpose] or BINDING:collection[:purpose]:name.
+            parts = binding.GetName().split(":")[2:]
+            if parts[:1] == ["collection"]:
+                parts = parts[1:-1]
+            purposes.update(parts[:1])
     found = {f"{mesh.GetPath()}.{BINDING}:{purpose}": "" for purpose in sorted(purposes)}
     subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Mesh(mesh))
     for prim in (mesh, *(subset.GetPrim() for subset in subsets)):
@@ -201,10 +190,9 @@ def competing_bindings(mesh: Usd.Prim, source: Usd.Prim, root: str) -> dict[str,
             if binding.GetPath() != mesh.GetPath().AppendProperty(BINDING):
                 collections = [t for t in binding.GetTargets() if t.IsPropertyPath()]
                 found[str(binding.GetPath())] = str(collections[0]) if collections else ""
-    here = Sdf.Path(root)
 
     def ours(path: str) -> str:
-        return str(Sdf.Path(path).ReplacePrefix(source.GetPath(), here)) if path else ""
+        return str(Sdf.Path(path).ReplacePrefix(source.GetPath(), Sdf.Path(root))) if path else ""
 
     return {ours(path): ours(collection) for path, collection in found.items()}
 
@@ -220,11 +208,9 @@ def weaken_bindings(layer: Sdf.Layer, mesh: Usd.Prim, source: Usd.Prim, root: st
                 weaker.SetInfo("bindMaterialAs", UsdShade.Tokens.weakerThanDescendants)
 
 
-def recorded_bindings(asset: Asset) -> dict[str, Competing]:
+def recorded_bindings(asset: Asset) -> dict[str, dict[str, str]]:
     """What the scan layer lists, per object's prim path; empty where the geometry is ours."""
-    layer = asset.layer("scan")
-    recorded = read_provenance(layer).get("competing_bindings", {}) if layer.is_file() else {}
-    return {prim_path: dict(found) for prim_path, found in recorded.items()}
+    return dict(read_provenance(asset.layer("scan")).get("competing_bindings", {}))
 
 
 def _with_ancestors(mesh: Usd.Prim, source: Usd.Prim) -> list[Usd.Prim]:
@@ -239,11 +225,3 @@ def _bindings(prim: Usd.Prim) -> list[Usd.Relationship]:
         for p in prim.GetAuthoredProperties()
         if isinstance(p, Usd.Relationship) and f"{p.GetName()}:".startswith(f"{BINDING}:")
     ]
-
-
-def _purpose(binding: Usd.Relationship) -> str:
-    """ "" for all purposes. Names are BINDING[:purpose] or BINDING:collection[:purpose]:name."""
-    parts = binding.GetName().split(":")[2:]
-    if parts[:1] == ["collection"]:
-        return parts[1] if len(parts) > 2 else ""
-    return parts[0] if parts else ""

@@ -1,16 +1,19 @@
-"""The weakest layer: the capture as it came, its meshes, camera and photographs."""
+"""What ingest writes: the weakest layer, the capture as it came, with its meshes, camera and
+photographs; and layers without any measurement: root, the artist's edits, those still to come."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, UsdGeom
 
-from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.header import Draft, Provenance, Scopes, StageHeader, new_layer, read_header
+from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
     apply_schema,
     attribute,
@@ -22,138 +25,141 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layers.input_usd import (
-    author_overrides,
-    author_reference,
-    competing_bindings,
-    has_transform,
-    input_mesh,
-    open_input,
-    weaken_bindings,
-)
-from usdbrdf.asset.layout import Asset, storable_path
-from usdbrdf.asset.properties import LabelledObject, Photographs, known_facts
+from usdbrdf.asset.layout import ROLES, Asset, relative_path, storable_path
+from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
+from usdbrdf.asset.readers.scene import LENS
+from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded
 
 Types = Sdf.ValueTypeNames
-LENS = (
-    "focalLength",
-    "horizontalAperture",
-    "verticalAperture",
-    "horizontalApertureOffset",
-    "verticalApertureOffset",
-)
 APERTURE_MM = 36.0
 NEAR_M, FAR_M = 0.01, 1000.0
-_PLATE = "photograph"
+_VERSION = "1"  # of the folder's layout; these layers outlive the version of the tool
+
+
+def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
+    """NAME.usda: the sublayers, strongest first, and metadata. Written once, never again."""
+    layer = new_layer(header, Provenance(role="root", version=_VERSION))
+    layer.documentation = (
+        "Captured scene with measured materials. Put your own opinions into edits.usda, the "
+        "strongest layer: no tool writes it again. The files in layers/ are regenerated."
+    )
+    layer.subLayerPaths = [
+        f"./{asset.edits_layer.name}",
+        *(f"./layers/{asset.layer(role).name}" for role in reversed(ROLES)),
+    ]
+    # Only a root layer can say this. The scan layer may still be waiting beside it, unpublished.
+    staged = Asset(path.parent, asset.name)
+    scopes = Scopes.of(staged if staged.layer("scan").is_file() else asset)
+    layer.pseudoRoot.SetInfo("renderSettingsPrimPath", scopes.path("render", "capture"))
+    export(layer, path, folder=asset.folder)
+
+
+def check_root(asset: Asset, header: StageHeader) -> None:
+    """Raise if the asset has a root layer that says otherwise about units or the up axis. USD
+    believes the root, which is never written again: a capture in other units would come out in the
+    wrong size, beneath edits that were made for the old one."""
+    if not asset.root_layer.is_file():
+        return
+    root = read_header(asset.root_layer)
+    ours, theirs = ((h.meters_per_unit, h.up_axis) for h in (root, header))
+    if ours != theirs:
+        raise OwnershipConflict(
+            f"{asset.root_layer}: the asset was made with {ours[0]:g} metres per unit and "
+            f"{ours[1]} up, this capture has {theirs[0]:g} and {theirs[1]}. Convert it into a new "
+            "folder. [ownership.units]"
+        )
+
+
+def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:
+    """edits.usda: empty, for the artist. Written once, never again."""
+    layer = new_layer(header, Provenance(role="edits", version=_VERSION))
+    layer.documentation = "Yours: stronger than everything that was measured, never overwritten."
+    over(layer, f"/{header.name}")
+    export(layer, path, folder=asset.folder)
+
+
+def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
+    """A layer without opinions, so that the root composes before the task of its role has run."""
+    layer = new_layer(header, Provenance(role=role, version=_VERSION), state="pending")
+    over(layer, f"/{header.name}")
+    export(layer, path, folder=path.parent)
 
 
 def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
-    asset, folder = draft.asset, draft.asset.layer("scan").parent
-    labels = [_labelled(label) for label in scan.objects]
-    # Files split vertices at seams; ours has its normals per corner and needs no copies.
-    mesh = None if scan.usd_geometry else welded(scan.mesh)
-    stage = open_input(scan.usd_geometry) if scan.usd_geometry else None
+    asset, folder, frames = draft.asset, draft.asset.layer("scan").parent, scan.frames
+    stage = input_usd.open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
     scopes = Scopes.beside(f"/{draft.header.name}", taken)
-    meshes = _input_meshes(source, scan, scopes.root) if source else {}
+    meshes = input_usd.input_meshes(source, scan.object_prims, scopes.root) if source else {}
+    rivals = partial(input_usd.competing_bindings, source=source, root=scopes.root)
+    competing = {at: rivals(mesh) for at, mesh in meshes.items()}
     layer = draft.new_layer(
         adapter=scan.adapter,
-        radiometric=scan.frames.radiometric,
+        radiometric=frames.radiometric,
         counts=scan.counts,
-        scopes=scopes.names(),
-        competing_bindings={
-            path: competing_bindings(mesh, source, scopes.root) for path, mesh in meshes.items()
-        }
-        or None,
+        scopes=scopes.names,
+        competing_bindings=competing or None,
     )
     # A typed root would hide the input's own type.
-    typed = source is not None and source.GetTypeName() != ""
-    root = define(layer, scopes.root, "" if typed else "Xform")
-    _author_root(root, asset, keep_kind=source is not None and source.HasAuthoredMetadata("kind"))
-    if source and scan.usd_geometry:
-        author_reference(layer, scopes.root, scan.usd_geometry, folder)
-        _author_input_meshes(layer, scopes.root, source, meshes, scan, labels)
-    elif mesh:
-        _author_meshes(layer, scopes, mesh, labels)
-    define(layer, scopes.path("cameras"), "Scope")
-    camera = define(layer, scopes.path("cameras", "capture"), "Camera")
-    # The poses are in the world, whatever the default prim does.
-    reset_transform = source is not None and has_transform(source)
-    _author_pose(camera, scan.frames.world_from_camera, reset_transform)
-    _author_lens(camera, scan.frames, scan.meters_per_unit)
-    _author_exposure(camera, scan.frames.exposure_time)
-    _author_capture(camera, scan.frames, folder)
-    _author_render_settings(layer, scopes, scan)
-    export(layer, path, folder=folder)
-
-
-def _labelled(label: ObjectLabel) -> LabelledObject:
-    """What makes a mesh one of our objects, as USD can hold it."""
-    return LabelledObject(
-        label=readable_label(label.label),
-        class_name=readable_label(label.class_name),
-        identifier=label.identifier,
-    )
-
-
-def _author_label(prim: Sdf.PrimSpec, label: LabelledObject) -> None:
-    author_record(prim, label)
-    prim.SetInfo("displayName", label.label)
-    if label.class_name:
-        apply_schema(prim, "SemanticsLabelsAPI:class")
-        attribute(prim, "semantics:labels:class", Types.TokenArray, [label.class_name])
-
-
-def _author_root(root: Sdf.PrimSpec, asset: Asset, *, keep_kind: bool) -> None:
-    if not keep_kind:
+    root = define(layer, scopes.root, "" if source and source.GetTypeName() else "Xform")
+    if not (source and source.HasAuthoredMetadata("kind")):
         root.SetInfo("kind", "assembly")
     identifier = Sdf.AssetPath(f"../{asset.root_layer.name}")
     root.SetInfo("assetInfo", {"identifier": identifier, "name": asset.name})
     apply_schema(root, "ColorSpaceAPI")
     attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
+    if source and scan.usd_geometry:
+        reference = Sdf.Reference(relative_path(scan.usd_geometry, folder))
+        root.referenceList.prependedItems = [reference]
+        normals, face_object = scan.mesh.corner_normals, scan.mesh.face_object
+        turned = scan.turned_faces
+        turned = np.zeros(len(normals), np.bool_) if turned is None else turned
+        for i, (at, mesh) in enumerate(meshes.items()):
+            input_usd.weaken_bindings(layer, mesh, source, scopes.root)
+            own = face_object == i
+            input_usd.author_overrides(layer, at, mesh, normals[own], turned[own])
+            _author_label(over(layer, at), scan.objects[i])
+    else:
+        _author_meshes(layer, scopes, scan)
+    define(layer, scopes.path("cameras"), "Scope")
+    camera = define(layer, scopes.path("cameras", "capture"), "Camera")
+    _author_pose_and_lens(camera, scan, reset_transform=input_usd.has_transform(source))
+    _author_capture(camera, frames, folder)
+    # Settings that render the capture's own view; the shading layer adds the products.
+    define(layer, scopes.path("render"), "Scope")
+    settings = define(layer, scopes.path("render", "capture"), "RenderSettings")
+    resolution = Gf.Vec2i(frames.resolution[0].tolist())
+    attribute(settings, "resolution", Types.Int2, resolution, uniform=True)
+    relationship(settings, "camera", scopes.path("cameras", "capture"))
+    attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
+    export(layer, path, folder=folder)
 
 
-def _input_meshes(source: Usd.Prim, scan: Scan, root: str) -> dict[str, Usd.Prim]:
-    """The input's meshes by their paths in our stage, in the order of the objects."""
-    meshes = [input_mesh(source, below) for below in scan.object_prims]
-    here = Sdf.Path(root)
-    return {str(mesh.GetPath().ReplacePrefix(source.GetPath(), here)): mesh for mesh in meshes}
+def _author_label(prim: Sdf.PrimSpec, found: ObjectLabel) -> None:
+    """What makes a mesh one of our objects, as USD can hold it."""
+    label, class_name = readable_label(found.label), readable_label(found.class_name)
+    identifier = found.identifier
+    author_record(prim, LabelledObject(label=label, class_name=class_name, identifier=identifier))
+    prim.SetInfo("displayName", label)
+    if class_name:
+        apply_schema(prim, "SemanticsLabelsAPI:class")
+        attribute(prim, "semantics:labels:class", Types.TokenArray, [class_name])
 
 
-def _author_input_meshes(
-    layer: Sdf.Layer,
-    root: str,
-    source: Usd.Prim,
-    meshes: Mapping[str, Usd.Prim],
-    scan: Scan,
-    labels: Sequence[LabelledObject],
-) -> None:
-    """What the referenced meshes need to be our objects."""
-    soup = scan.mesh
-    turned = np.zeros(len(soup.triangles), np.bool_)
-    turned = turned if scan.turned_faces is None else scan.turned_faces
-    for i, (path, mesh) in enumerate(meshes.items()):
-        weaken_bindings(layer, mesh, source, root)
-        own = soup.face_object == i
-        author_overrides(layer, path, mesh, soup.corner_normals[own], turned[own])
-        _author_label(over(layer, path), labels[i])
-
-
-def _author_meshes(
-    layer: Sdf.Layer, scopes: Scopes, mesh: ScanMesh, labels: Sequence[LabelledObject]
-) -> None:
+def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
+    # Files split vertices at seams; ours has its normals per corner and needs no copies.
+    mesh = welded(scan.mesh)
     geometry = define(layer, scopes.path("geometry"), "Scope")
     geometry.SetInfo("kind", "group")
     order = np.argsort(mesh.face_object, kind="stable")
-    objects = np.arange(len(labels) + 1)
-    bounds = np.searchsorted(mesh.face_object[order], objects)
-    for i, label in enumerate(labels):
+    bounds = np.searchsorted(mesh.face_object[order], np.arange(len(scan.objects) + 1))
+    for i, label in enumerate(scan.objects):
         faces = order[bounds[i] : bounds[i + 1]]
         if len(faces):
             prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
@@ -178,24 +184,11 @@ def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]
     attribute(prim, "doubleSided", Types.Bool, True, uniform=True)
 
 
-def _author_render_settings(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
-    """Settings that render the capture's own view; the shading layer adds the products."""
-    define(layer, scopes.path("render"), "Scope")
-    settings = define(layer, scopes.path("render", "capture"), "RenderSettings")
-    width, height = (int(value) for value in scan.frames.resolution[0])
-    attribute(settings, "resolution", Types.Int2, Gf.Vec2i(width, height), uniform=True)
-    relationship(settings, "camera", scopes.path("cameras", "capture"))
-    attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
-
-
 def lens_from_pinhole(
     pinhole: Double, resolution: Sequence[int], meters_per_unit: float
 ) -> tuple[float, float, float, float, float]:
-    """The values of ``LENS``.
-
-    In tenths of a scene unit, as USD wants them. Only ratios to the aperture mean anything, so the
-    aperture is that of a full-frame camera.
-    """
+    """The values of ``LENS``, in tenths of a scene unit, as USD wants them. Only ratios to the
+    aperture mean anything, so the aperture is that of a full-frame camera."""
     fx, fy, cx, cy = (float(value) for value in pinhole)
     width, height = (int(value) for value in resolution)
     aperture = APERTURE_MM / (100.0 * meters_per_unit)
@@ -206,17 +199,17 @@ def lens_from_pinhole(
     return focal, aperture, vertical, offset_x, offset_y
 
 
-def _author_pose(prim: Sdf.PrimSpec, world_from_camera: Double, reset_transform: bool) -> None:
-    """Frame i is at time code i + 1, and the first is the default as well."""
+def _author_pose_and_lens(prim: Sdf.PrimSpec, scan: Scan, *, reset_transform: bool) -> None:
+    """Frame i is at time code i + 1, and the first is the default as well. The poses are in the
+    world: ``reset_transform`` where the default prim moves what is below it."""
+    frames, meters_per_unit = scan.frames, scan.meters_per_unit
     # USD multiplies row vectors from the left: its matrices are ours transposed.
-    poses = [Gf.Matrix4d(pose.T.tolist()) for pose in np.asarray(world_from_camera, np.float64)]
+    matrices = np.asarray(frames.world_from_camera, np.float64)
+    poses = [Gf.Matrix4d(pose.T.tolist()) for pose in matrices]
     name = "xformOp:transform"
     attribute_per_frame(prim, name, Types.Matrix4d, poses, always=True)
     order = ["!resetXformStack!", name] if reset_transform else [name]
     attribute(prim, "xformOpOrder", Types.TokenArray, order, uniform=True)
-
-
-def _author_lens(prim: Sdf.PrimSpec, frames: Frames, meters_per_unit: float) -> None:
     lens = [
         lens_from_pinhole(pinhole, resolution, meters_per_unit)
         for pinhole, resolution in zip(frames.intrinsics, frames.resolution, strict=True)
@@ -228,40 +221,27 @@ def _author_lens(prim: Sdf.PrimSpec, frames: Frames, meters_per_unit: float) -> 
     attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(near, far))
 
 
-def _author_exposure(prim: Sdf.PrimSpec, exposure_time: Double) -> None:
-    """Exposure attributes whose product is 1: the frames are radiance already.
+def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
+    """Exposure attributes whose product is 1, as the frames are radiance already; our record of
+    the photographs; and these where applications look for plates (new in USD 26.11; older versions
+    pass over a schema that they do not know), muted: no render may change because of them.
 
     USD: scale = responsivity * time * (iso / 100) * 2^exposure / fStop^2.
     """
-    times = [t if math.isfinite(t) and t > 0 else 1.0 for t in map(float, exposure_time)]
-    attribute(prim, "exposure", Types.Float, 0.0)
-    attribute(prim, "exposure:fStop", Types.Float, 1.0)
-    attribute(prim, "exposure:iso", Types.Float, 100.0)
+    times = [t if math.isfinite(t) and t > 0 else 1.0 for t in frames.exposure_time.tolist()]
+    for name, value in (("", 0.0), (":fStop", 1.0), (":iso", 100.0)):
+        attribute(prim, f"exposure{name}", Types.Float, value)
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
-
-
-def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
-    photographs = Photographs(
-        image=[storable_path(path, folder) for path in frames.image_paths],
-        exposure_time=frames.exposure_time.tolist(),
-        saturation_radiance=frames.saturation_radiance.tolist(),
-        noise_floor_radiance=frames.noise_floor_radiance.tolist(),
-        intrinsics=frames.intrinsics.tolist(),
-        resolution=frames.resolution.tolist(),
-        encoding=frames.encoding,
-        radiometric=frames.radiometric,
-    )
-    for fact, value in known_facts(photographs):
+    images = [storable_path(path, folder) for path in frames.image_paths]
+    stored = {name: getattr(frames, name) for name, _ in facts_of(Photographs) if name != "image"}
+    plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in stored.items()}
+    plates = [Sdf.AssetPath(image) for image in images]
+    for fact, value in known_facts(Photographs(image=images, **plain)):
         author_fact(prim, fact, value)
         if fact.name == "image":
-            _author_back_plate(prim, value)
-
-
-def _author_back_plate(prim: Sdf.PrimSpec, images: Sequence[str]) -> None:
-    """The photographs where applications look for plates (new in USD 26.11; older versions pass
-    over a schema that they do not know). Muted: no render may change because of them."""
-    apply_schema(prim, f"BackPlateAPI:{_PLATE}")
-    prefix, values = f"backPlate:{_PLATE}", [Sdf.AssetPath(image) for image in images]
-    attribute_per_frame(prim, f"{prefix}:image", Types.Asset, values, always=True)
-    attribute(prim, f"{prefix}:plateVisibility", Types.Token, "mute")
+            apply_schema(prim, "BackPlateAPI:photograph")
+            attribute_per_frame(
+                prim, "backPlate:photograph:image", Types.Asset, plates, always=True
+            )
+            attribute(prim, "backPlate:photograph:plateVisibility", Types.Token, "mute")

@@ -14,9 +14,9 @@ from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.hashes import hash_of_files
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
+from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.model.arrays import Array
 
 _MAX_LENGTH = 300
@@ -24,37 +24,29 @@ _TIMEOUT_S = 600.0
 
 
 def in_one_line(error: object) -> str:
-    """The text of an error of USD, which often spans lines and repeats itself, on one line.
-
-    Of an exception what its errors say, without the places in USD's own source.
-    """
-    told = (
-        [each.commentary for each in error.args]
-        if isinstance(error, Tf.ErrorException)
-        else [error]
-    )
-    text = "; ".join(" ".join(str(part).split()).rstrip(".; ") for part in told)
+    """The text of an error of USD, which often spans lines and repeats itself, on one line. Of an
+    exception what its errors say, without the places in USD's own source."""
+    told = error.args if isinstance(error, Tf.ErrorException) else [error]
+    parts = (str(getattr(part, "commentary", part)) for part in told)
+    text = "; ".join(" ".join(part.split()).rstrip(".; ") for part in parts)
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 
 
 def open_weaker(asset: Asset, role: str) -> Usd.Stage:
-    """The stage that the task of a role builds upon: only the layers weaker than its own.
-
-    Never edits.usda: what an artist overrides must not flow back into the measurement.
-    """
-    return _sublayered(asset, ROLES[: ROLES.index(role)])
+    """The stage that the task of a role builds upon: only the layers weaker than its own. Never
+    edits.usda: what an artist overrides must not flow back into the measurement.
+    InputRefused where one of the tasks before has not run."""
+    return _sublayered(asset, _weaker_layers(asset, role))
 
 
 def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's."""
-    return _sublayered(asset, ROLES)
+    return _sublayered(asset, [asset.layer(role) for role in ROLES])
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
     """The asset as everybody else opens it: the root layer, with the artist's opinions.
-
-    InputRefused where it does not compose, or USD crashes on it.
-    """
+    InputRefused where it does not compose, or USD crashes on it."""
     try_in_child(asset.root_layer)
     return open_stage(asset.root_layer)
 
@@ -85,12 +77,11 @@ def try_in_child(layer: Path, *, composes: bool = True) -> None:
 
 def open_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
     """The child's part of ``try_in_child``."""
-    layer = Path(parameters["layer"])
     if parameters["composes"]:
-        open_stage(layer)
+        open_stage(Path(parameters["layer"]))
     else:
         with suppress(Tf.ErrorException):
-            Usd.Stage.Open(str(layer))
+            Usd.Stage.Open(parameters["layer"])
     return {}
 
 
@@ -133,29 +124,18 @@ def named_files(layer: Sdf.Layer) -> set[str]:
     return found - {""}
 
 
-def _sublayered(asset: Asset, roles: Sequence[str]) -> Usd.Stage:
-    layers = [asset.layer(role) for role in roles]
+def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     for layer in layers:
-        if not layer.is_file():
-            raise InputRefused(
-                f"{layer}: the layer is missing. Run the task that writes it first. [stage.missing]"
-            )
-    header = read_header(layers[0])
-    root = new_layer(header, Provenance(role="view", version="1"))
-    root.subLayerPaths = [str(layer) for layer in reversed(layers)]
-    return open_stage(root)
-
-
-def open_before(asset: Asset, role: str) -> Usd.Stage:
-    """The stage that tasks before that of ``role`` wrote; InputRefused where one has not run."""
-    for layer in _weaker_layers(asset, role):
         if not layer.is_file():
             raise InputRefused(
                 f"{asset.folder}: {layer.name} is missing, so an earlier step has not run here. "
                 "Run `usdbrdf convert`, or the steps ingest, texture, shade, fit in this order. "
                 "[asset.incomplete]"
             )
-    return open_weaker(asset, role)
+    root = new_layer(read_header(layers[0]), Provenance(role="view", version="1"))
+    # Texture coordinates are a sublayer of texturing.usda already.
+    root.subLayerPaths = [str(layer) for layer in reversed(layers) if layer != asset.uv_layer]
+    return open_stage(root)
 
 
 def hashes_of_inputs(
@@ -169,7 +149,6 @@ def hashes_of_inputs(
 ) -> dict[str, str]:
     """By label the SHA-256 of all that a task of ``role`` reads: the weaker layers and the USD
     geometry that they refer to, the maps ``aovs``, the photographs, the picture of the sky."""
-    layers = _weaker_layers(asset, role)
     files = {
         "geometry": maps.layers_elsewhere(asset.folder),
         "environment": [environment] if environment else [],
@@ -180,7 +159,7 @@ def hashes_of_inputs(
         raise InputRefused(
             f"{environment}: no such file. Check --environment. [shading.environment]"
         )
-    by_label = {layer.name: sha256_of(layer) for layer in layers}
+    by_label = {layer.name: sha256_of(layer) for layer in _weaker_layers(asset, role)}
     return by_label | {label: hash_of_files(some) for label, some in files.items() if some}
 
 

@@ -18,9 +18,8 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdLux
 
 from usdbrdf.asset.readers.compose import open_stage
-from usdbrdf.asset.readers.frames import asset_file, capture_camera, frames_from_stage
-from usdbrdf.asset.readers.materials import read_texture
-from usdbrdf.asset.readers.surfaces import metres_from_units, surfaces_from_stage
+from usdbrdf.asset.readers.scene import LENS, asset_file, capture_camera, frames_from_stage
+from usdbrdf.asset.readers.surfaces import metres_from_units, read_texture, surfaces_from_stage
 from usdbrdf.errors import UsageError
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
@@ -32,16 +31,12 @@ _DEFAULT_WIDTH = 1280
 
 @dataclass(frozen=True, kw_only=True)
 class RenderScene:
-    """Surfaces and lights in metres, in the world of the stage.
-
-    up_axis          "Y" or "Z"
-    metres_per_unit  of the stage, whose units these were
-    """
+    """Surfaces and lights in metres, in the world of the stage."""
 
     surfaces: tuple[Surface, ...]
     lights: tuple[Light, ...]
-    up_axis: str
-    metres_per_unit: float
+    up_axis: str  # "Y" or "Z"
+    metres_per_unit: float  # of the stage, whose units these were
 
 
 def render_scene_from_stage(
@@ -50,7 +45,7 @@ def render_scene_from_stage(
     """What is visible in a stage at a time; ``warn`` is told, in sentences, what is left out."""
     return RenderScene(
         surfaces=surfaces_from_stage(stage, time, warn),
-        lights=lights_from_stage(stage, time, warn),
+        lights=_lights_from_stage(stage, time, warn),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
         metres_per_unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
     )
@@ -65,7 +60,7 @@ def view_from_stage(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode)
     """The camera at ``prim_path``, or the capture's where that is None; as many pixels as its
     photographs have, else 1280 across."""
     if prim_path is None:
-        camera = capture_camera(stage)
+        prim = capture_camera(stage).GetPrim()
     else:
         prim = stage.GetPrimAtPath(prim_path) if prim_path.startswith("/") else None
         if not prim or not prim.IsA(UsdGeom.Camera):
@@ -74,38 +69,20 @@ def view_from_stage(stage: Usd.Stage, prim_path: str | None, time: Usd.TimeCode)
                 f"--camera {prim_path}: the stage has no camera there. It has: "
                 f"{', '.join(known) or 'none'}. [relight.camera]"
             )
-        camera = UsdGeom.Camera(prim)
-    return _view(camera, time)
-
-
-def time_code(stage: Usd.Stage, frame: float | None) -> Usd.TimeCode:
-    """The time code of a frame that lies in the stage's range; None is the earliest time."""
-    if frame is None:
-        return Usd.TimeCode.EarliestTime()
-    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    if not first <= frame <= last:
-        raise UsageError(
-            f"--frame {frame:g}: the stage has the frames {first:g} to {last:g}. [relight.frame]"
-        )
-    return Usd.TimeCode(frame)
-
-
-def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> Camera:
-    prim = camera.GetPrim()
+    camera = UsdGeom.Camera(prim)
     if camera.GetProjectionAttr().Get(time) != UsdGeom.Tokens.perspective:
         raise UsageError(
             f"--camera {prim.GetPath()}: only perspective cameras are rendered. [relight.camera]"
         )
-    names = ("focalLength", "horizontalAperture", "verticalAperture")
-    focal, across, upright = (float(prim.GetAttribute(name).Get(time)) for name in names)
+    focal, across, upright, offset_x, offset_y = (
+        float(prim.GetAttribute(name).Get(time)) for name in LENS
+    )
     resolution = prim.GetAttribute("usdBrdf:capture:resolution")
     if resolution and resolution.HasValue():
         width, height = (int(value) for value in resolution.Get(time))
     else:
         width = _DEFAULT_WIDTH
         height = max(1, round(width * upright / across))
-    offset_x = float(camera.GetHorizontalApertureOffsetAttr().Get(time))
-    offset_y = float(camera.GetVerticalApertureOffsetAttr().Get(time))
     # Row vectors in USD: transposed they are ours. A camera's scale is no part of its pose.
     pose = np.array(camera.ComputeLocalToWorldTransform(time)).T
     pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
@@ -124,19 +101,28 @@ def _view(camera: UsdGeom.Camera, time: Usd.TimeCode) -> Camera:
     )
 
 
+def time_code(stage: Usd.Stage, frame: float | None) -> Usd.TimeCode:
+    """The time code of a frame that lies in the stage's range; None is the earliest time."""
+    if frame is None:
+        return Usd.TimeCode.EarliestTime()
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if not first <= frame <= last:
+        raise UsageError(
+            f"--frame {frame:g}: the stage has the frames {first:g} to {last:g}. [relight.frame]"
+        )
+    return Usd.TimeCode(frame)
+
+
 def eye_height(stage: Usd.Stage) -> float:
     """Metres along the up axis of the capture's highest camera: below every ceiling."""
     poses = frames_from_stage(stage).world_from_camera
     return float(poses[:, "XYZ".index(str(UsdGeom.GetStageUpAxis(stage))), 3].max())
 
 
-def lights_from_stage(
+def _lights_from_stage(
     stage: Usd.Stage, time: Usd.TimeCode, warn: Callable[[str], None]
 ) -> tuple[Light, ...]:
-    """All active, visible lights that emit.
-
-    warn  is told, in sentences, what was left out
-    """
+    """All active, visible lights that emit."""
     lights: list[Light] = []
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         kind = str(prim.GetTypeName())
@@ -150,11 +136,16 @@ def lights_from_stage(
             continue
         if prim.HasAPI(UsdLux.ShapingAPI):
             warn(f"<{prim.GetPath()}>: the shaping of the light is not rendered.")
-        emission = _emission(prim, time)
+        light = UsdLux.LightAPI(prim)
+        colour = np.array(light.GetColorAttr().Get(time) or (1, 1, 1), np.float32)
+        if light.GetEnableColorTemperatureAttr().Get(time):
+            kelvin = light.GetColorTemperatureAttr().Get(time)
+            colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float32)
+        scale = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
+        emission = np.asarray(np.maximum(colour * scale, 0), np.float32)
         if emission.any():
-            read = _READERS[kind]
             world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time)
-            lights.append(read(_Source(prim, time, emission, np.array(world).T)))
+            lights.append(_READERS[kind](_Source(prim, time, emission, np.array(world).T)))
     return tuple(lights)
 
 
@@ -185,17 +176,6 @@ class _Source(NamedTuple):
         return np.asarray(read_texture(file, "auto") * self.emission, np.float32)
 
 
-def _emission(prim: Usd.Prim, time: Usd.TimeCode) -> Float:
-    """(3,) colour * intensity * 2^exposure, with the colour temperature."""
-    light = UsdLux.LightAPI(prim)
-    colour = np.array(light.GetColorAttr().Get(time) or (1, 1, 1), np.float32)
-    if light.GetEnableColorTemperatureAttr().Get(time):
-        kelvin = light.GetColorTemperatureAttr().Get(time)
-        colour = colour * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin), np.float32)
-    scale = light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time)
-    return np.asarray(np.maximum(colour * scale, 0), np.float32)
-
-
 def _shape(source: _Source) -> ShapeLight:
     kind, emission = _SHAPES[str(source.prim.GetTypeName())], source.emission
     if kind == "rectangle":
@@ -204,21 +184,17 @@ def _shape(source: _Source) -> ShapeLight:
         size = (source.value("radius"),) * 3
     world_from_shape = source.world_from_light @ np.diag([*size, 1.0])
     if source.value("normalize"):
-        emission = emission / np.float32(_area(kind, world_from_shape))
+        # By the area in square units of the stage, as UsdLux divides.
+        x, y, z = (np.linalg.norm(column) for column in world_from_shape[:3, :3].T)
+        ball = 4 * math.pi * (x * y * z) ** (2 / 3)
+        area = {"rectangle": 4 * x * y, "disk": math.pi * x * y, "sphere": ball}[kind]
+        emission = emission / np.float32(area)
     # UsdLux emits towards -z; turned about y, so that a rectangle keeps its up direction.
     world_from_shape = world_from_shape @ np.diag([-1.0, 1, -1, 1])
     lit = source._replace(emission=emission)
     image = lit.picture() if kind == "rectangle" else constant_map(*emission)
     metres = metres_from_units(source.prim.GetStage())
     return ShapeLight(kind=kind, world_from_here=metres @ world_from_shape, emission=image)
-
-
-def _area(kind: str, world_from_shape: Double) -> float:
-    """Area in square units of the stage, as UsdLux divides by."""
-    x, y, z = (np.linalg.norm(column) for column in world_from_shape[:3, :3].T)
-    if kind == "rectangle":
-        return float(4 * x * y)
-    return float(math.pi * x * y if kind == "disk" else 4 * math.pi * (x * y * z) ** (2 / 3))
 
 
 def _distant(source: _Source) -> DistantLight:

@@ -1,48 +1,113 @@
-"""The labelled meshes of a stage -> one triangle soup in metres."""
+"""A composed stage -> what capture and tasks said in it: photographs, the labelled meshes as one
+triangle soup in metres, and the records of the objects."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.properties import OBJECT, TEXTURING
+from usdbrdf.asset.properties import (
+    AOV,
+    CAPTURE,
+    FIT,
+    OBJECT,
+    SHADING,
+    TEXTURING,
+    Aov,
+    FittedObject,
+    Photographs,
+    Schema,
+    ShadedObject,
+    facts_of,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
 
+Record = TypeVar("Record")
+Number = TypeVar("Number", np.float32, np.float64)
 _TIME = Usd.TimeCode.EarliestTime()  # the default value too, where nothing is animated
+LENS = (
+    "focalLength",
+    "horizontalAperture",
+    "verticalAperture",
+    "horizontalApertureOffset",
+    "verticalApertureOffset",
+)
+_IMAGE = CAPTURE.attribute(CAPTURE.key)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Mesh:
-    points: Float
-    triangles: Int
-    corner_normals: Float
-    corner_uv: Float | None
+def frames_from_stage(stage: Usd.Stage) -> Frames:
+    """The photographs, with poses in metres and absolute image paths, in the order of time."""
+    camera = capture_camera(stage)
+    image = camera.GetPrim().GetAttribute(_IMAGE)
+    times = image.GetTimeSamples()
+    # Row vectors in USD: transposed they are ours.
+    poses = np.array([camera.ComputeLocalToWorldTransform(time) for time in times])
+    poses = np.ascontiguousarray(poses.transpose(0, 2, 1))
+    poses[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
+    read: dict[str, Any] = {}
+    for field, fact in facts_of(Photographs):
+        attribute = camera.GetPrim().GetAttribute(fact.attribute())
+        if fact.samples and field != "image":
+            read[field] = np.array([attribute.Get(time) for time in times], np.float64)
+        elif field != "image":
+            read[field] = attribute.Get()
+    read["resolution"] = read["resolution"].astype(np.int32)
+    paths = [asset_file(image, time) for time in times]
+    return Frames(
+        image_paths=tuple(path for path in paths if path is not None),
+        world_from_camera=poses,
+        **read,
+    )
+
+
+def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
+    """The camera that carries the photographs."""
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Camera) and prim.GetAttribute(_IMAGE):
+            return UsdGeom.Camera(prim)
+    raise InputRefused(
+        f"{stage.GetRootLayer().identifier}: no camera of the stage has photographs "
+        "(usdBrdf:capture:image). Run ingest again. [stage.camera]"
+    )
+
+
+def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | None:
+    """Absolute path of the file that an attribute names, existing or not; None if empty."""
+    value = attribute.Get(time)
+    if not value or not value.path:
+        return None
+    # Relative to the layer that holds the opinion.
+    layer = attribute.GetPropertyStack(time)[0].layer
+    return Path(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
 
 
 def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
-
-    Meshes without normals of their own get them by the crease angle that ingest was given.
-    """
-    prims = [prim for prim in stage.Traverse() if is_object(prim)]
+    Meshes without normals of their own get them by the crease angle that ingest was given."""
+    prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh) and is_measured(p, OBJECT)]
     if not prims:
         raise InputRefused(
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
-    crease_angle_deg = _crease_angle_deg(stage)
-    meshes = [_read_mesh(UsdGeom.Mesh(prim), crease_angle_deg) for prim in prims]
-    num_faces = [len(mesh.triangles) for mesh in meshes]
-    first_face = np.cumsum([0, *num_faces])
-    first_point = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    records = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetLayerStack()]
+    angles = (record.get("parameters", {}).get("crease_angle_deg") for record in records)
+    angle = next((a for a in angles if a is not None), IngestOptions().crease_angle_deg)
+    read = (_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims)
+    points, triangles, normals, uvs = zip(*read, strict=True)
+    num_faces = [len(own) for own in triangles]
+    first_face, first_point = np.cumsum([0, *num_faces]), np.cumsum([0, *map(len, points)])
     objects = tuple(
         SceneObject(
             prim_path=str(prim.GetPath()),
@@ -54,34 +119,49 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
         )
         for i, prim in enumerate(prims)
     )
-    shifted = [mesh.triangles + first_point[i] for i, mesh in enumerate(meshes)]
+    without = [prim.GetPath() for prim, uv in zip(prims, uvs, strict=True) if uv is None]
+    if 0 < len(without) < len(prims):
+        raise InputRefused(
+            f"<{without[0]}>: the mesh has no texture coordinates though others have. "
+            "Run `usdbrdf texture` again. [stage.st]"
+        )
+    shifted = [own + first_point[i] for i, own in enumerate(triangles)]
     return Scene(
         objects=objects,
-        points=np.concatenate([mesh.points for mesh in meshes]),
+        points=np.concatenate(points),
         triangles=np.concatenate(shifted).astype(np.int32),
-        corner_normals=np.concatenate([mesh.corner_normals for mesh in meshes]),
-        face_object=np.repeat(np.arange(len(meshes), dtype=np.int32), num_faces),
-        corner_uv=_joined_uv(prims, meshes),
+        corner_normals=np.concatenate(normals),
+        face_object=np.repeat(np.arange(len(prims), dtype=np.int32), num_faces),
+        corner_uv=None if without else np.concatenate(uvs),
     )
 
 
-def is_object(prim: Usd.Prim) -> bool:
-    """True for a mesh that ingest labelled."""
-    label = prim.GetAttribute(OBJECT.attribute(OBJECT.key))
-    return bool(label and label.HasAuthoredValue() and prim.IsA(UsdGeom.Mesh))
-
-
-def read_corner_uv(mesh: UsdGeom.Mesh, fans: Triangulation) -> Float | None:
-    """(T, 3, 2) texture coordinates that the task texture authored; None before it.
-
-    An input file's own primvars:st does not count: only ours go with our textures.
-    """
-    ours = mesh.GetPrim().GetAttribute(TEXTURING.attribute(TEXTURING.key))
+def _read_mesh(
+    mesh: UsdGeom.Mesh, crease_angle_deg: float
+) -> tuple[Float, Int, Float, Float | None]:
+    """Points in the world, triangles, their corners' normals and texture coordinates of ours."""
+    fans = triangulation_of(mesh)
+    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
+    meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
+    local = np.asarray(mesh.GetPointsAttr().Get(_TIME), np.float64).reshape(-1, 3)
+    world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
+    points = np.ascontiguousarray(world, np.float32)
+    triangles, normals, uv = fans.triangles, authored_normals(mesh, fans), None
+    # An input file's own primvars:st does not count: only ours go with our textures.
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-    if not (ours and ours.HasAuthoredValue() and primvar):
-        return None
-    values = np.asarray(primvar.ComputeFlattened(_TIME), np.float32)
-    return np.ascontiguousarray(values[fans.corners])
+    if is_measured(mesh.GetPrim(), TEXTURING) and primvar:
+        uv = np.asarray(primvar.ComputeFlattened(_TIME), np.float32)[fans.corners]
+    if _is_mirrored(mesh):
+        triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
+        uv = None if uv is None else uv[:, [0, 2, 1]]
+        normals = None if normals is None else normals[:, [0, 2, 1]]
+    if normals is None:
+        in_world = corner_normals(points, triangles, crease_angle_deg)
+    else:
+        turned = normals @ np.linalg.inv(world_from_local[:3, :3])
+        unit = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        in_world = np.ascontiguousarray(unit, np.float32)
+    return points, triangles, in_world, uv
 
 
 def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
@@ -92,12 +172,17 @@ def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
     given = primvar.ComputeFlattened(_TIME) if primvar and primvar.HasAuthoredValue() else None
     if not isinstance(given, Vt.Vec2fArray | Vt.Vec2dArray | Vt.Vec2hArray):
         return None
-    values = np.asarray(given, np.float32)
-    element = triangulation_of(mesh).element_of_corner(primvar.GetInterpolation())
-    if element.max(initial=-1) >= len(values):
-        return None
-    uv = values[element]
-    return np.ascontiguousarray(uv[:, [0, 2, 1]] if _is_mirrored(mesh) else uv)
+    uv = per_corner(given, np.float32, primvar.GetInterpolation(), triangulation_of(mesh))
+    return uv[:, [0, 2, 1]] if uv is not None and _is_mirrored(mesh) else uv
+
+
+def per_corner(
+    values: Any, kind: type[Number], interpolation: str, fans: Triangulation
+) -> npt.NDArray[Number] | None:
+    """(T, 3, ...) the value that each triangle's corner has; None where there are too few of them:
+    the file is wrong about these values, not about its shape."""
+    elements = fans.element_of_corner(interpolation)
+    return np.asarray(values, kind)[elements] if elements.max(initial=-1) < len(values) else None
 
 
 def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
@@ -109,35 +194,6 @@ def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
         left_handed=mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded,
         holes=np.asarray(holes, np.int32) if holes else None,
     )
-
-
-def _crease_angle_deg(stage: Usd.Stage) -> float:
-    """As the scan's layer records it; the default of ingest where no layer does."""
-    for layer in stage.GetLayerStack():
-        parameters = layer.customLayerData.get("usdbrdf", {}).get("parameters", {})
-        if "crease_angle_deg" in parameters:
-            return float(parameters["crease_angle_deg"])
-    return IngestOptions().crease_angle_deg
-
-
-def _read_mesh(mesh: UsdGeom.Mesh, crease_angle_deg: float) -> _Mesh:
-    fans = triangulation_of(mesh)
-    world_from_local = np.array(mesh.ComputeLocalToWorldTransform(_TIME)).T
-    meters = UsdGeom.GetStageMetersPerUnit(mesh.GetPrim().GetStage())
-    local = np.asarray(mesh.GetPointsAttr().Get(_TIME), np.float64).reshape(-1, 3)
-    world = (local @ world_from_local[:3, :3].T + world_from_local[:3, 3]) * meters
-    points = np.ascontiguousarray(world, np.float32)
-    triangles, uv = fans.triangles, read_corner_uv(mesh, fans)
-    normals = authored_normals(mesh, fans)
-    if _is_mirrored(mesh):
-        triangles = np.ascontiguousarray(triangles[:, [0, 2, 1]])
-        uv = None if uv is None else np.ascontiguousarray(uv[:, [0, 2, 1]])
-        normals = None if normals is None else normals[:, [0, 2, 1]]
-    if normals is None:
-        in_world = corner_normals(points, triangles, crease_angle_deg)
-    else:
-        in_world = _unit(normals @ np.linalg.inv(world_from_local[:3, :3]))
-    return _Mesh(points=points, triangles=triangles, corner_normals=in_world, corner_uv=uv)
 
 
 def _is_mirrored(mesh: UsdGeom.Mesh) -> bool:
@@ -154,30 +210,65 @@ def authored_normals(
     else:
         values = mesh.GetNormalsAttr().Get(time)
         interpolation = mesh.GetNormalsInterpolation()
-    if not values:
+    chosen = per_corner(values, np.float64, interpolation, fans) if values else None
+    if chosen is None or not np.isfinite(chosen).all():
         return None
-    normals = np.asarray(values, np.float64).reshape(-1, 3)
-    element_of_corner = fans.element_of_corner(interpolation)
-    if element_of_corner.size and element_of_corner.max() >= len(normals):
-        return None  # too few of them: the file is wrong about its normals, not about its shape
-    chosen = normals[element_of_corner]
-    usable = np.isfinite(chosen).all() and (np.linalg.norm(chosen, axis=-1) > 1e-12).all()
-    return chosen if usable else None
+    return chosen if (np.linalg.norm(chosen, axis=-1) > 1e-12).all() else None
 
 
-def _unit(vectors: npt.NDArray[np.float64]) -> Float:
-    unit = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.ascontiguousarray(unit, np.float32)
+def authored(prim: Usd.Prim, name: str) -> Any:
+    """The authored value of an attribute: a schema's fallback is no measurement. Else None."""
+    attribute = prim.GetAttribute(name)
+    return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
 
 
-def _joined_uv(prims: list[Usd.Prim], meshes: list[_Mesh]) -> Float | None:
-    present = [mesh.corner_uv for mesh in meshes if mesh.corner_uv is not None]
-    if not present:
+def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
+    """Whether anybody measured of a prim what the schema is about."""
+    return authored(prim, schema.attribute(schema.key)) is not None
+
+
+def aov_path(stage: Usd.Stage, prim_path: str, aov: str) -> Path | None:
+    """Absolute path of an object's map; None where the object has no such map."""
+    attribute = stage.GetPrimAtPath(prim_path).GetAttribute(AOV.attribute("file", aov))
+    return asset_file(attribute, Usd.TimeCode.Default()) if attribute else None
+
+
+def read_aovs(stage: Usd.Stage, prim_path: str) -> tuple[Aov, ...]:
+    """All maps of an object, by name; from whatever layers the stage is composed of."""
+    prim = stage.GetPrimAtPath(prim_path)
+    paths = (p.GetName() for p in prim.GetAuthoredPropertiesInNamespace("usdBrdf:aov"))
+    names = sorted(path.split(":")[2] for path in paths if path.endswith(":file"))
+    return tuple(read_record(Aov, prim, name, name=name) for name in names)
+
+
+def read_object(
+    kind: type[Record], schema: Schema, stage: Usd.Stage, prim_path: str, **others: Any
+) -> Record | None:
+    """What the task of a schema said of an object, its maps apart; None before that task."""
+    prim = stage.GetPrimAtPath(prim_path)
+    if not is_measured(prim, schema):
         return None
-    if len(present) < len(meshes):
-        missing = next(p for p, mesh in zip(prims, meshes, strict=True) if mesh.corner_uv is None)
-        raise InputRefused(
-            f"<{missing.GetPath()}>: the mesh has no texture coordinates though others have. "
-            "Run `usdbrdf texture` again. [stage.st]"
-        )
-    return np.concatenate(present)
+    identifier = str(authored(prim, "usdBrdf:identifier"))
+    return read_record(kind, prim, prim_path=prim_path, identifier=identifier, **others)
+
+
+read_shading = partial(read_object, ShadedObject, SHADING)
+read_fit = partial(read_object, FittedObject, FIT)
+
+
+def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others: Any) -> Record:
+    """A record as ``author_record`` said it; ``others`` are its fields that are no facts."""
+    fields, row_type = dict(others), cast(type, kind)
+    rows = facts_of(row_type)
+    for field, fact in rows:
+        value = authored(prim, fact.attribute(instance))
+        if value is not None and field not in fields:
+            if isinstance(value, Sdf.AssetPath):
+                value = value.path
+            elif isinstance(value, (Gf.Vec2i, Gf.Vec3f, Gf.Vec4d)):
+                value = tuple(value)
+            fields[field] = fact.read(value)
+        if fact.schema.flag:
+            fields[fact.schema.flag] = is_measured(prim, fact.schema)
+    unknown = {field: fact.unknown for field, fact in reversed(rows)}
+    return kind(**unknown | fields)

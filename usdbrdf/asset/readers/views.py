@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.frames import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,
@@ -49,11 +49,9 @@ class Views:
 
 
 def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
-    """The cameras of a document, named after their images, to render from.
-
-    Images need not exist where the document states width and height. InputRefused where a view
-    cannot be used, or two have images of one name.
-    """
+    """The cameras of a document, named after their images, to render from. Images need not exist
+    where the document states width and height. InputRefused where a view cannot be used, or two
+    have images of one name."""
     findings = Findings()
     records = _rigid_records(source, asset, IngestOptions(), findings, images=False)
     if findings.dropped:
@@ -67,17 +65,29 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
             f"{source}: {'no views' if not records else 'two views have images of one name'}. "
             "Correct the document. [relight.views]"
         )
-    return tuple(_camera(record, metres_per_unit) for record in records)
+    cameras = []
+    for record in records:
+        pose = record.world_from_camera.copy()
+        pose[:3, 3] *= metres_per_unit
+        width, height = record.resolution
+        cameras.append(
+            Camera(
+                name=record.name,
+                world_from_camera=pose,
+                intrinsics=record.intrinsics,
+                width=width,
+                height=height,
+            )
+        )
+    return tuple(cameras)
 
 
 def photographs_of_views(
     source: Path, asset: Asset, stage: Usd.Stage, scene: Scene, allow_outside: tuple[Path, ...] = ()
 ) -> Views:
-    """The photographs of a document, checked as those of a capture are.
-
-    Images have the capture's encoding. Views that cannot be used are dropped with a warning;
-    InputRefused where none is left or where the cameras do not see the asset.
-    """
+    """The photographs of a document, checked as those of a capture are. Images have the capture's
+    encoding. Views that cannot be used are dropped with a warning; InputRefused where none is left
+    or where the cameras do not see the asset."""
     captured = frames_from_stage(stage)
     findings = Findings()
     options = IngestOptions(allow_outside=allow_outside)
@@ -113,19 +123,6 @@ def _rigid_records(
     records = frame_records(source, options, findings, images=images)
     pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
     return rigid_records(records, findings, source, pose_scale=pose_scale)
-
-
-def _camera(record: FrameRecord, metres_per_unit: float) -> Camera:
-    pose = record.world_from_camera.copy()
-    pose[:3, 3] *= metres_per_unit
-    width, height = record.resolution
-    return Camera(
-        name=record.name,
-        world_from_camera=pose,
-        intrinsics=record.intrinsics,
-        width=width,
-        height=height,
-    )
 
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:

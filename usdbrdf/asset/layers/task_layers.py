@@ -1,0 +1,334 @@
+"""What the tasks texture, shade and fit add to the scan, each in a layer of its own.
+
+Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``. A lighter wants
+lights: something to dim, to link, to sample well. The measured emission is in the materials, and a
+renderer that honoured both would count every lamp twice. So the default prim has a variant set:
+``emissive``, the default, has no lights; ``usdlux`` has them, and scales the emission of the lamps
+they stand for to nothing. A shot that references the asset chooses by one opinion of its own, which
+neither a muted layer nor invisible lights in the root would allow: mutes are a session's, not a
+file's, and visibility would leave the glowing surfaces on. A layer may still be muted: all of it is
+in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+
+Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
+``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
+an object only, keep their emission in both variants. Flat lights shine from the front of the faces;
+their lamps are dark where a renderer does not show lights to the camera. A ball is hidden, since
+its light encloses it, and some renderers draw such a light from its centre.
+
+Where it is asked for, the materials once more as OpenPBR networks of MaterialX, for renderers that
+take those rather than UsdPreviewSurface; they get the same numbers. materialx.usda is a sublayer of
+material.usda, weaker than it and listed there: so the root layer need not be written again, and a
+session that does not want it mutes one file. What glows keeps its UsdPreviewSurface alone, whose
+emission the variants of the lights switch off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.layers.author import (
+    apply_schema,
+    attribute,
+    author_inputs,
+    author_record,
+    connect,
+    define,
+    export,
+    over,
+    relationship,
+)
+from usdbrdf.asset.layers.looks import (
+    LIT,
+    SHADED,
+    SURFACE,
+    aov_looks,
+    author_look_materials,
+    author_looks,
+    colour_from_texture,
+    lobe,
+    node,
+    scale_texture,
+    surface,
+)
+from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
+from usdbrdf.asset.properties import FittedObject, ShadedObject, TexturedObject
+from usdbrdf.errors import UsdBrdfError
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.light import LampShape
+
+Types = Sdf.ValueTypeNames
+THUMBNAIL = "previews/lit.png"  # in the asset folder
+# Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
+_PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
+ALBEDO, EMISSION = "albedo", "emission"
+# Texture nodes of the materials; that of the emission has no scale of its own.
+ALBEDO_TEXTURE, EMISSION_TEXTURE = "AlbedoTexture", "EmissionTexture"
+LIGHTS = "lights"
+EMISSIVE, USDLUX = "emissive", "usdlux"
+_TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp:
+    """An emitter and the lights that may stand for it; none where it has no shape for that."""
+
+    prim_path: str
+    identifier: str
+    shapes: tuple[LampShape, ...]
+
+
+def write_lights_layer(
+    path: Path, draft: Draft, lamps: Sequence[Lamp], world_from_root: Double
+) -> None:
+    """Write lights.usda to ``path``; without a lamp that has shapes it holds nothing.
+
+    world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
+    """
+    scopes, layer = draft.scopes, draft.new_layer()
+    shaped = [lamp for lamp in lamps if lamp.shapes]
+    if shaped:
+        emissive, usdlux = (
+            Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, name)
+            for name in (EMISSIVE, USDLUX)
+        )
+        over(layer, str(emissive))
+        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE
+        define(layer, _within(usdlux, scopes.path("lights")), "Scope")
+        for lamp in shaped:
+            lights = _within(usdlux, scopes.path("lights", lamp.identifier))
+            define(layer, lights, "Scope")
+            for number, shape in enumerate(lamp.shapes, start=1):
+                prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
+                _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
+            # The lamp itself must not shine beside them.
+            texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
+            prim = over(layer, _within(usdlux, texture))
+            author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
+            if lamp.shapes[0].kind == "sphere":
+                hidden = over(layer, _within(usdlux, lamp.prim_path))
+                attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
+    export(layer, path, folder=path.parent)
+
+
+def world_from_root(stage: Usd.Stage) -> Double:
+    """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+    return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
+
+
+def _within(variant: Sdf.Path, path: str) -> str:
+    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
+
+
+def _author_light(
+    prim: Sdf.PrimSpec, shape: LampShape, world_from_root: Double, meters_per_unit: float
+) -> None:
+    """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
+    brightest = max(shape.radiance)
+    colour = Gf.Vec3f(*(value / brightest for value in shape.radiance))
+    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    author_inputs(prim, Types.Color3f, color=colour)
+    author_inputs(prim, Types.Bool, normalize=False)
+    width, height = (side / meters_per_unit for side in shape.size)
+    if shape.kind == "rectangle":
+        author_inputs(prim, Types.Float, width=width, height=height)
+    else:
+        author_inputs(prim, Types.Float, radius=width / 2)
+    half = Gf.Vec3f(width / 2, height / 2, width / 2 if shape.kind == "sphere" else 0)
+    attribute(prim, "extent", Types.Float3Array, [-half, half])
+    # Rigid in the world, in units of the stage: what the root does to sizes is undone here.
+    in_units = shape.world_from_light.copy()
+    in_units[:3, 3] /= meters_per_unit
+    pose = np.linalg.inv(world_from_root) @ in_units
+    # USD multiplies row vectors from the left: its matrices are ours transposed.
+    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
+    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
+
+
+def write_texturing_layer(
+    path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject], scanned: Usd.Stage
+) -> None:
+    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``.
+
+    scanned  the composed stage of the weaker layers
+    """
+    asset, scopes = draft.asset, draft.scopes
+    folder = asset.layer("texturing").parent
+    coordinates, layer = draft.new_layer(), draft.new_layer()
+    layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
+    with Sdf.ChangeBlock():
+        for item in objects:
+            # One value per triangle corner; equal values are stored once and indexed. Their type is
+            # the one that an input file gives its own, which ours must share: float2[] is usual.
+            declared = scanned.GetAttributeAtPath(f"{item.prim_path}.primvars:st")
+            kind = declared.GetTypeName() if declared else Types.TexCoord2fArray
+            if type(kind.defaultValue) not in _PAIRS:
+                kind = Types.TexCoord2fArray
+            corners = np.ascontiguousarray(item.corner_uv, np.float32).reshape(-1, 2)
+            # Two floats as one integer: equal bits, much faster than rows.
+            bits = corners.view(np.uint64)
+            _, first, index = np.unique(bits, return_index=True, return_inverse=True)
+            values = corners[first].astype(_PAIRS[type(kind.defaultValue)])
+            prim = over(coordinates, item.prim_path)
+            attribute(prim, "primvars:st", kind, values, interpolation="faceVarying")
+            attribute(
+                prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32)
+            )
+            author_record(over(layer, item.prim_path), item)
+    # What browsers of assets show: the picture that the task writes beside the layer.
+    root = layer.GetPrimAtPath(scopes.root)
+    apply_schema(root, "AssetPreviewsAPI")
+    picture = {"defaultImage": Sdf.AssetPath(path_in_layer(THUMBNAIL))}
+    root.SetInfo("assetInfo", {"previews": {"thumbnails": {"default": picture}}})
+    author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=LIT)
+    export(coordinates, uv_path, folder=folder)
+    export(layer, path, folder=folder)
+
+
+# What a renderer is asked for: name, type, source. Light path expressions say which paths count;
+# "raw" names a renderer's own output.
+_RENDER_VARS = (
+    ("beauty", "color3f", "C.*", "lpe"),
+    ("diffuse", "color3f", "C<RD>.*", "lpe"),
+    ("specular", "color3f", "C<RG>.*", "lpe"),
+    ("emission", "color3f", "C[<L.>O]", "lpe"),
+    ("albedo", "color3f", "albedo", "raw"),
+    ("normal", "normal3f", "N", "raw"),
+    ("depth", "float", "depth", "raw"),
+)
+
+
+def write_shading_layer(path: Path, draft: Draft, objects: Sequence[ShadedObject]) -> None:
+    """Write shading.usda to ``path``; its sublayer is ``write_lights_layer``'s."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
+    define(layer, scopes.path("materials"), "Scope")
+    for item in objects:
+        author_record(over(layer, item.prim_path), item)
+        # Diffuse only: the lobe is what the task fit adds, in a stronger layer.
+        material = scopes.path("materials", item.identifier)
+        surface(layer, material)
+        files = {aov.name: aov.file for aov in item.aovs}
+        wanted = EMISSION if item.emitter else ALBEDO
+        if wanted not in files:
+            raise UsdBrdfError(
+                f"<{item.prim_path}>: the task shade delivered no {wanted} map. This is a defect "
+                "of usdbrdf; please report it. [stage.aov]"
+            )
+        # An emitter reflects nothing that could be measured; other objects may glow in places.
+        inputs = [("emissiveColor", EMISSION_TEXTURE, EMISSION, item.radiance)]
+        if not item.emitter:
+            inputs.append(("diffuseColor", ALBEDO_TEXTURE, ALBEDO, item.mean_albedo))
+        for name, texture, aov, mean in inputs:
+            if aov in files:
+                colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
+    # Emission is not a look: it is nothing on most objects, and the shaded look shows it.
+    looks = aov_looks(layer, scopes, objects, hidden=frozenset([EMISSION]))
+    looks[SHADED] = {item.prim_path: scopes.path("materials", item.identifier) for item in objects}
+    author_looks(layer, draft, looks, selected=SHADED)
+    _author_render_outputs(layer, scopes)
+    export(layer, path, folder=asset.layer("shading").parent)
+
+
+def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
+    """The product and its variables for the render settings that the scan layer defines."""
+    product, variables = scopes.path("render", "aovs"), scopes.path("render", "vars")
+    relationship(over(layer, scopes.path("render", "capture")), "products", product)
+    prim = define(layer, product, "RenderProduct")
+    attribute(prim, "productName", Types.Token, "aovs.####.exr")
+    relationship(prim, "camera", scopes.path("cameras", "capture"))
+    relationship(prim, "orderedVars", *(f"{variables}/{name}" for name, *_ in _RENDER_VARS))
+    define(layer, variables, "Scope")
+    for name, data_type, source, source_type in _RENDER_VARS:
+        prim = define(layer, f"{variables}/{name}", "RenderVar")
+        attribute(prim, "dataType", Types.Token, data_type, uniform=True)
+        attribute(prim, "sourceName", Types.String, source, uniform=True)
+        attribute(prim, "sourceType", Types.Token, source_type, uniform=True)
+
+
+def write_material_layer(
+    path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
+) -> None:
+    """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
+    networks = {}
+    for item in objects:
+        material = scopes.path("materials", item.identifier)
+        author_record(over(layer, item.prim_path), item)
+        shown = NO_LOBE
+        if item.is_known:
+            shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
+            lobe(layer, material, shown.roughness, shown.ior)
+            shader = over(layer, f"{material}/{SURFACE}")
+            author_inputs(shader, Types.Float, metallic=0.0)
+            author_inputs(shader, Types.Int, useSpecularWorkflow=0)
+        texture = _author_colour(layer, material, item, shown.diffuse, shading)
+        if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
+            networks[material] = (shown, texture)
+    looks = aov_looks(layer, scopes, objects)
+    for look, parameter in (("roughness", "phi"), ("specular", "psi")):
+        greys = [(getattr(i, parameter),) * 3 if i.is_known else None for i in objects]
+        looks[look] = author_look_materials(layer, scopes, look, objects, greys)
+    author_looks(layer, draft, looks, selected=SHADED)
+    if materialx:
+        layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
+        beneath = draft.new_layer()
+        for material, (shown, texture) in networks.items():
+            _author_network(beneath, material, shown, texture)
+        export(beneath, materialx, folder=asset.materialx_layer.parent)
+    export(layer, path, folder=asset.layer("material").parent)
+
+
+def _author_colour(
+    layer: Sdf.Layer, material: str, item: FittedObject, scale: float, shading: Sdf.Layer
+) -> str:
+    """The refined colour instead of the albedo, on what reflects; without one a factor on the
+    albedo. Returns the texture's path in layers; "" where there is none, as of an emitter."""
+    for aov in item.aovs:
+        if aov.name == "base_color" and any(item.mean_color):
+            colour_from_texture(
+                layer, material, "diffuseColor", "BaseColorTexture", aov.file,
+                scale=scale, fallback=item.mean_color,
+            )  # fmt: skip
+            return path_in_layer(aov.file)
+    albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
+    if albedo is None:
+        return ""
+    if scale != 1:
+        scale_texture(layer, material, ALBEDO_TEXTURE, scale)
+    return str(albedo.default.path)
+
+
+def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
+    """OpenPBR with what UsdPreviewSurface is told; ``file`` is the texture of its diffuse colour as
+    layers spell its path, "" is black."""
+    surface = f"{material}/OpenPBR"
+    connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
+    prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)
+    author_inputs(
+        prim, Types.Float,
+        base_weight=1.0, base_diffuse_roughness=0.0, base_metalness=0.0, specular_weight=1.0,
+        specular_roughness=shown.roughness, specular_ior=shown.ior,
+    )  # fmt: skip
+    if not file:
+        author_inputs(prim, Types.Color3f, base_color=(0.0, 0.0, 0.0))
+        return
+    st, image, scaled = (f"{material}/Mtlx{name}" for name in ("St", "BaseColor", "Scaled"))
+    prim_st = node(layer, st, "ND_geompropvalue_vector2", "out", Types.Float2)
+    author_inputs(prim_st, Types.String, geomprop="st")
+    texture = node(layer, image, "ND_image_color3", "out", Types.Color3f)
+    author_inputs(texture, Types.Asset, file=Sdf.AssetPath(file))
+    author_inputs(texture, Types.String, uaddressmode="clamp", vaddressmode="clamp")
+    connect(texture, "inputs:texcoord", Types.Float2, f"{st}.outputs:out")
+    product = node(layer, scaled, "ND_multiply_color3FA", "out", Types.Color3f)
+    author_inputs(product, Types.Float, in2=shown.diffuse)
+    connect(product, "inputs:in1", Types.Color3f, f"{image}.outputs:out")
+    connect(prim, "inputs:base_color", Types.Color3f, f"{scaled}.outputs:out")
