@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.model.arrays import Array, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
