@@ -120,6 +120,7 @@ ENGINEERING: dict[str, str] = {
     "GRID": "discretisation of the search",
     "MEASURED": "codes of coverage, which other programs read",
     "MIXTURE": "rays: noise against time",
+    "NEUTRAL": "mathematics: the middle of [0, 1]",
     "NOTHING": "codes of what a texel shows in a frame",
     "NOTHING_KNOWN": "mathematics: deviation of the even distribution",
     "OF_TEXTURING": "bytes",

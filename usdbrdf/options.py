@@ -267,8 +267,7 @@ class ShadeOptions(Options):
 
 
 class FitOptions(Options):
-    """How roughness and specular are found, and who is told. Without evidence all methods but
-    "paper" write the prior of the object's class."""
+    """How roughness and specular are found, and who is told."""
 
     method: Literal["views", "scaled", "paper"] = option("--fit", "views")
     """views: many views per texel, L_d free, and refined with what was found; scaled: one target
@@ -278,6 +277,9 @@ class FitOptions(Options):
     mapping: Literal["measured", "matched"] = option("--material", "matched")
     """what UsdPreviewSurface is told: measured: roughness and specular as fitted; matched: as
     renderers need them to show that"""
+    unmeasured: Literal["neutral", "class"] = option("--unmeasured", "neutral")
+    """what materials show of objects that were not measured: neutral: what the frames leave likely;
+    class: what is usual for their class, as far as the frames allow"""
     materialx: bool = option("--materialx", False)
     "write OpenPBR networks of MaterialX too, as layers/materialx.usda"
     environment: Path | None = _environment()

@@ -14,7 +14,6 @@ from usdbrdf.material.fit_target import (
     mirror_hits_emitter,
     object_pixels,
 )
-from usdbrdf.material.verdict import class_prior
 from usdbrdf.transport.lit_scene import LitScene, visible_points
 
 WIDTH, HEIGHT = 80, 60
@@ -157,14 +156,3 @@ def test_half_of_a_limited_number_of_pixels_lies_by_the_highlight():
     number = (np.hypot(row - 55, column - 75) <= 30).sum()
     assert stands_for[near].sum() == pytest.approx(number, rel=1e-5)
     assert stands_for[~near].sum() == pytest.approx(len(whole) - number, rel=1e-5)
-
-
-def test_priors_by_class_then_by_name_then_neutral():
-    assert class_prior("wall", "anything") == class_prior("", "north wall")
-    # The last word names the thing.
-    assert class_prior("table lamp sofa", "") == class_prior("sofa", "")
-    assert class_prior("", "") == class_prior("qwertz", "object-17") == (0.5, 0.5)
-    for name in ("wall", "sofa", "table", "tv", "vase"):
-        phi, psi = class_prior(name, "")
-        assert 0 <= phi <= 1
-        assert 0 <= psi <= 1

@@ -4,117 +4,105 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
+    NEUTRAL,
     NOTHING_KNOWN,
-    PRIOR_ERROR,
     SOME_EVIDENCE,
-    Verdict,
+    LobeEstimate,
+    lobe_from_costs,
     verdict_on_frame,
     verdict_on_views,
-    with_prior,
 )
 
-PRIOR = (0.6, 0.3)
-NO_FIT = (math.nan, math.nan)
 
-
-def _on_views(
-    *,
-    phi_error: float = 0.02,
-    psi_error: float = 0.05,
-    unresolved: float = 0.0,
-    evidence: float = 0.8,
-    seen: bool = True,
-) -> Verdict:
-    return verdict_on_views(
-        (0.1, phi_error), (0.8, psi_error), unresolved, evidence, PRIOR, seen
+def _lobe(**numbers: float) -> LobeEstimate:
+    sharp = LobeEstimate(
+        phi=0.1, psi=0.8, phi_error=0.02, psi_error=0.05, unresolved=0.0, cost=1.0, evidence=0.8,
+        phi_median=0.3, psi_median=0.6, psi_upper=0.9,
     )  # fmt: skip
-
-
-def _blend(value: float, error: float, of_class: float) -> tuple[float, float]:
-    """With nothing unresolved: what the frames say and the prior, by their precisions."""
-    return with_prior(value, error, of_class, NOTHING_KNOWN)
+    return sharp._replace(**numbers)
 
 
 @pytest.mark.parametrize("evidence", [MIN_EVIDENCE, 1.0])
 def test_a_measurement_is_published_as_found(evidence: float):
-    found = _on_views(evidence=evidence)
-    # The prior is left behind: 0.02 against 0.25.
-    assert (found.phi, found.psi) == (pytest.approx(0.1, abs=0.005), pytest.approx(0.8, abs=0.025))
-    assert (found.phi_error, found.psi_error) == pytest.approx((0.02, 0.05), rel=0.05)
+    found = verdict_on_views(_lobe(evidence=evidence), True)
+    assert (found.phi, found.psi, found.phi_error, found.psi_error) == (0.1, 0.8, 0.02, 0.05)
     assert (found.phi_confidence, found.psi_confidence) == ("high", "high")
-    assert found.status == "measured"
+    assert (found.status, found.psi_upper) == ("measured", 0.9)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.1, 1.3])
 def test_each_parameter_is_judged_by_its_own_error(share: float):
-    # Errors that, with the prior's precision added, come to ``share`` of the limit.
-    def before(limit: float) -> float:
-        precision = (share * limit) ** -2 - PRIOR_ERROR**-2 + NOTHING_KNOWN**-2
-        return precision**-0.5
-
     wanted = "high" if share < 1 else "low"
-    found = _on_views(psi_error=before(MAX_PSI_ERROR))
-    assert found.psi_error == pytest.approx(share * MAX_PSI_ERROR)
-    assert found.psi == pytest.approx(_blend(0.8, before(MAX_PSI_ERROR), PRIOR[1])[0])
-    assert PRIOR[1] < found.psi < 0.8
+    found = verdict_on_views(_lobe(psi_error=share * MAX_PSI_ERROR), True)
+    # Where psi is not determined its median stands for it.
+    assert (found.phi, found.psi) == (0.1, 0.8 if share < 1 else 0.6)
     assert (found.phi_confidence, found.psi_confidence) == ("high", wanted)
     assert found.status == ("measured" if share < 1 else "prior")
-    found = _on_views(phi_error=before(MAX_PHI_ERROR))
-    assert found.phi_error == pytest.approx(share * MAX_PHI_ERROR)
+    found = verdict_on_views(_lobe(phi_error=share * MAX_PHI_ERROR), True)
+    assert (found.phi, found.psi) == (0.1 if share < 1 else 0.3, 0.8)
     assert (found.phi_confidence, found.psi_confidence) == (wanted, "high")
     assert found.status == ("measured" if share < 1 else "prior")
 
 
-@pytest.mark.parametrize("evidence", [SOME_EVIDENCE, MIN_EVIDENCE - 0.01])
-def test_some_evidence_moves_the_prior(evidence: float):
-    found = _on_views(phi_error=0.15, evidence=evidence)
-    assert (found.phi, found.phi_error) == pytest.approx(_blend(0.1, 0.15, PRIOR[0]))
-    assert 0.1 < found.phi < PRIOR[0]
+@pytest.mark.parametrize("evidence", [0.0, 0.9 * SOME_EVIDENCE, SOME_EVIDENCE, 0.9 * MIN_EVIDENCE])
+def test_without_a_highlight_what_remains_likely_is_published(evidence: float):
+    found = verdict_on_views(_lobe(evidence=evidence, psi_median=0.05, psi_upper=0.2), True)
+    assert (found.phi, found.psi, found.psi_upper) == (0.3, 0.05, 0.2)
     # However small the errors.
-    assert (found.phi_confidence, found.psi_confidence) == ("low", "low")
+    confidence = "low" if evidence >= SOME_EVIDENCE else "none"
+    assert (found.phi_confidence, found.psi_confidence) == (confidence, confidence)
     assert found.status == "prior"
 
 
-@pytest.mark.parametrize("evidence", [SOME_EVIDENCE - 0.01, 0.0, math.nan])
-def test_without_evidence_the_prior_stays(evidence: float):
-    assert _on_views(evidence=evidence) == Verdict(
-        phi=PRIOR[0], psi=PRIOR[1], phi_error=PRIOR_ERROR, psi_error=PRIOR_ERROR, status="prior"
-    )
+def test_no_highlight_where_one_would_show_bounds_psi():
+    # A cost that a lobe of any roughness but the largest raises by 100 for psi = 1.
+    phis = np.linspace(0, 1, 21)
+    seen = 100 * (1 - phis**4)
+    terms = np.stack([np.ones(21), np.zeros(21), seen], axis=1)
+    found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
+    assert found.evidence == 0
+    assert found.psi_median < 0.15
+    assert found.psi_median < found.psi_upper < 0.8
+    # Where nothing was asked nothing is known.
+    terms[:, 2] = 0
+    found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
+    assert found.psi_median == pytest.approx(0.5, abs=0.01)
+    assert found.psi_upper == pytest.approx(0.95, abs=0.01)
+    assert found.phi_median == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
     # Some of phi may be the footprint's, or all of it.
-    sharp = _on_views()
     for unresolved, confidence in ((0.03, "high"), (0.15, "low")):
-        found = _on_views(unresolved=unresolved)
-        assert (found.phi, found.psi) == (sharp.phi, sharp.psi)
-        assert found.phi_error == pytest.approx(math.hypot(sharp.phi_error, unresolved))
+        found = verdict_on_views(_lobe(unresolved=unresolved), True)
+        assert found.psi == 0.8
+        assert found.phi_error == pytest.approx(math.hypot(0.02, unresolved))
         # A blurred highlight holds the same light.
         assert found.psi_error == pytest.approx(
-            math.hypot(sharp.psi_error, sharp.psi / 3 * min(unresolved / 0.1, 1)), rel=0.03
+            math.hypot(0.05, 0.8 / 3 * min(unresolved / 0.1, 1)), rel=0.03
         )
         assert found.phi_confidence == confidence
-        assert found.status == ("measured" if confidence == "high" else "prior")
 
 
 def test_what_no_frame_sees_is_unseen():
-    found = verdict_on_views(NO_FIT, NO_FIT, math.nan, math.nan, PRIOR, False)
-    assert (found.phi, found.psi, found.status) == (*PRIOR, "unseen")
-    assert found.phi_error == found.psi_error == PRIOR_ERROR
+    found = verdict_on_views(None, False)
+    assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.5, 1.0, "unseen")
+    assert found.phi_error == found.psi_error == pytest.approx(NOTHING_KNOWN)
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.
-    assert verdict_on_views(NO_FIT, NO_FIT, math.nan, math.nan, PRIOR, True).status == "prior"
+    assert verdict_on_views(None, True).status == "prior"
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_one_frame_measures_where_it_tells_roughnesses_apart(keep: bool):
-    found = verdict_on_frame((0.1, 0.02), 0.8, 0.5, PRIOR, True, keep)
+    found = verdict_on_frame((0.1, 0.02), 0.8, 0.5, True, keep)
     assert (found.phi, found.psi, found.phi_error, found.status) == (0.1, 0.8, 0.02, "measured")
     assert math.isnan(found.psi_error)
 
@@ -122,16 +110,16 @@ def test_one_frame_measures_where_it_tells_roughnesses_apart(keep: bool):
 @pytest.mark.parametrize(
     ("flat", "evidence"), [(0.02, 0.09), (0.5 / math.sqrt(12), 0.5), (0.02, math.nan)]
 )
-def test_the_paper_keeps_what_it_finds_and_the_others_take_the_prior(flat: float, evidence: float):
-    kept = verdict_on_frame((0.1, flat), 0.8, evidence, PRIOR, True, True)
+def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, evidence: float):
+    kept = verdict_on_frame((0.1, flat), 0.8, evidence, True, True)
     assert (kept.phi, kept.psi, kept.status) == (0.1, 0.8, "failed")
-    prior = verdict_on_frame((0.1, flat), 0.8, evidence, PRIOR, True, False)
-    assert (prior.phi, prior.psi, prior.status) == (*PRIOR, "prior")
-    assert prior.phi_error == prior.psi_error == PRIOR_ERROR
+    prior = verdict_on_frame((0.1, flat), 0.8, evidence, True, False)
+    assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "prior")
+    assert prior.phi_error == prior.psi_error == pytest.approx(NOTHING_KNOWN)
 
 
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize(("seen", "status"), [(True, "prior"), (False, "unseen")])
 def test_without_a_fit_there_is_nothing_to_keep(keep: bool, seen: bool, status: str):
-    found = verdict_on_frame(NO_FIT, math.nan, math.nan, PRIOR, seen, keep)
-    assert (found.phi, found.psi, found.status) == (*PRIOR, status)
+    found = verdict_on_frame((math.nan, math.nan), math.nan, math.nan, seen, keep)
+    assert (found.phi, found.psi, found.status) == (*NEUTRAL, status)

@@ -262,6 +262,15 @@ class FittedObject(MeasuredObject):
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
+    psi_upper: Annotated[float, Fact(FIT, "psiUpper95", "float", 1.0, """What psi exceeds with a
+        probability of 5 %: a bound also where no highlight shows; without unit.""", low=0,
+        high=1)] = math.nan
+    shown_phi: Annotated[float, Fact(FIT, "shownPhi", "float", 0.5, """The phi that the material
+        shows in place of the measurement, where it is authored: what is usual for the object's
+        class (option --unmeasured class); without unit.""", low=0, high=1)] = math.nan
+    shown_psi: Annotated[float, Fact(FIT, "shownPsi", "float", 0.5, """The psi that the material
+        shows in place of the measurement, where it is authored; no more than psiUpper95; without
+        unit.""", low=0, high=1)] = math.nan
     phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none",
         _CONFIDENCE.format("phi"), tokens=_CONFIDENCES)] = "none"
     psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none",
@@ -274,9 +283,10 @@ class FittedObject(MeasuredObject):
         specular lobe): what the highlights explain; 0 is nothing, 1 is everything; without
         unit.""", high=1)]
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
-        the photographs, and their stated errors are small; prior: the values of the class, together
-        with what the photographs say; unseen: no photograph shows the object; failed: method paper
-        alone, which keeps its minimum even where the photograph does not determine it.""",
+        the photographs, and their stated errors are small; prior: they do not determine both, whose
+        values are the medians of what remains likely if all was equally likely before; unseen: no
+        photograph shows the object; failed: method paper alone, which keeps its minimum even where
+        the photograph does not determine it.""",
         tokens=("measured", "prior", "unseen", "failed"))]
     target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
         shows the highlight best, counted from 0 (time code minus 1); -1 where there is none.""",
@@ -293,6 +303,12 @@ class FittedObject(MeasuredObject):
     mean_color: Colour = (0.0, 0.0, 0.0)  # area-weighted base colour, linear
 
     @property
+    def shown(self) -> tuple[float, float]:
+        """phi and psi of the material."""
+        usual = math.isfinite(self.shown_phi)
+        return (self.shown_phi, self.shown_psi) if usual else (self.phi, self.psi)
+
+    @property
     def is_known(self) -> bool:
         """Whether there is a lobe to show."""
         return math.isfinite(self.phi) and math.isfinite(self.psi)
@@ -300,8 +316,8 @@ class FittedObject(MeasuredObject):
     @property
     def summary(self) -> dict[str, Any]:
         """What a summary says of the object, JSON."""
-        names = ("phi", "psi", "phi_error", "psi_error", "phi_confidence", "psi_confidence",
-                 "status", "evidence", "target_frame")
+        names = ("phi", "psi", "phi_error", "psi_error", "psi_upper", "phi_confidence",
+                 "psi_confidence", "status", "evidence", "target_frame")
         row = {name: getattr(self, name) for name in names}
         row |= {name: round(value, 4) if math.isfinite(value) else None
                 for name, value in row.items() if isinstance(value, float)}

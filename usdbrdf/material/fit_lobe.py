@@ -13,6 +13,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.material.verdict import (
     NOTHING_KNOWN,
+    POSTERIOR,
     SOME_EVIDENCE,
     LobeEstimate,
     averaged,
@@ -87,7 +88,7 @@ def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
         of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
     of_rays /= np.sqrt(len(found))
     errors = np.minimum(np.hypot(stated.mean(axis=0), of_rays), NOTHING_KNOWN)
-    names = ("phi", "psi", "unresolved", "cost", "evidence")
+    names = ("phi", "psi", "unresolved", "cost", "evidence", *POSTERIOR)
     return LobeEstimate(
         **{name: float(np.mean([getattr(one, name) for one in found])) for name in names},
         phi_error=float(errors[0]),

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +24,9 @@ from usdbrdf.material.fit_target import (
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
-    NEUTRAL,
+    LobeEstimate,
     Verdict,
-    class_prior,
+    usual_lobe,
     verdict_on_frame,
     verdict_on_views,
 )
@@ -61,6 +61,7 @@ class ObjectFit(NamedTuple):
     phi, psi, phi_error, psi_error  the paper's parameters and their standard deviations
     unresolved    share of the highlight that the pixels do not resolve
     cost          at the minimum; evidence: 1 - cost / cost without a lobe
+    phi_median, psi_median, psi_upper  of what remains likely, see ``LobeEstimate``
     num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
     """
 
@@ -71,6 +72,9 @@ class ObjectFit(NamedTuple):
     unresolved: float = math.nan
     cost: float = math.nan
     evidence: float = math.nan
+    phi_median: float = math.nan
+    psi_median: float = math.nan
+    psi_upper: float = math.nan
     num_samples: int = 0
     target: int = -1
 
@@ -86,7 +90,7 @@ class ObjectFit(NamedTuple):
 
     def rounded(self) -> ObjectFit:
         """Without the digits that depend on how many threads the linear algebra had."""
-        return ObjectFit._make([*(round(number, 4) for number in self[:7]), *self[7:]])
+        return ObjectFit._make([*(round(number, 4) for number in self[:-2]), *self[-2:]])
 
 
 def survey_frames(
@@ -170,7 +174,7 @@ def fit_object(
         )
         if lobe is None:
             return ObjectFit(num_samples=used, target=target)
-        return ObjectFit(*lobe[:7], used, target)
+        return ObjectFit(*lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper, used, target)
     faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
     third = np.full(len(faces), 1 / 3, np.float32)
     shines = lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5
@@ -184,15 +188,23 @@ def fit_object(
     # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
     error = (found.phi_high - found.phi_low) / math.sqrt(12)
     return ObjectFit(
-        found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence, used, target
-    )
+        found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence,
+        num_samples=used, target=target,
+    )  # fmt: skip
 
 
-def judged(found: ObjectFit, obj: SceneObject, method: str, observed: bool) -> Verdict:
-    """What to publish of a fit; ``observed``: some frame shows the object."""
-    phi, psi = (found.phi, found.phi_error), (found.psi, found.psi_error)
-    prior = class_prior(obj.class_name, obj.label) if observed else NEUTRAL
-    if method == "views":
-        return verdict_on_views(phi, psi, found.unresolved, found.evidence, prior, observed)
-    keep = method == "paper"
-    return verdict_on_frame(phi, found.psi, found.evidence, prior, observed, keep)
+def judged(found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bool) -> Verdict:
+    """What to publish and to show of a fit; ``observed``: some frame shows the object."""
+    if options.method == "views":
+        lobe = LobeEstimate(
+            found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
+            found.evidence, (0.0, 0.0), found.phi_median, found.psi_median, found.psi_upper,
+        )  # fmt: skip
+        verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
+    else:
+        keep, phi = options.method == "paper", (found.phi, found.phi_error)
+        verdict = verdict_on_frame(phi, found.psi, found.evidence, observed, keep)
+    usual = usual_lobe(obj.class_name, obj.label) if options.unmeasured == "class" else None
+    if usual is None or verdict.status != "prior":
+        return verdict
+    return replace(verdict, shown_phi=usual[0], shown_psi=min(usual[1], verdict.psi_upper))

@@ -1,5 +1,5 @@
 """From a cost over roughness and specular to their values and how sure they are; and what to
-publish of these: measured values, or the class prior with what the frames say."""
+publish of these: measured values, or what remains likely where the frames determine none."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Double
 
 _PSI_GRID = np.linspace(0, 1, 201)
+# What an estimate says of the posterior beside its least cost.
+POSTERIOR = ("phi_median", "psi_median", "psi_upper")
 _MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
 # Standard deviation of a number in [0, 1] of which nothing is known.
@@ -25,7 +27,9 @@ class LobeEstimate(NamedTuple):
     tell, which near NOTHING_KNOWN say just that; unresolved, how much of phi may be due to the
     samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any specular
     light; of_rays, what the rays' noise alone does to phi and psi, beside the stated errors until
-    ``mean_of_repeats`` adds it to them."""
+    ``mean_of_repeats`` adds it to them. phi_median, psi_median, psi_upper: medians of either, and
+    what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
+    highlight shows, the frames still say that psi is small or phi large."""
 
     phi: float
     psi: float
@@ -35,6 +39,9 @@ class LobeEstimate(NamedTuple):
     cost: float
     evidence: float
     of_rays: tuple[float, float] = (0.0, 0.0)
+    phi_median: float = 0.5
+    psi_median: float = 0.5
+    psi_upper: float = 1.0
 
 
 def lobe_from_costs(
@@ -64,6 +71,8 @@ def lobe_from_costs(
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
+    psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (0.5, 0.95))
+    (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
         psi=best_psi,
@@ -72,6 +81,9 @@ def lobe_from_costs(
         unresolved=footprint,
         cost=least / max(freedom, 1),
         evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
+        phi_median=phi_median,
+        psi_median=psi_median,
+        psi_upper=psi_upper,
     )
 
 
@@ -97,7 +109,7 @@ def averaged(
     def of(name: str) -> Double:
         return np.array([getattr(estimate, name) for estimate in estimates])
 
-    means = {name: float(weight @ of(name)) for name in ("phi", "psi", "unresolved")}
+    means = {name: float(weight @ of(name)) for name in ("phi", "psi", "unresolved", *POSTERIOR)}
     for name in ("phi", "psi"):
         scatter = of(f"{name}_error") ** 2 + (of(name) - means[name]) ** 2
         means[f"{name}_error"] = min(math.sqrt(float(weight @ scatter)), float(NOTHING_KNOWN))
@@ -118,35 +130,30 @@ def _vertex(phis: Double, profile: Double) -> float:
     return float(np.clip(x[1] - b / (2 * a), x[0], x[2]))
 
 
+def _quantiles(density: Double, values: Double, shares: Sequence[float]) -> tuple[float, ...]:
+    """Below which so large ``shares`` of the probability of ascending ``values`` lie."""
+    below = np.cumsum(density) - density / 2
+    return tuple(float(np.interp(share, below, values)) for share in shares)
+
+
 def _deviation(density: Double, values: Double, about: float) -> float:
     """Root mean square distance from ``about``."""
     return float(np.sqrt((density * (values - about) ** 2).sum()))
 
 
-PRIOR_ERROR = calibration.number("prior.error")
-NEUTRAL = calibration.pair("prior.neutral")
+# Of [0, 1], where nothing is known.
+NEUTRAL = (0.5, 0.5)
 _OF_WORD = calibration.pairs("prior.classes")
 
 
-def class_prior(class_name: str, label: str) -> tuple[float, float]:
-    """(phi, psi) for an object's class, else for its name, else a neutral dielectric."""
+def usual_lobe(class_name: str, label: str) -> tuple[float, float] | None:
+    """(phi, psi) as usual for an object's class, else for its name; None where neither is known."""
     for text in (class_name, label):
         words = text.lower().replace("-", "_").replace(" ", "_").split("_")
         for word in reversed(words):
             if word in _OF_WORD:
                 return _OF_WORD[word]
-    return NEUTRAL
-
-
-def with_prior(
-    value: float, error: float, prior: float, nothing_known: float
-) -> tuple[float, float]:
-    """(value, error) of a number in [0, 1] estimated as ``value`` with a standard deviation of
-    ``error``, together with its prior. An error of ``nothing_known`` leaves the prior alone."""
-    precision = max(1 / max(error, 1e-3) ** 2 - 1 / nothing_known**2, 0.0)
-    of_prior = 1 / PRIOR_ERROR**2
-    mean = (precision * value + of_prior * prior) / (precision + of_prior)
-    return mean, (precision + of_prior) ** -0.5
+    return None
 
 
 MIN_EVIDENCE = calibration.number("verdict.min_evidence")
@@ -161,7 +168,9 @@ _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 @dataclass(frozen=True)
 class Verdict:
     """phi, psi and their standard deviations (NaN: not known); status "measured", "prior",
-    "unseen" or "failed"; confidence in either, "high", "low" or "none"."""
+    "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper: what psi exceeds
+    with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown instead of what
+    was found (NaN: that itself)."""
 
     phi: float
     psi: float
@@ -170,49 +179,41 @@ class Verdict:
     status: str
     phi_confidence: str = "none"
     psi_confidence: str = "none"
+    psi_upper: float = math.nan
+    shown_phi: float = math.nan
+    shown_psi: float = math.nan
 
 
-def verdict_on_views(
-    phi: tuple[float, float],
-    psi: tuple[float, float],
-    unresolved: float,
-    evidence: float,
-    prior: tuple[float, float],
-    seen: bool,
-) -> Verdict:
-    """On a fit of many views. phi, psi: (value, standard deviation), NaN without a fit; unresolved,
-    evidence: see LobeEstimate; prior: (phi, psi) of the class.
+def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
+    """On a fit of many views; None: there were too few samples for one.
 
-    Each is published as the mean of what the frames say and of the prior, weighted by their
-    precisions: where the frames determine it, that is what they say. Of a highlight that is hardly
-    larger than the samples' footprint they say something, but the stated error includes what the
-    footprint may have done. Without evidence the prior stands alone.
+    What the frames determine is published as found. Of a highlight that is hardly larger than the
+    samples' footprint they say something, but the stated error includes what the footprint may have
+    done. Where they do not determine both numbers, the medians of what remains likely are
+    published: no highlight is knowledge too. Names and classes of objects tell nothing here.
     """
+    if lobe is None:
+        errors = float(NOTHING_KNOWN), float(NOTHING_KNOWN)
+        return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
+    of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
+    phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved), NOTHING_KNOWN)
+    psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 
-    def published(
-        number: tuple[float, float], of_class: float, limit: float, blurred: float
-    ) -> tuple[float, float, str]:
-        if evidence >= SOME_EVIDENCE:  # never where it is NaN, without a fit
-            value, error = with_prior(*number, of_class, NOTHING_KNOWN)
-            error = min(math.hypot(error, blurred), NOTHING_KNOWN)
-            sure = evidence >= MIN_EVIDENCE and error <= limit
-            return value, error, "high" if sure else "low"
-        return of_class, PRIOR_ERROR, "none"
+    def confidence(error: float, limit: float) -> str:
+        if lobe.evidence >= MIN_EVIDENCE and error <= limit:
+            return "high"
+        return "low" if lobe.evidence >= SOME_EVIDENCE else "none"
 
-    phi_mean, phi_error, of_phi = published(phi, prior[0], MAX_PHI_ERROR, unresolved)
-    blurred = _PSI_SHARE * psi[0] * min(unresolved / max(phi[0], 0.01), 1.0)
-    psi_mean, psi_error, of_psi = published(psi, prior[1], MAX_PSI_ERROR, blurred)
-    status = "measured" if of_phi == of_psi == "high" else "prior" if seen else "unseen"
-    return Verdict(phi_mean, psi_mean, phi_error, psi_error, status, of_phi, of_psi)
+    sure = confidence(phi_error, MAX_PHI_ERROR), confidence(psi_error, MAX_PSI_ERROR)
+    phi = lobe.phi if sure[0] == "high" else lobe.phi_median
+    psi = lobe.psi if sure[1] == "high" else lobe.psi_median
+    status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
+    upper = max(lobe.psi_upper, psi)
+    return Verdict(phi, psi, float(phi_error), float(psi_error), status, *sure, psi_upper=upper)
 
 
 def verdict_on_frame(
-    phi: tuple[float, float],
-    psi: float,
-    evidence: float,
-    prior: tuple[float, float],
-    seen: bool,
-    keep: bool,
+    phi: tuple[float, float], psi: float, evidence: float, seen: bool, keep: bool
 ) -> Verdict:
     """On a fit of one frame. phi: (value, standard deviation of the flat stretch), NaN without a
     fit; keep: publish the minimum even where it is no measurement."""
@@ -221,4 +222,5 @@ def verdict_on_frame(
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
         return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
-    return Verdict(*prior, PRIOR_ERROR, PRIOR_ERROR, "prior" if seen else "unseen")
+    unknown = float(NOTHING_KNOWN)
+    return Verdict(*NEUTRAL, unknown, unknown, "prior" if seen else "unseen", psi_upper=1.0)

@@ -64,12 +64,12 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
                 num_pixels=own.num_samples,
                 method=options.method,
                 mapping=options.mapping,
-                **vars(judged(own, obj, options.method, maps.is_observed(i))),
+                **vars(judged(own, obj, options, maps.is_observed(i))),
             )
             for i, (obj, own) in enumerate(zip(maps.scene.objects, found, strict=True))
         ]
         measured = sum(item.status == "measured" for item in objects)
-        say(f"fit: {measured} of {len(objects)} objects measured, the others by their class")
+        say(f"fit: {measured} of {len(objects)} objects measured")
         if options.method == "views":
             objects = _refined(run, asset, maps, lit, reader, objects, lightmap_filter, options)
         layer = run.output(f"layers/{asset.layer('material').name}")

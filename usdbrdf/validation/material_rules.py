@@ -21,6 +21,7 @@ _TOLERANCE = 1e-4
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
 _MAPPINGS = (_MEASURED, "matched")
+_SHOWN = ("usdBrdf:fit:shownPhi", "usdBrdf:fit:shownPsi")
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
 
@@ -122,6 +123,8 @@ def _contradictions(scene: AssetStage, item: Usd.Prim) -> Iterator[tuple[Usd.Att
     """The attributes of an object's material in our layers that show another lobe than its record
     stands for, and what they should be; what an artist changes on purpose is theirs."""
     surface, (phi, psi) = scene.surface_of(item), (authored(item, name) for name in _RECORD[:2])
+    usual = [authored(item, name) for name in _SHOWN]
+    phi, psi = (phi, psi) if None in usual else usual
     if surface is None or _mapping(item) not in _MAPPINGS or phi is None or psi is None:
         return
     if not (0 <= phi <= 1 and 0 <= psi <= 1):

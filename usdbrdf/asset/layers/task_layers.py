@@ -265,7 +265,7 @@ def write_material_layer(
         author_record(over(layer, item.prim_path), item)
         shown = NO_LOBE
         if item.is_known:
-            shown = preview_surface_from_fit(item.phi, item.psi, item.mapping)
+            shown = preview_surface_from_fit(*item.shown, item.mapping)
             lobe(layer, material, shown.roughness, shown.ior)
             shader = over(layer, f"{material}/{SURFACE}")
             author_inputs(shader, Types.Float, metallic=0.0)
@@ -274,8 +274,8 @@ def write_material_layer(
         if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
             networks[material] = (shown, texture)
     looks = aov_looks(layer, scopes, objects)
-    for look, parameter in (("roughness", "phi"), ("specular", "psi")):
-        greys = [(getattr(i, parameter),) * 3 if i.is_known else None for i in objects]
+    for parameter, look in enumerate(("roughness", "specular")):
+        greys = [(i.shown[parameter],) * 3 if i.is_known else None for i in objects]
         looks[look] = author_look_materials(layer, scopes, look, objects, greys)
     author_looks(layer, draft, looks, selected=SHADED)
     if materialx:
