@@ -21,8 +21,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
-from usdbrdf.asset.layers.looks import VARIANT_SET as LIGHTS
-from usdbrdf.asset.layers.task_layers import EMISSIVE
+from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage

@@ -9,9 +9,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from usdbrdf.asset.layers.input_usd import BINDING
 from usdbrdf.asset.layers.looks import LIT, SHADED
-from usdbrdf.asset.layers.looks import VARIANT_SET as LIGHTS
 from usdbrdf.asset.layers.looks import VARIANT_SET as LOOKS
-from usdbrdf.asset.layers.task_layers import EMISSIVE, USDLUX
+from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 

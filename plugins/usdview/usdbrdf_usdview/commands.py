@@ -2,9 +2,14 @@
 
 from pxr.Usdviewq.qt import QtWidgets
 
-from usdbrdf.asset.properties import facts_of
-from usdbrdf.asset.readers.scene import capture_camera
-from usdbrdf_usdview.fit_facts import METHOD, TARGET_FRAME, fitted_prim, time_code_of_frame
+from usdbrdf_usdview.fit_facts import (
+    METHOD,
+    TARGET_FRAME,
+    capture_camera,
+    facts_of,
+    fitted_prim,
+    time_code_of_frame,
+)
 from usdbrdf_usdview.fit_rows import fit_rows
 
 _NOT_FITTED = "Select an object that usdbrdf has fitted."
