@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from usdbrdf import calibration
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,
@@ -37,7 +36,6 @@ from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
 _MAX_OBJECTS = 65_535
-_OPEN = calibration.number("surroundings.least_share")
 
 
 class LabelTable(NamedTuple):
@@ -295,7 +293,6 @@ def scan_from_parts(
         usd_geometry=geometry.usd_geometry,
         object_prims=geometry.object_prims,
         turned_faces=sides.turned,
-        is_open=1 - hit_share > _OPEN,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )

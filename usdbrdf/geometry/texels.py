@@ -58,7 +58,6 @@ def texels_from_atlas(scene: Scene, resolution: Int) -> Texels:
         first_texel=np.searchsorted(pixel, first_pixel),
         nearest_texel=nearest,
         corner_pixel=corner_pixel,
-        far_objects=tuple(np.flatnonzero(scene.is_far).tolist()),
     )
 
 

@@ -13,7 +13,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.surroundings import RESOLUTION, lat_long_uv
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.kernel import kernel
@@ -143,15 +142,11 @@ def charts_of_scene(
     given  per object (F_i, 3, 2), or None
     """
     corner_uv, resolution = unwrap(scene, sizes)
-    for far in np.flatnonzero(scene.is_far):
-        faces = scene.objects[far].faces
-        corner_uv[faces] = lat_long_uv(scene.points[scene.triangles[faces]])
-        resolution[far] = RESOLUTION
     of_objects = sizes.of_objects(scene)
     for i, (obj, uv) in enumerate(zip(scene.objects, given, strict=True)):
         corners = scene.points[scene.triangles[obj.faces]]
         side = None if uv is None else atlas_side(uv, corners, of_objects[i])
-        if uv is not None and side is not None and not obj.far:
+        if uv is not None and side is not None:
             corner_uv[obj.faces], resolution[i] = uv, side
             say(f"texture: {obj.identifier} keeps the texture coordinates that it came with")
     return {"corner_uv": corner_uv, "resolution": resolution}
@@ -175,10 +170,10 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     texels = area / sizes.side.astype(np.float64) ** 2
     for obj in scene.objects:
         side = math.ceil(math.sqrt(texels[obj.faces].sum()))
-        if side > MAX_SIDE and not obj.far:
+        if side > MAX_SIDE:
             raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
-    count = np.array([obj.num_faces * (not obj.far) for obj in scene.objects], np.int64)
+    count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     result = run_child(
         "usdbrdf.geometry.unwrap:unwrap_objects",
         {
@@ -204,8 +199,6 @@ def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -
     corner_uv = np.zeros((len(triangles), 3, 2), np.float32)
     resolution = np.zeros((len(arrays["first"]), 2), np.int32)
     for i, (first, count) in enumerate(zip(arrays["first"], arrays["count"], strict=True)):
-        if not count:
-            continue
         faces = slice(int(first), int(first + count))
         _, own, corners = compact(points, triangles[faces])
         sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])

@@ -205,7 +205,6 @@ def _means_without_lobes(
     their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
     frames, texels = reader.frames, lit.texels
     owner, level, samples = texels.object_index(), _level(before.lit), before.samples
-    far = texels.is_far
 
     def means(part: slice) -> dict[str, Float]:
         """Of some texels, going on from the last saved state of an interrupted run."""
@@ -220,7 +219,6 @@ def _means_without_lobes(
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
-            taken &= ~far[some.texel]
             texel, camera = some.texel[taken], frames.camera(some.frame)
             of_texel = Lobes(lobes.phi[owner[texel]], lobes.psi[owner[texel]])
             own_seed = seed + len(frames) + some.frame

@@ -61,7 +61,6 @@ class Scan:
     and object_prims are ``ScanGeometry``'s.
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
-    is_open        frames look past the mesh at what lies around it
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -77,6 +76,5 @@ class Scan:
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
     turned_faces: Bool | None = None
-    is_open: bool = False
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

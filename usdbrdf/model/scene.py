@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from usdbrdf.model.arrays import Bool, Float, Int
+from usdbrdf.model.arrays import Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneObject:
-    """One object: its mesh prim, its USD identifier (names its textures), its faces in the soup.
-
-    far  it is no object but what lies around the scan: a dome that only shines
-    """
+    """One object: its mesh prim, its USD identifier (names its textures), its faces in the soup."""
 
     prim_path: str
     identifier: str
@@ -22,7 +17,6 @@ class SceneObject:
     class_name: str
     first_face: int
     num_faces: int
-    far: bool = False
 
     @property
     def faces(self) -> slice:
@@ -41,16 +35,3 @@ class Scene:
     corner_normals: Float
     face_object: Int
     corner_uv: Float | None = None
-
-    @property
-    def is_far(self) -> Bool:
-        """(num_objects,): see ``SceneObject.far``."""
-        return np.array([obj.far for obj in self.objects], np.bool_)
-
-    @property
-    def diagonal_m(self) -> float:
-        """Of the box around all that is not far, metres."""
-        if not self.is_far.any():
-            return float(np.linalg.norm(np.ptp(self.points, axis=0)))
-        near = self.points[self.triangles[~self.is_far[self.face_object]]]
-        return float(np.linalg.norm(np.ptp(near.reshape(-1, 3), axis=0)))

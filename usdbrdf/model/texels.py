@@ -80,7 +80,6 @@ class Texels:
     first_texel     (num_objects + 1,) int64
     nearest_texel   (P,) int32: for every flat pixel the texel that it shows; its own, or (gutter)
                     the nearest one of the same atlas; -1 only in an atlas without texels
-    far_objects     numbers of the objects that are surroundings
     corner_pixel    (F, 3, 2) float32: x right, y down, in pixels of the face's atlas
     """
 
@@ -99,7 +98,6 @@ class Texels:
     first_texel: Long
     nearest_texel: Int
     corner_pixel: Float
-    far_objects: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.face)
@@ -134,14 +132,6 @@ class Texels:
         """(...): the mean over one object's surface of per-texel values (T, ...)."""
         own = self.of_object(index)
         return np.average(values[own], axis=0, weights=np.maximum(self.area[own], 1e-12))
-
-    @property
-    def is_far(self) -> Bool:
-        """(T,): the texel shows the surroundings, see ``SceneObject.far``."""
-        far = np.zeros(len(self), np.bool_)
-        for index in self.far_objects:
-            far[self.of_object(index)] = True
-        return far
 
     def object_index(self) -> Int:
         """(T,) int32, the object of each texel."""

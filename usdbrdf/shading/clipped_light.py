@@ -171,7 +171,7 @@ def estimate_clipped_light(
 
 def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
     """Measured texels spread over all objects, denser near the lamps, and their segments."""
-    usable = np.flatnonzero(measured & texels.interior & ~texels.is_far & (groups.group < 0))
+    usable = np.flatnonzero(measured & texels.interior & (groups.group < 0))
     owner = texels.object_index()[usable]
     normal = texels.normal[usable]
     axis = np.abs(normal).argmax(axis=1)

@@ -63,11 +63,8 @@ def find_emitters(
     light = radiance.mean(axis=1)
     shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
-    far = texels.is_far
-    shines &= light > np.median(light[~far])
+    shines &= light > np.median(light)
     shines &= clipped | (light >= unknown_lamp)
-    # Surroundings reflect nothing that would be known; what they send shines.
-    shines |= far
     known = seen | clipped
     emissive = np.zeros(len(texels), np.bool_)
     num_objects = len(texels.resolution)
@@ -136,7 +133,7 @@ def albedo_map(
     need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
     is known are NEUTRAL.
     """
-    floor = _DARK * float(np.median(irradiance[~texels.is_far].mean(axis=1)))
+    floor = _DARK * float(np.median(irradiance.mean(axis=1)))
     albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))
     reflects = known & ~emissive
     over = (albedo > 1).any(axis=1) & reflects & lit_enough
@@ -158,22 +155,15 @@ def by_tiles(
     run: TaskRun, texels: Texels, name: str, label: str, trace: Callable[[Array, Array], Arrays]
 ) -> Arrays:
     """Arrays of all texels, of which ``trace`` finds those of one tile after the other, given their
-    numbers and patches; each is kept under ``name``, for a run that goes on after a kill. Texels of
-    the surroundings, on which nothing shines, are 0."""
+    numbers and patches; each is kept under ``name``, for a run that goes on after a kill."""
     order, patch = tiles_of_texels(texels)
-    near = ~texels.is_far[order]
-    order, patch = order[near], patch[near]
     tiles = whole_tiles(patch, _TILE)
     found = [
         run.checkpoint(f"{name}-{number}", partial(trace, order[part], patch[part]))
         for number, part in enumerate(progress(tiles, total=len(tiles), label=label, unit="tiles"))
     ]
-    everywhere = {}
-    for key in found[0]:
-        values = np.concatenate([some[key] for some in found])
-        everywhere[key] = np.zeros((len(texels), *values.shape[1:]), values.dtype)
-        everywhere[key][order] = values
-    return everywhere
+    back = np.argsort(order)
+    return {key: np.concatenate([some[key] for some in found])[back] for key in found[0]}
 
 
 def trace_irradiance(

@@ -178,13 +178,11 @@ def texel_sizes_from_frames(
     count = len(scene.triangles)
     normals = face_normals_and_angles(scene.points, scene.triangles)[0]
     logarithm, pixels = np.zeros(count), np.zeros(count)
-    far = scene.is_far[scene.face_object]
     for i in range(len(frames)):
         camera = frames.camera(i)
         small = camera.at_width(min(camera.width, _MOST_ACROSS))
         face, point = (found.reshape(-1, *found.shape[2:]) for found in visible_faces(rays, small))
-        near = (face >= 0) & ~far[face]
-        way, face = (point - camera.eye)[near], face[near]
+        way, face = (point - camera.eye)[face >= 0], face[face >= 0]
         distance = np.linalg.norm(way, axis=1)
         cosine = np.abs((way * normals[face]).sum(axis=1)) / distance
         size = distance / math.sqrt(camera.intrinsics[0] * camera.intrinsics[1])
@@ -203,6 +201,6 @@ def texel_sizes_from_frames(
     own = np.where(of_object[1] > 0, of_object[0] / np.maximum(of_object[1], 1), anywhere)
     coarse = own[scene.face_object] + math.log(_UNSEEN)
     side = np.exp(np.where(pixels > 0, logarithm / np.maximum(pixels, 1), coarse))
-    area = np.where(far, 0, doubled_areas(scene.points, scene.triangles) / 2)
+    area = doubled_areas(scene.points, scene.triangles) / 2
     side *= math.sqrt(max(1.0, float((area / side**2).sum()) / (_PACKING * max_texels)))
     return TexelSizes(side.astype(np.float32), pixels.astype(np.float32))

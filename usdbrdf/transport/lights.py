@@ -155,14 +155,9 @@ def lights_from_radiance(
         ]
     doubled = doubled_areas(scene.points, scene.triangles)
     area = doubled / 2
-    counted = area.copy()
-    far = scene.is_far[scene.face_object]
-    if far.any():
-        # Surroundings count as a sphere about the scene would, however far off they are.
-        counted[far] *= np.pi * scene.diagonal_m**2 / area[far].sum()
-    scene_mean = float((mean * counted).sum() / max(counted.sum(), 1e-30))
+    scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
     bright = (mean > brighter_than * scene_mean) & (area > 0)
-    share = np.where(bright, mean * counted, 0)
+    share = np.where(bright, mean * area, 0)
     total = share.sum()
     face = np.flatnonzero(bright).astype(np.int32)
     density = np.zeros(len(area), np.float32)

@@ -32,7 +32,7 @@ class TexturedScene:
     @cached_property
     def diagonal_m(self) -> float:
         """Of the scene's bounding box, metres."""
-        return self.scene.diagonal_m
+        return float(np.linalg.norm(np.ptp(self.scene.points, axis=0)))
 
     def texture(self, values: Float) -> SurfaceTexture:
         """Per-texel values (T, 3) as a texture that rays can look up."""
