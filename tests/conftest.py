@@ -59,8 +59,6 @@ NIGHTLY = (
     "physics/test_recovery.py::"
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
-    "test_identity.py::test_damaged_kernels_are_compiled_again",
-    "test_identity.py::test_processes_that_compile_at_once_agree",
 )
 
 

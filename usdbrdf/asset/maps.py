@@ -208,6 +208,7 @@ class AssetMaps:
             if aov_path(self.stage, obj.prim_path, aov) is not None:
                 picture = read_exr(self._file(obj, aov))
                 values[self.texels.of_object(i)] = self.texels.from_image(i, picture)
+        self._read[aov] = values
         return values
 
     def _decoded(self, aov: str) -> Float:
@@ -220,7 +221,7 @@ class AssetMaps:
         path = aov_path(self.stage, obj.prim_path, aov)
         if path is None or not path.is_file():
             raise InputRefused(
-                f"<{obj.prim_path}>: its map {aov!r} is missing ({path}). Run the step that makes "
+                f"<{obj.prim_path}>: its map {aov!r} is missing ({path}). Run the task that makes "
                 "it again. [asset.incomplete]"
             )
         return path

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from usdbrdf.transport.brdf import F0_OF_PSI, alpha_of_phi
 from usdbrdf.transport.renderer_match import measured_lobe, shown_lobe
 
 
@@ -29,11 +30,11 @@ def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") 
     matched   F0 and the diffuse colour as renderers need them to show that (``renderer_match``)
     F0 = ((ior - 1) / (ior + 1))^2: ior = (1 + sqrt(F0)) / (1 - sqrt(F0)).
     """
-    f0, diffuse = 0.08 * psi, 1.0
+    f0, diffuse = F0_OF_PSI * psi, 1.0
     if mapping == "matched":
         f0, diffuse = (float(value) for value in shown_lobe(phi, psi))
     sqrt_f0 = math.sqrt(f0)
-    return PreviewLobe(math.sqrt(max(0.001, phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
+    return PreviewLobe(math.sqrt(alpha_of_phi(phi)), (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)
 
 
 def fit_from_preview_surface(roughness: float, ior: float) -> PreviewLobe:
@@ -43,5 +44,5 @@ def fit_from_preview_surface(roughness: float, ior: float) -> PreviewLobe:
     what nobody touched comes back as it was fitted."""
     shown = ((ior - 1) / (ior + 1)) ** 2
     psi, diffuse = measured_lobe(roughness**2, shown)
-    sqrt_f0 = math.sqrt(0.08 * psi)
+    sqrt_f0 = math.sqrt(F0_OF_PSI * psi)
     return PreviewLobe(roughness, (1 + sqrt_f0) / (1 - sqrt_f0), diffuse)

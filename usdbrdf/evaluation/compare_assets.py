@@ -153,9 +153,8 @@ def matched(atlas: AssetMaps, other: AssetMaps) -> tuple[Correspondence, Bool]:
     least three times, inside a triangle and without emission, in both."""
     comparable = []
     for each in (atlas, other):
-        seen = each.map("samples")[:, 0] >= MIN_SAMPLES
-        emits = (each.map_where_present("emission", 3) > 0).any(axis=1)
-        comparable.append(seen & ~emits & each.texels.interior)
+        often = each.samples >= MIN_SAMPLES
+        comparable.append(often & ~each.emissive & each.texels.interior)
     same = correspondence(atlas, other)
     scored = comparable[0] & comparable[1][np.maximum(same.texel, 0)] & (same.texel >= 0)
     return same, np.asarray(scored, np.bool_)

@@ -50,6 +50,7 @@ STAMP_SCHEMA = 1
 class Stamp:
     """What a task did.
 
+    stage                the task's name
     version, code        of the package, and the hash of its sources
     parameters, inputs   what it depends on; inputs maps a label to a SHA-256
     outputs              asset-relative path -> SHA-256

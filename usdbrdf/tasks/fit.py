@@ -26,7 +26,7 @@ from usdbrdf.transport.environment import environment_from_file
 from usdbrdf.transport.lit_scene import LitScene
 
 # The maps that the fit reads.
-_READ = ("lit", "coverage", "irradiance", "irradiance_raw", "emission")
+_READ = ("lit", "samples", "coverage", "irradiance", "irradiance_raw", "emission")
 
 
 def fit(asset: Asset, options: FitOptions) -> TaskResult:

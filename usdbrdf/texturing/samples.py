@@ -23,7 +23,6 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
 from usdbrdf.transport.rays import RayScene
 
-Count = npt.NDArray[np.int64]
 _GLARING = calibration.number("glare.from")
 _REACH = calibration.count("glare.reach")
 

@@ -60,12 +60,15 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
                 f"{picture}: {number} pixels are {what}; repair the picture given as "
                 "--environment. [shading.environment]"
             )
-    # Integer files are read as k / 65535, which k / 255 is too.
-    levels = image * np.float64(65535)
-    integers = image.max() <= 1 and (np.abs(levels - np.round(levels)) < 0.01).all()
-    if picture.suffix.lower() not in _HDR_SUFFIXES and integers:
+    if picture.suffix.lower() not in _HDR_SUFFIXES and _holds_integers(image):
         raise InputRefused(
             f"{picture}: an 8- or 16-bit picture ends at white and holds no radiance; give an "
             "OpenEXR or Radiance HDR file as --environment. [shading.environment]"
         )
     return Environment(image=to_working_space(image, WORKING_SPACE), z_up=up_axis == "Z")
+
+
+def _holds_integers(image: Float) -> bool:
+    """True if all values are k / 65535, which k / 255 is too: what integer files are read as."""
+    levels = image * np.float64(65535)
+    return bool(image.max() <= 1 and (np.abs(levels - np.round(levels)) < 0.01).all())

@@ -1,6 +1,6 @@
 """What to write into a UsdPreviewSurface so that renderers show what the fitted lobe reflects.
 
-Renderers read roughness and reflectance as another lobe than the one that was fitted (``lobe``):
+Renderers read roughness and reflectance as another lobe than the one that was fitted (``brdf``):
 they mask by Smith's term of the same alpha, and take what is reflected away from the diffuse term.
 With the fitted numbers in it, Cycles reflects 20 to 40 % more and diffuses 4 to 10 % less.
 

@@ -25,7 +25,7 @@ _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 
 @rule(Severity.ERROR)
 def layer_missing(scene: AssetStage) -> Iterator[Fault]:
-    """The root layer names edits.usda and the layers of all stages, and they are there. USD passes
+    """The root layer names edits.usda and the layers of all tasks, and they are there. USD passes
     over a missing sublayer with a message that is easily lost.
 
     Run usdbrdf convert again, which makes what is missing; or restore the sublayers of the root
@@ -41,7 +41,7 @@ def layer_missing(scene: AssetStage) -> Iterator[Fault]:
 @rule(Severity.ERROR)
 def layer_order(scene: AssetStage) -> Iterator[Fault]:
     """Strongest first the sublayers are edits.usda, material, shading, texturing, scan. In another
-    order the lobe of a material is hidden by the stage before it, or the artist's edits by a
+    order the lobe of a material is hidden by the task before it, or the artist's edits by a
     measurement. Other layers may stand between them. lights, texturing_uv and materialx are no
     sublayers of the root, but of the layers that own them.
 

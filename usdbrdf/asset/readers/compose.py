@@ -19,7 +19,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.model.arrays import Array
 
-_MAX_LENGTH = 300
+_MAX_LENGTH = 600
 _TIMEOUT_S = 600.0
 
 
