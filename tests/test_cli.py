@@ -96,7 +96,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         ("--min-component-area M2", "m^2", "(default: 0.01)"),
         ("--max-nonfinite SHARE", "share", "(default: 0.01)"),
         ("--meters-per-unit M", "metres", "default: as the format says"),
-        ("--texel-size M", "metres", "default: the frames' median pixel footprint"),
+        ("--texel-size M", "metres", "default: what the frames' pixels cover of each chart"),
         ("--quantile P", "quantile", "(default: 0.5)"),
         ("--max-texels N", "texels", "(default: 1000000)"),
         ("--standard-error E", "relative", "(default: 0.03)"),

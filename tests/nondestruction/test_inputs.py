@@ -14,8 +14,7 @@ from tests.scenes import ROOM
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_weaker
 from usdbrdf.asset.readers.scene import scene_from_stage
-from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.parts import geometry_from_usd
+from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
 from usdbrdf.options import IngestOptions
 from usdbrdf.pipeline import working_on
@@ -236,7 +235,7 @@ def test_meshes_without_normals_get_those_that_are_measured_with(made, tmp_path)
     with working_on(tmp_path / "odd") as asset:
         options = IngestOptions(mesh=file, crease_angle_deg=60.0)
         ingest(capture.folder, asset, options)
-    expected = geometry_from_usd(file, options, Findings(), capture_root=tmp_path).mesh
+    expected = read_scan(capture.folder, options).mesh
     composed = open_weaker(Asset.at(tmp_path / "odd"), "texturing")
     for i in range(4):
         mesh = UsdGeom.Mesh.Get(composed, f"/odd/roof_{i}")
