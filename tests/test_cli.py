@@ -98,7 +98,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         ("--meters-per-unit M", "metres", "default: as the format says"),
         ("--texel-size M", "metres", "default: what the frames' pixels cover of each chart"),
         ("--quantile P", "quantile", "(default: 0.5)"),
-        ("--max-texels N", "texels", "(default: 1000000)"),
+        ("--max-texels N", "texels", "default: as many as the memory holds"),
         ("--standard-error E", "relative", "(default: 0.03)"),
         ("--rays N", "rays per texel", "default: 2048"),
         ("--environment HDR", "latitude-longitude", "default: black"),
