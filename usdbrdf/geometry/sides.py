@@ -121,28 +121,26 @@ def _united(one: Long, other: Long, alike: Bool, count: int) -> tuple[Long, Bool
     """Union-find that knows of each face whether it is wound as its root is."""
     root, as_root = np.arange(count), np.ones(count, np.bool_)
     for k in range(len(one)):
-        a, of_a = one[k], True
-        while root[a] != a:
-            # Halve the way: a's parent becomes its grandparent.
-            up = root[a]
-            as_root[a], root[a] = as_root[a] == as_root[up], root[up]
-            of_a = of_a == as_root[a]
-            a = root[a]
-        b, of_b = other[k], True
-        while root[b] != b:
-            up = root[b]
-            as_root[b], root[b] = as_root[b] == as_root[up], root[up]
-            of_b = of_b == as_root[b]
-            b = root[b]
+        a, of_a = _root_of(root, as_root, one[k])
+        b, of_b = _root_of(root, as_root, other[k])
         if a != b:
             root[b], as_root[b] = a, (of_a == of_b) == alike[k]
     for f in range(count):
-        a, agrees = f, True
-        while root[a] != a:
-            agrees = agrees == as_root[a]
-            a = root[a]
+        a, agrees = _root_of(root, as_root, f)
         root[f], as_root[f] = a, agrees
     return root, as_root
+
+
+@kernel
+def _root_of(root: Long, as_root: Bool, face: int) -> tuple[int, bool]:
+    """A face's root, and whether it is wound alike; the way there is halved for the next."""
+    agrees = True
+    while root[face] != face:
+        up = root[face]
+        as_root[face], root[face] = as_root[face] == as_root[up], root[up]
+        agrees = agrees == as_root[face]
+        face = root[face]
+    return face, agrees
 
 
 def _looking_around(
