@@ -28,6 +28,7 @@ from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras
 from usdbrdf.geometry.unwrap import connected_triangles
+from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
@@ -300,7 +301,8 @@ def scan_from_parts(
 
 def _sides(geometry: ScanGeometry, frames: Frames, findings: Findings) -> Sides:
     """Which faces have to be turned towards the cameras, and which show both sides."""
-    cameras = (frames.camera(i) for i in range(len(frames)))
+    numbers = progress(range(len(frames)), total=len(frames), label="sides", unit="frames")
+    cameras = (frames.camera(i) for i in numbers)
     sides = sides_from_cameras(geometry.mesh, cameras)
     turned, both = int(sides.turned.sum()), int(sides.both.sum())
     findings.count("faces_turned", turned)

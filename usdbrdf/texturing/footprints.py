@@ -13,6 +13,7 @@ from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.unwrap import TexelSizes
 from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.job.progress import progress
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
@@ -178,8 +179,8 @@ def texel_sizes_from_frames(
     count = len(scene.triangles)
     normals = face_normals_and_angles(scene.points, scene.triangles)[0]
     logarithm, pixels = np.zeros(count), np.zeros(count)
-    for i in range(len(frames)):
-        camera = frames.camera(i)
+    numbers = progress(range(len(frames)), total=len(frames), label="texel sizes", unit="frames")
+    for camera in map(frames.camera, numbers):
         small = camera.at_width(min(camera.width, _MOST_ACROSS))
         face, point = (found.reshape(-1, *found.shape[2:]) for found in visible_faces(rays, small))
         way, face = (point - camera.eye)[face >= 0], face[face >= 0]
