@@ -25,8 +25,8 @@ _SHARE, _OF_FRAMES = 0.75, 0.5
 # Bytes. Of a triangle: Embree's tree. Of a pixel: frames read ahead, and what the present one sees.
 # Of the process: interpreter, libraries and compiled code.
 _PER_TRIANGLE, _PER_PIXEL = 200, 200
-# Of a texel, if nobody says how many there may be: several times what any task holds of it, for what
-# fills memory takes hours too.
+# Of a texel, if nobody says how many there may be: several times what any task holds of it, for
+# what fills the memory takes hours too.
 _PER_TEXEL = 6000
 _PROCESS = GIB // 2
 # A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
