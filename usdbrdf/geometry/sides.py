@@ -17,7 +17,7 @@ from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Bool, Double, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles, welded_ids
+from usdbrdf.model.mesh import ScanMesh, doubled_areas, face_normals_and_angles, welded_ids
 from usdbrdf.transport.rays import RayScene, lift_from_surface
 
 # Rays that graze a face may belong to its neighbour behind the edge: their side tells nothing.
@@ -156,9 +156,7 @@ def _looking_around(
     which is of each face its front (shown 1), its back (-1) or neither (0)."""
     unseen = np.flatnonzero(lost)
     corner = mesh.points.astype(np.float64)[mesh.triangles[unseen]]
-    area = np.linalg.norm(
-        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
-    )
+    area = doubled_areas(mesh.points, mesh.triangles[unseen])
     order = np.lexsort((-area, part[unseen]))
     place = np.arange(len(order)) - np.searchsorted(part[unseen][order], part[unseen][order])
     chosen = order[place < _LOOKING]
