@@ -38,7 +38,7 @@ def house(session: nox.Session) -> None:
 
 @nox.session
 def quick(session: nox.Session) -> None:
-    """All tests that are not slow: on two cores in some minutes."""
+    """All tests that are not slow: on two cores in two minutes."""
     install(session, "test")
     session.run("python", "-m", "pytest", "-q", "-m", "not slow", *session.posargs)
 

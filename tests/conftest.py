@@ -11,13 +11,18 @@ import pytest
 from tests.synthetic_asset import box, build, make_scan
 from usdbrdf.job.progress import set_quiet
 
-# Files and folders whose tests run the pipeline, kill processes, start other programs or fit
-# materials; `pytest -m "not slow"` leaves them out.
+# Files and folders whose tests run the pipeline, kill processes, start other programs, damage whole
+# captures, pack whole assets or fit materials; `pytest -m "not slow"` leaves them out.
 SLOW = (
     "asset/test_previews.py",
     "asset/test_schema.py",
+    "capture/test_adapters.py",
     "dcc",
+    "delivery/test_glb.py",
+    "delivery/test_package_refused.py",
+    "delivery/test_package_usdz.py",
     "evaluation",
+    "faults/test_bad_captures.py",
     "faults/test_kill_resume.py",
     "job/test_child.py",
     "job/test_kill_resume.py",
@@ -28,12 +33,15 @@ SLOW = (
     "physics/test_lobe_samples.py",
     "physics/test_recovery.py",
     "plugins",
+    "relighting/test_model.py",
+    "relighting/test_relight.py",
     "shading/test_denoise.py",
     "shading/test_denoise_default.py",
     "tasks/test_texture.py",
     "test_cli.py",
     "test_convert.py",
     "test_identity.py",
+    "test_units.py",
 )
 
 # Sweeps whose cases take seconds each: every third runs for each change, the others at night.

@@ -173,6 +173,8 @@ except EnvironmentFailure as error:
 def test_errors_of_the_machine_are_translated():
     with pytest.raises(EnvironmentFailure, match="out of memory"), environment_failures("x"):
         raise MemoryError
+    with pytest.raises(EnvironmentFailure, match="out of memory"), environment_failures("x"):
+        raise OSError(12, "Cannot allocate memory", "/a")
     with pytest.raises(EnvironmentFailure, match="Permission"), environment_failures("x"):
         raise PermissionError(13, "Permission denied", "/a")
     with pytest.raises(BrokenPipeError), environment_failures("x"):

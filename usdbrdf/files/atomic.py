@@ -81,18 +81,19 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 def environment_failures(subject: str) -> Iterator[None]:
     """Translate what the machine lacks (disk, memory, permission) into EnvironmentFailure.
 
-    Every OSError counts, whatever its errno: numpy raises one without when a disk is full.
+    Every OSError counts, whatever its errno: numpy raises one without when a disk is full. Short
+    memory comes as a MemoryError or as the ENOMEM of a call that opens, maps or forks.
     """
     try:
         yield
     except BrokenPipeError:
         raise  # whoever read our output has gone: no fault of this machine
-    except MemoryError as error:
-        raise EnvironmentFailure(
-            f"{subject}: out of memory. Free some or use a larger machine, then run the same "
-            "command again; finished work is kept. [environment.memory]"
-        ) from error
-    except OSError as error:
+    except (MemoryError, OSError) as error:
+        if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
+            raise EnvironmentFailure(
+                f"{subject}: out of memory. Free some or use a larger machine, then run the same "
+                "command again; finished work is kept. [environment.memory]"
+            ) from error
         where = f" ({error.filename!r})" if error.filename else ""
         raise EnvironmentFailure(
             f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
