@@ -157,7 +157,7 @@ class Built:
             if item.emitter
         ]
         world = world_from_root(open_weaker(self.asset, "texturing"))
-        write_lights_layer(self.asset.lights_layer, self.draft("shading"), lamps, world)
+        write_lights_layer(self.asset.lights_layer, self.draft("shading"), lamps, None, world)
 
     def write_layer(self, role, path=None):
         """Write (again) the layer of one stage from the kept values."""
@@ -169,7 +169,7 @@ class Built:
             scanned = open_weaker(self.asset, "texturing")
             write_texturing_layer(path, self.asset.uv_layer, draft, self.textured, scanned)
         elif role == "shading":
-            write_shading_layer(path, draft, self.shaded)
+            write_shading_layer(path, draft, self.shaded, None)
             self.write_lights()
         else:
             write_material_layer(path, draft, self.fitted)

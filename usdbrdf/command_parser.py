@@ -145,6 +145,8 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
     text = words[-1][1]
     if text == option.none:
         return None
+    if text in option.words:
+        return text
     if option.file and not Path(text).is_file():
         # Said before any work is done; an input that is not there is refused as a capture would be.
         raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")

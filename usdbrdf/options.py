@@ -38,6 +38,7 @@ class Option(NamedTuple):
     counts: tuple[int, ...] = ()  # how many numbers make up a value
     file: bool = False  # a file must lie there before any work begins
     none: str = ""  # the word for None on the command line
+    words: tuple[str, ...] = ()  # that may stand in the place of a file
     shared: str = ""  # title in help, of what several tasks have
     help: str = ""  # its meaning, if that is not below the field
 
@@ -120,10 +121,22 @@ class Options:
                 item.check(value, f"{item.option.name} {value}")
 
 
-def _environment() -> Path | None:
-    text = "latitude-longitude picture of the surroundings, for rays that leave the scene"
-    more = {"file": True, "shared": "light transport", "help": text}
-    return option("--environment HDR", None, unset="black", **more)
+# What may stand in the place of a picture of the surroundings.
+ESTIMATE: Literal["estimate"] = "estimate"
+NO_LIGHT: Literal["none"] = "none"
+Surroundings = Path | Literal["estimate", "none"]
+
+
+def kind_of_light(environment: Surroundings) -> str:
+    """As it is recorded: a file counts by what is in it, not by its name."""
+    return "given" if isinstance(environment, Path) else environment
+
+
+def _environment() -> Surroundings:
+    text = """light from outside the scan: estimate: what the frames show and what its light and
+        shadows tell; none; or a latitude-longitude picture"""
+    more = {"file": True, "words": (ESTIMATE, NO_LIGHT), "shared": "light transport", "help": text}
+    return option("--environment estimate|none|HDR", ESTIMATE, **more)
 
 
 def _seed() -> int:
@@ -263,7 +276,7 @@ class ShadeOptions(Options):
     sampling: Sampling = field(default_factory=Sampling)
     denoise: Denoise = option("--denoise", "auto")
     "lightmap filter for S; oidn needs usdbrdf[denoise], auto takes it where it is there"
-    environment: Path | None = _environment()
+    environment: Surroundings = _environment()
 
 
 class FitOptions(Options):
@@ -282,7 +295,7 @@ class FitOptions(Options):
     class: what is usual for their class, as far as the frames allow"""
     materialx: bool = option("--materialx", False)
     "write OpenPBR networks of MaterialX too, as layers/materialx.usda"
-    environment: Path | None = _environment()
+    environment: Surroundings = _environment()
     memory: float | None = _memory()
     seed: int = _seed()
 
@@ -303,7 +316,7 @@ class EvaluateOptions(Options):
     "points that a rendered pixel is the mean of; a square number"
     rays: int = option("--rays N", 144, (8, 1 << 24))
     "rays per pixel for the specular light, shared among its points"
-    environment: Path | None = _environment()
+    environment: Surroundings = _environment()
     seed: int = _seed()
     truth: Path | None = option("--truth FOLDER", None, unset="none")
     "compare with known materials: objects.json and albedo_vertex.npz"

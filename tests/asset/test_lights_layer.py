@@ -145,7 +145,7 @@ def test_both_variants_validate(built):
 
 def test_a_ball_is_hidden_inside_its_light(built):
     lamp = ball_lamp(built)
-    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [lamp], np.eye(4))
+    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [lamp], None, np.eye(4))
     stage = opened(built, USDLUX)
     (light,) = (p for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI))
     assert light.GetTypeName() == "SphereLight"
@@ -179,7 +179,9 @@ def test_lights_stand_in_the_world_whatever_the_root_does(built):
     order = Sdf.AttributeSpec(prim, "xformOpOrder", types.TokenArray, Sdf.VariabilityUniform)
     order.default = ["xformOp:transform"]
     edits.Save()
-    write_lights_layer(built.asset.lights_layer, built.draft("shading"), [ball_lamp(built)], root)
+    write_lights_layer(
+        built.asset.lights_layer, built.draft("shading"), [ball_lamp(built)], None, root
+    )
     (light,) = render_scene_from_stage(opened(built, USDLUX), TIME, pytest.fail).lights
     assert light.world_from_here[:3, 3] == pytest.approx([1.0, 2.0, 2.5])
     scale = abs(np.linalg.det(light.world_from_here[:3, :3])) ** (1 / 3)

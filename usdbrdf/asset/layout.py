@@ -97,6 +97,16 @@ class Asset:
         """Path of an object's map, relative to the asset folder."""
         return f"textures/{identifier}.{aov}.exr"
 
+    @property
+    def sky(self) -> str:
+        """Path of the picture of the surroundings, relative to the asset folder."""
+        return "textures/outside.sky.exr"
+
+    @property
+    def sky_confidence(self) -> str:
+        """Path of the picture that tells how each direction of ``sky`` is known."""
+        return "textures/outside.sky_confidence.exr"
+
     def textures(self, *aovs: str) -> list[Path]:
         """All objects' maps of these AOVs that are there, in the order of their names."""
         endings = tuple(f".{aov}.exr" for aov in aovs)

@@ -12,11 +12,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Ar, Usd
+from pxr import Ar, Usd, UsdGeom
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov
-from usdbrdf.asset.readers.scene import aov_path, frames_from_stage, scene_from_stage
+from usdbrdf.asset.readers.scene import (
+    aov_path,
+    frames_from_stage,
+    light_from_outside,
+    scene_from_stage,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import image_size, needs_float, read_exr, write_exr, write_preview_png
@@ -26,7 +31,14 @@ from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.transport.environment import Environment
+from usdbrdf.options import ESTIMATE, Surroundings
+from usdbrdf.transport.environment import (
+    NO_SUN,
+    Environment,
+    Sun,
+    black_environment,
+    environment_from_file,
+)
 from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
@@ -184,6 +196,24 @@ class AssetMaps:
         """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and of lamps what shading found (of
         those that clipped in every frame L_d is only a lower bound)."""
         return np.where(self.emissive[:, None], self.emission, self.lit)
+
+    def environment(self, asked: Surroundings) -> Environment:
+        """The light from outside: a file's, none, or what the shading task found or was given."""
+        up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
+        if isinstance(asked, Path):
+            return environment_from_file(asked, up_axis)
+        found = light_from_outside(self.stage) if asked == ESTIMATE else None
+        if found is None:
+            return black_environment()
+        record, picture = found
+        if not picture.is_file():
+            raise InputRefused(
+                f"{picture}: the picture of the surroundings is missing. Run `usdbrdf shade` "
+                "again. [asset.incomplete]"
+            )
+        direction, irradiance = np.array(record.sun_direction), np.array(record.sun_irradiance)
+        sun = Sun(direction, irradiance, record.sun_half_angle) if irradiance.any() else NO_SUN
+        return Environment(read_exr(picture), up_axis == "Z").under(sun)
 
     def lit_scene(self, environment: Environment) -> LitScene:
         """All that light transport needs, with ``light`` as the light."""

@@ -115,7 +115,10 @@ FIT = Schema("MaterialFit", "usdBrdf:fit", "Mesh", "status", """The fitted GGX l
     UsdPreviewSurface is derived from it as usdBrdf:fit:mapping says.""")
 EMITTER = Schema("Emitter", "usdBrdf:emitter", "Mesh", "radiance", """An object that emits light of
     its own. Its material has emissiveColor and no albedo.""", flag="emitter")
-SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER)
+OUTSIDE = Schema("Outside", "usdBrdf:outside", "Imageable", "sky", """The light that comes from
+    outside the scan: a picture of the surroundings, and the sun, which the picture does not
+    show.""")
+SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER, OUTSIDE)
 _CONFIDENCES = ("high", "low", "none")
 _CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
     of the class the rest; none: {0} is the value of the class."""
@@ -250,6 +253,44 @@ class ShadedObject(MeasuredObject):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LightFromOutside:
+    """Of the whole scan, on the default prim; ``sky`` and ``confidence`` are relative to the asset
+    folder here."""
+
+    sky: Annotated[str, Fact(OUTSIDE, "sky", "asset", "", """Radiance of the surroundings without
+        the sun, a latitude-longitude picture as a DomeLight has it, in W m-2 sr-1 where the capture
+        is calibrated.""", stored=path_in_layer, read=path_in_asset)]
+    confidence: Annotated[str, Fact(OUTSIDE, "confidence", "asset", "", """How each direction of the
+        picture is known: 1 where photographs show it or a file told it, 0.5 where it clips in all
+        of them, 0 where it was inferred from the light that it casts.""", stored=path_in_layer,
+        read=path_in_asset)]
+    source: Annotated[str, Fact(OUTSIDE, "source", "token", "estimated", """Whether the capture
+        tells the light or a file did.""", tokens=("estimated", "given"))]
+    open_share: Annotated[float, Fact(OUTSIDE, "openShare", "float", 0.0, """Share of the light's
+        directions that leave the scan; 0 to 1, without unit.""", low=0, high=1)]
+    sky_error: Annotated[float, Fact(OUTSIDE, "skyError", "float", 0.0, """Relative standard error
+        of what was inferred of the picture; without unit.""", low=0)]
+    sun_irradiance: Annotated[Colour, Fact(OUTSIDE, "sunIrradiance", "color3f", (0, 0, 0), """What
+        the sun brings to a surface that faces it, linear Rec.709, in W m-2 where the capture is
+        calibrated; black where there is no sun.""", low=0)]
+    sun_direction: Annotated[Colour, Fact(OUTSIDE, "sunDirection", "vector3f", (0, 0, 1), """Unit
+        vector towards the sun, in the frame of the world.""",
+        when=lambda outside: any(outside.sun_irradiance))]
+    sun_half_angle: Annotated[float, Fact(OUTSIDE, "sunHalfAngle", "float", 0.00465, """Of the sun's
+        disc, in radians.""", low=0, when=lambda outside: any(outside.sun_irradiance))]
+    sun_error: Annotated[float, Fact(OUTSIDE, "sunError", "float", 0.0, """Relative standard error
+        of the sun's irradiance in the worst channel; without unit.""", low=0)]
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What a summary says of it, JSON."""
+        numbers = {name: getattr(self, name) for name in ("open_share", "sky_error", "sun_error")}
+        known = {name: round(n, 4) for name, n in numbers.items() if math.isfinite(n)}
+        sun = {"sun_direction": self.sun_direction, "sun_irradiance": self.sun_irradiance}
+        return {"source": self.source, **known, **(sun if any(self.sun_irradiance) else {})}
+
+
+@dataclass(frozen=True, kw_only=True)
 class FittedObject(MeasuredObject):
     """Result of the task fit for one object; NaN where a number is not known. Maps are "diffuse",
     "refined_irradiance" and "base_color", if the fit refined them."""
@@ -325,7 +366,9 @@ class FittedObject(MeasuredObject):
 # fmt: on
 
 
-RECORDS = (LabelledObject, Photographs, Aov, TexturedObject, ShadedObject, FittedObject)
+RECORDS = (
+    LabelledObject, Photographs, Aov, TexturedObject, ShadedObject, LightFromOutside, FittedObject,
+)  # fmt: skip
 
 
 @cache

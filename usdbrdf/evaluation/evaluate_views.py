@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
@@ -34,8 +33,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.options import EvaluateOptions
-from usdbrdf.transport.environment import environment_from_file
+from usdbrdf.options import EvaluateOptions, Surroundings
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
@@ -218,10 +216,10 @@ class ViewedAsset:
     psi: Float
 
 
-def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Path | None) -> ViewedAsset:
+def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> ViewedAsset:
     """Its light, its diffuse radiance (``diffuse``, else ``lit``), its lobes as the fit left them.
 
-    environment  latitude-longitude picture of the surroundings, None: black
+    environment  the light from outside, see ``AssetMaps.environment``
     """
     read = [read_fit(atlas.stage, obj.prim_path) for obj in atlas.scene.objects]
     fits = [fit for fit in read if fit is not None]
@@ -230,8 +228,7 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Path | None) -> Vi
             f"{asset.folder}: its objects have no roughness and specular yet. Run `usdbrdf fit` "
             "first. [asset.incomplete]"
         )
-    up_axis = read_header(asset.layer("scan")).up_axis
-    lit = atlas.lit_scene(environment_from_file(environment, up_axis))
+    lit = atlas.lit_scene(atlas.environment(environment))
     diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,

@@ -30,6 +30,7 @@ from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.sunlight import sunlight
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
 # More lamps are not told apart; the faintest keep their bounds.
@@ -211,7 +212,7 @@ def _evidence(
 
     def traced(light: Float, outside: Environment, seed: int) -> Float:
         """S (N, 3) at the chosen texels with the radiance ``light`` (T, 3)."""
-        return irradiance_at(
+        return sunlight(surface, chosen, outside.sun, seed) + irradiance_at(
             surface.rays, surface.texture(light),
             lights_from_radiance(surface.scene, texels, light), outside,
             texels.position[chosen], texels.normal[chosen], independent_tiles(len(chosen)),

@@ -21,12 +21,14 @@ from usdbrdf.model.arrays import Array, Bool, Float
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
+from usdbrdf.shading.outside import USUAL_ALBEDO, Outside
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
-from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.sunlight import sunlight
 
 EMITTER_RATIO = calibration.number("emitters.ratio")
 _WHOLE_LAMP = calibration.number("emitters.whole_lamp")
@@ -126,8 +128,8 @@ def albedo_from_irradiance(
 
 def albedo_map(
     texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool
-) -> tuple[Float, float]:
-    """(albedo (T, 3) in [0, 1], share of the known, non-emissive texels over 1).
+) -> tuple[Float, Bool]:
+    """(albedo (T, 3) in [0, 1], (T,) the known, non-emissive texels that would be over 1).
 
     radiance, irradiance (T, 3); known (T,): the texel's radiance is not filled in, and its albedo
     need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
@@ -143,7 +145,7 @@ def albedo_map(
         if not known[own].any():
             albedo[own] = NEUTRAL
     albedo[emissive] = 0
-    return albedo, float(over.sum() / max(reflects.sum(), 1))
+    return albedo, over
 
 
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
@@ -182,7 +184,8 @@ def trace_irradiance(
             surface.rays, radiance, lights, environment, texels.position[index],
             texels.normal[index], patch, sampling, surface.diagonal_m, dark[index],
         )  # fmt: skip
-        return dict(vars(found))
+        mean = found.mean + sunlight(surface, index, environment.sun, sampling.seed)
+        return {**vars(found), "mean": mean}
 
     return Irradiance(**by_tiles(run, texels, "tile", "shade", tile))
 
@@ -209,7 +212,9 @@ class Shaded:
     irradiance      (T, 3) float32, W/m^2: S as it is used; ``traced.mean`` itself if not filtered
     emitters        what shines by itself
     albedo          (T, 3) float32 in [0, 1], 0 on emitters
-    over_one        share of the measured reflectors whose albedo came out over 1
+    unexplained     (T,): more comes from a measured reflector than reaches it, its albedo is 1
+    over_one        the share of these
+    outside         the light from outside; None for none
     """
 
     light: ClippedLight
@@ -218,7 +223,9 @@ class Shaded:
     irradiance: Float
     emitters: Emitters
     albedo: Float
+    unexplained: Bool
     over_one: float
+    outside: Outside | None
 
     @property
     def emission(self) -> Float:
@@ -238,7 +245,7 @@ class Shaded:
 
     def doubts(self, identifiers: Sequence[str]) -> Iterator[str]:
         """Sentences about what a person should look at; identifiers: of the objects."""
-        if not self.emitters.emissive.any():
+        if not self.emitters.emissive.any() and not self.outside:
             yield "no emitter was found, so a relit stage will be dark. [shading.no-light]"
         for i, identifier in enumerate(identifiers):
             status = self.radiance_status(i)
@@ -261,10 +268,16 @@ class Shaded:
                 "[shading.albedo]"
             )
         escaped = float(self.traced.escaped.mean())
-        if escaped > _MOSTLY_OPEN:
+        if escaped > _MOSTLY_OPEN and not self.outside:
             yield (
                 f"{100 * escaped:.0f} % of the light's directions leave the scan and count as "
                 "black. Give the surroundings as --environment. [shading.open]"
+            )
+        elif escaped > _MOSTLY_OPEN and not math.isnan(self.outside.open_share):
+            yield (
+                f"{100 * escaped:.0f} % of the light's directions leave the scan; its level is the "
+                f"one at which the mean albedo is near {math.exp(USUAL_ALBEDO[0]):.2f}. Give the "
+                "surroundings as --environment to measure it. [shading.open]"
             )
 
     def summary(self, identifiers: Sequence[str]) -> dict[str, Any]:
@@ -289,14 +302,16 @@ def shade_surface(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
-    environment: Environment,
+    outside: Outside | None,
     sampling: Sampling,
     lightmap_filter: str,
 ) -> Shaded:
     """Trace S with the light ``lit`` (T, 3), L_d as texturing left it; divide; find the emitters.
 
-    run  keeps what is done for a run that goes on
+    run      keeps what is done for a run that goes on
+    outside  the light from outside; None for none
     """
+    environment = outside.environment if outside else black_environment()
     light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed)
     filtered = lightmap_filter == OIDN
     if filtered:
@@ -306,7 +321,11 @@ def shade_surface(
     texels, seen = surface.texels, coverage.measured
     may_shine, dimmest = light.may_shine(coverage.clipped), light.least_of_lamps()
     emitters = find_emitters(texels, light.lit, irradiance, seen, may_shine, dimmest)
-    albedo, over_one = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
+    albedo, over = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
-    return Shaded(light, traced, relative, irradiance, emitters, albedo, over_one)
+    return Shaded(
+        light=light, traced=traced, relative_error=relative, irradiance=irradiance,
+        emitters=emitters, albedo=albedo, unexplained=over, outside=outside,
+        over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),
+    )  # fmt: skip

@@ -19,14 +19,13 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
 from usdbrdf.material.refine import Lobes, frame_reader, refined_light
-from usdbrdf.options import FitOptions
+from usdbrdf.options import FitOptions, kind_of_light
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
-from usdbrdf.transport.environment import environment_from_file
 from usdbrdf.transport.lit_scene import LitScene
 
 # The maps that the fit reads.
-_READ = ("lit", "samples", "coverage", "irradiance", "irradiance_raw", "emission")
+_READ = ("lit", "samples", "coverage", "irradiance", "irradiance_raw", "emission", "sky")
 
 
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
@@ -36,7 +35,8 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
     shading = read_provenance(asset.layer("shading")).get("parameters", {})
     filtered = options.method == "views" and shading.get("denoise") == OIDN
     lightmap_filter = chosen_filter(AUTO) if filtered else NONE
-    chosen = {k: v for k, v in asdict(options).items() if k not in ("environment", "memory")}
+    chosen = {k: v for k, v in asdict(options).items() if k != "memory"}
+    chosen["environment"] = kind_of_light(options.environment)
     task = Task(
         asset=asset,
         name="fit",
@@ -48,8 +48,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
-        environment = environment_from_file(options.environment, task.header.up_axis)
-        lit = maps.lit_scene(environment)
+        lit = maps.lit_scene(maps.environment(options.environment))
         usable = maps.coverage.measured & ~maps.emissive
         reader = frame_reader(lit, maps.frames, options.memory)
         survey = survey_frames(run, lit, usable, reader, options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,14 @@ from usdbrdf.asset.layers.task_layers import (
 )
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import ShadedObject, colour
+from usdbrdf.asset.properties import LightFromOutside, ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
+from usdbrdf.files.images import needs_float, write_exr
 from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.options import ShadeOptions
+from usdbrdf.options import ESTIMATE, NO_LIGHT, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
+from usdbrdf.shading.outside import Outside, estimated_outside
 from usdbrdf.shading.shaded import Shaded, shade_surface
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import chosen_filter
@@ -37,22 +40,31 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         asset=asset,
         name="shade",
         role="shading",
-        parameters={**asdict(options.sampling), "denoise": lightmap_filter},
+        parameters={
+            **asdict(options.sampling),
+            "denoise": lightmap_filter,
+            "environment": kind_of_light(options.environment),
+        },
         inputs=hashes_of_inputs(
-            asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment
+            asset,
+            "shading",
+            maps,
+            aovs=("lit", "coverage"),
+            environment=options.environment,
+            photographs=options.environment == ESTIMATE,
         ),
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
-        environment = environment_from_file(options.environment, task.header.up_axis)
+        outside = _outside(run, maps, options, task.header.up_axis)
         shaded = shade_surface(
-            run, maps.surface, maps.lit, maps.coverage, environment, options.sampling,
-            lightmap_filter,
-        )  # fmt: skip
+            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
+        )
+        published = _write_outside(run, asset, outside, options) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = _write_maps(writer, shaded)
         layer = run.output(f"layers/{asset.layer('shading').name}")
-        write_shading_layer(layer, task.draft, objects)
+        write_shading_layer(layer, task.draft, objects, published)
         lamps = [
             Lamp(
                 prim_path=item.prim_path,
@@ -63,16 +75,49 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
             if item.emitter
         ]
         lights = run.output(f"layers/{asset.lights_layer.name}")
-        write_lights_layer(lights, task.draft, lamps, world_from_root(maps.stage))
+        write_lights_layer(lights, task.draft, lamps, published, world_from_root(maps.stage))
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
         identifiers = [item.identifier for item in objects]
         for doubt in shaded.doubts(identifiers):
             warn(doubt)
-        return {**shaded.summary(identifiers), "denoise": lightmap_filter}
+        summary = {**shaded.summary(identifiers), "denoise": lightmap_filter}
+        return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work)
+
+
+def _outside(run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str) -> Outside | None:
+    """The light from outside as a file tells it, or the capture; None without any."""
+    if isinstance(options.environment, Path):
+        return Outside.given(environment_from_file(options.environment, up_axis))
+    if options.environment == NO_LIGHT:
+        return None
+    return estimated_outside(
+        run, maps.surface, maps.frames, maps.lit, maps.coverage, up_axis == "Z",
+        options.sampling.seed,
+    )  # fmt: skip
+
+
+def _write_outside(
+    run: TaskRun, asset: Asset, outside: Outside, options: ShadeOptions
+) -> LightFromOutside:
+    """Its pictures, and the record that names them."""
+    image, sun = outside.environment.image, outside.environment.sun
+    write_exr(run.output(asset.sky), image, half=not needs_float(image))
+    write_exr(run.output(asset.sky_confidence), outside.confidence[..., None], half=True)
+    return LightFromOutside(
+        sky=asset.sky,
+        confidence=asset.sky_confidence,
+        source="given" if isinstance(options.environment, Path) else "estimated",
+        open_share=outside.open_share,
+        sky_error=outside.sky_error,
+        sun_irradiance=colour(sun.irradiance),
+        sun_direction=colour(sun.direction),
+        sun_half_angle=sun.half_angle,
+        sun_error=outside.sun_error,
+    )
 
 
 def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
@@ -85,6 +130,8 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
     }
     if shaded.irradiance is not traced.mean:
         maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
+    if shaded.unexplained.any():
+        maps["unexplained"] = TexelMap(shaded.unexplained.astype(np.float32), 1.0, "1")
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
     emitters, objects = shaded.emitters, []
     for i, obj in enumerate(writer.scene.objects):

@@ -34,10 +34,12 @@ from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.lights import DENSITY, LightGroups, facing, picked, way_to
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, points_of_rays
 from usdbrdf.transport.rays import Hits, lift_from_surface
+from usdbrdf.transport.sunlight import towards_sun
 from usdbrdf.transport.warps import (
     cosine_direction,
     cosine_rays,
     hashed_uniform,
+    shifts_of,
     sobol_bits,
     tangent_frame,
     triangle_point,
@@ -51,15 +53,17 @@ LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
 # Roughnesses that vector instructions take at once, and rays of points that are traced at once:
 # what bounds the memory.
 _LANES, _RAYS_AT_ONCE = 8, 1 << 20
+_SUN_SEED = 0x50B  # random numbers of its own
 
 
 class Mixture(NamedTuple):
-    """How many of a point's samples each technique draws: per lobe width, towards the lights, and
-    cosine-distributed."""
+    """How many of a point's samples each technique draws: per lobe width, towards the lights,
+    cosine-distributed, and towards the sun: one where there is a sun, after all others."""
 
     per_lobe: int = 8
     lights: int = 8
     cosine: int = 4
+    sun: int = 0
 
 
 MIXTURE = Mixture()
@@ -219,7 +223,7 @@ def _weigh_point(
         w = aimed.direction[r, k]
         f = hits.face[r, k]
         cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
-        light = 0.0
+        light, of_sun = 0.0, k >= len(weighted) - mixture.sun
         if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
             triangle = groups.triangles[groups.of_face[f]]
             sent = facing(triangle, w[0], w[1], w[2])
@@ -227,7 +231,7 @@ def _weigh_point(
                 light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
         # A ray sent to a point on a light counts only if that is what it meets.
         missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
-        if cosine <= 0 or missed:
+        if cosine <= 0 or missed or (of_sun and f >= 0):
             weighted[k] = 0
             continue
         s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
@@ -239,6 +243,9 @@ def _weigh_point(
         samples.grazing[r, k] = grazing(clamped(cos_wh))
         for c in range(3):
             value = weighted[k, c]
+            if of_sun:  # which only this sample looks for: its irradiance is L over the density
+                weighted[k, c] = environment.sun_irradiance[c] * cosine
+                continue
             if f < 0:
                 value = environment_at(environment, w[0], w[1], w[2], c)
             weighted[k, c] = value * cosine / density
@@ -304,13 +311,14 @@ def trace_lobe_samples(
     stream (G,)    groups of the same number share their random numbers; default: none do
     alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
     """
-    groups = lit.lights.groups
+    groups, sun = lit.lights.groups, lit.environment.sun
     if not len(groups.face):
         mixture = Mixture(mixture.per_lobe, 0, mixture.cosine + mixture.lights)
+    mixture = mixture._replace(sun=int(sun.shines))
     count = len(points.face)
     if alphas is None:
         alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
-    total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine
+    total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine + mixture.sun
     origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
     draws = GroupDraws(
         sobol_bits(int(np.ceil(np.log2(group * max(mixture))))),
@@ -323,6 +331,9 @@ def trace_lobe_samples(
         np.full((count, total), -1, np.int32),
     )  # fmt: skip
     draw_directions(aimed, origin, draws, mixture, groups)
+    if mixture.sun:
+        numbers = np.repeat(draws.number, group) * group + np.arange(count) % group
+        aimed.direction[:, -1] = towards_sun(sun, shifts_of(numbers, 2, seed ^ _SUN_SEED))
     hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
     cos_in, sin2_half, graze = np.zeros((3, count, total), np.float32)
     arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.header import Draft, Scopes
+from usdbrdf.asset.header import Draft, Scopes, StageHeader
 from usdbrdf.asset.layers.author import (
     apply_schema,
     attribute,
@@ -58,7 +58,7 @@ from usdbrdf.asset.layers.looks import (
 )
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
-from usdbrdf.asset.properties import FittedObject, ShadedObject, TexturedObject
+from usdbrdf.asset.properties import FittedObject, LightFromOutside, ShadedObject, TexturedObject
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.light import LampShape
@@ -85,22 +85,30 @@ class Lamp:
 
 
 def write_lights_layer(
-    path: Path, draft: Draft, lamps: Sequence[Lamp], world_from_root: Double
+    path: Path,
+    draft: Draft,
+    lamps: Sequence[Lamp],
+    outside: LightFromOutside | None,
+    world_from_root: Double,
 ) -> None:
-    """Write lights.usda to ``path``; without a lamp that has shapes it holds nothing.
+    """Write lights.usda to ``path``; without a lamp that has shapes, and without light from
+    outside, it holds nothing. Where nothing in the scan shines, the lights are on.
 
     world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
     """
     scopes, layer = draft.scopes, draft.new_layer()
     shaped = [lamp for lamp in lamps if lamp.shapes]
-    if shaped:
+    if shaped or outside:
         emissive, usdlux = (
             Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, name)
             for name in (EMISSIVE, USDLUX)
         )
         over(layer, str(emissive))
-        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE
+        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE if lamps else USDLUX
         define(layer, _within(usdlux, scopes.path("lights")), "Scope")
+        if outside:
+            _author_outside(layer, _within(usdlux, scopes.path("lights")), outside, draft.header,
+                            world_from_root)  # fmt: skip
         for lamp in shaped:
             lights = _within(usdlux, scopes.path("lights", lamp.identifier))
             define(layer, lights, "Scope")
@@ -115,6 +123,49 @@ def write_lights_layer(
                 hidden = over(layer, _within(usdlux, lamp.prim_path))
                 attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
     export(layer, path, folder=path.parent)
+
+
+def _author_outside(
+    layer: Sdf.Layer,
+    lights: str,
+    outside: LightFromOutside,
+    header: StageHeader,
+    world_from_root: Double,
+) -> None:
+    """A DomeLight with the picture, and a DistantLight where there is a sun."""
+    dome = define(layer, f"{lights}/sky", "DomeLight")
+    file = Sdf.AssetPath(path_in_layer(outside.sky))
+    author_inputs(dome, Types.Asset, **{"texture:file": file})
+    author_inputs(dome, Types.Token, **{"texture:format": "latlong"})
+    author_inputs(dome, Types.Float, intensity=1.0)
+    # A DomeLight's pole is its y axis.
+    turned = np.eye(4)
+    if header.up_axis == "Z":
+        turned[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    _author_pose(dome, np.linalg.inv(world_from_root) @ turned)
+    brightest = max(outside.sun_irradiance)
+    if brightest <= 0:
+        return
+    sun = define(layer, f"{lights}/sun", "DistantLight")
+    author_inputs(sun, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    author_inputs(sun, Types.Float, angle=math.degrees(2 * outside.sun_half_angle))
+    hue = Gf.Vec3f(*(value / brightest for value in outside.sun_irradiance))
+    author_inputs(sun, Types.Color3f, color=hue)
+    author_inputs(sun, Types.Bool, normalize=True)
+    # It shines along its -z.
+    back = np.array(outside.sun_direction, np.float64)
+    right = np.cross(np.eye(3)[np.abs(back).argmin()], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=-1)
+    _author_pose(sun, np.linalg.inv(world_from_root) @ pose)
+
+
+def _author_pose(prim: Sdf.PrimSpec, pose: Double) -> None:
+    """USD multiplies row vectors from the left: its matrices are ours, of column vectors,
+    transposed."""
+    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
+    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
 
 
 def world_from_root(stage: Usd.Stage) -> Double:
@@ -146,10 +197,7 @@ def _author_light(
     # Rigid in the world, in units of the stage: what the root does to sizes is undone here.
     in_units = shape.world_from_light.copy()
     in_units[:3, 3] /= meters_per_unit
-    pose = np.linalg.inv(world_from_root) @ in_units
-    # USD multiplies row vectors from the left: its matrices are ours transposed.
-    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
-    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
+    _author_pose(prim, np.linalg.inv(world_from_root) @ in_units)
 
 
 def write_texturing_layer(
@@ -205,10 +253,14 @@ _RENDER_VARS = (
 )
 
 
-def write_shading_layer(path: Path, draft: Draft, objects: Sequence[ShadedObject]) -> None:
+def write_shading_layer(
+    path: Path, draft: Draft, objects: Sequence[ShadedObject], outside: LightFromOutside | None
+) -> None:
     """Write shading.usda to ``path``; its sublayer is ``write_lights_layer``'s."""
     asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
     layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
+    if outside:
+        author_record(over(layer, scopes.root), outside)
     define(layer, scopes.path("materials"), "Scope")
     for item in objects:
         author_record(over(layer, item.prim_path), item)

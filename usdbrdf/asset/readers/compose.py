@@ -18,6 +18,7 @@ from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.model.arrays import Array
+from usdbrdf.options import NO_LIGHT, Surroundings
 
 _MAX_LENGTH = 600
 _TIMEOUT_S = 600.0
@@ -145,20 +146,19 @@ def hashes_of_inputs(
     *,
     aovs: tuple[str, ...] = (),
     photographs: bool = False,
-    environment: Path | None = None,
+    environment: Surroundings = NO_LIGHT,
 ) -> dict[str, str]:
     """By label the SHA-256 of all that a task of ``role`` reads: the weaker layers and the USD
     geometry that they refer to, the maps ``aovs``, the photographs, the picture of the sky."""
+    picture = environment if isinstance(environment, Path) else None
     files = {
         "geometry": maps.layers_elsewhere(asset.folder),
-        "environment": [environment] if environment else [],
+        "environment": [picture] if picture else [],
         "maps": asset.textures(*aovs),
         "frames": [*maps.frames.image_paths] if photographs else [],
     }
-    if environment and not environment.is_file():
-        raise InputRefused(
-            f"{environment}: no such file. Check --environment. [shading.environment]"
-        )
+    if picture and not picture.is_file():
+        raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
     by_label = {layer.name: sha256_of(layer) for layer in _weaker_layers(asset, role)}
     return by_label | {label: hash_of_files(some) for label, some in files.items() if some}
 

@@ -16,10 +16,12 @@ from usdbrdf.asset.properties import (
     CAPTURE,
     FIT,
     OBJECT,
+    OUTSIDE,
     SHADING,
     TEXTURING,
     Aov,
     FittedObject,
+    LightFromOutside,
     Photographs,
     Schema,
     ShadedObject,
@@ -250,6 +252,16 @@ def read_object(
         return None
     identifier = str(authored(prim, "usdBrdf:identifier"))
     return read_record(kind, prim, prim_path=prim_path, identifier=identifier, **others)
+
+
+def light_from_outside(stage: Usd.Stage) -> tuple[LightFromOutside, Path] | None:
+    """What shading said of the light from outside, and the absolute path of its picture; None where
+    it found none."""
+    prim = stage.GetDefaultPrim()
+    if not prim or not is_measured(prim, OUTSIDE):
+        return None
+    file = asset_file(prim.GetAttribute(OUTSIDE.attribute(OUTSIDE.key)), Usd.TimeCode.Default())
+    return (read_record(LightFromOutside, prim), file) if file else None
 
 
 read_shading = partial(read_object, ShadedObject, SHADING)

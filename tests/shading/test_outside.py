@@ -1,0 +1,148 @@
+"""The light from outside of a yard whose sun and sky are known, from what its surfaces reflect."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import Sampling, box, quad, world_of
+from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading.outside import Outside, light_from_outside
+from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
+from usdbrdf.transport.environment import (
+    NO_SUN,
+    Environment,
+    Sun,
+    directions_of_pixels,
+    solid_angles,
+)
+from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
+from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.sunlight import sunlight
+
+TOWARDS = np.array([0.5, 0.3, 0.8]) / np.linalg.norm([0.5, 0.3, 0.8])
+SUN = Sun(TOWARDS, np.array([12.0, 9.0, 5.0]))
+# Brighter at the horizon.
+_UP = directions_of_pixels(HEIGHT, WIDTH, True)[..., 2]
+SKY = (np.float32([0.6, 0.8, 1.0]) * (1.5 - np.clip(_UP, 0, 1))[..., None]).astype(np.float32)
+SKY[_UP < 0] = 0.2
+
+
+@pytest.fixture(scope="module")
+def yard():
+    """A yard of 8 m with walls on three sides and two blocks in it."""
+    return world_of([
+        quad((0, 0, 0), (8, 0, 0), (0, 8, 0), (80, 80)),
+        quad((0, 8, 0), (8, 0, 0), (0, 0, 3), (60, 24)),
+        quad((0, 0, 0), (0, 8, 0), (0, 0, 3), (60, 24)),
+        quad((8, 0, 0), (0, 0, 3), (0, 8, 0), (24, 60)),
+        *box((3, 3, 0.01), (4, 4.5, 1.5), (24, 24)),
+        *box((5.5, 1.5, 0.01), (6.3, 2.3, 2.2), (24, 24)),
+    ])  # fmt: skip
+
+
+def _lit(world, environment: Environment, texture: float = 0.25):
+    """L_d (T, 3) with light going to and fro three times, and the albedo (T, 3)."""
+    surface, texels = TexturedScene(world.scene, world.texels, world.rays), world.texels
+    random = np.random.default_rng(1)
+    usual = random.uniform(0.15, 0.7, (len(texels.resolution), 3))[texels.object_index()]
+    albedo = usual * np.exp(texture * random.standard_normal((len(texels), 1)))
+    albedo = np.minimum(albedo, 0.95)
+    every, lit = np.arange(len(texels)), np.zeros((len(texels), 3), np.float32)
+    direct = sunlight(surface, every, environment.sun, 5)
+    for _ in range(3):
+        arriving = irradiance_at(
+            surface.rays, surface.texture(lit), lights_from_radiance(world.scene, texels, lit),
+            environment, texels.position, texels.normal, independent_tiles(len(texels)),
+            Sampling(standard_error=0.02, max_rays=512), surface.diagonal_m,
+        ).mean  # fmt: skip
+        lit = (albedo / np.pi * (arriving + direct)).astype(np.float32)
+    return surface, lit, albedo
+
+
+def _seen(which) -> Surroundings:
+    """The directions ``which`` (H, W) of SKY."""
+    radiance = np.where(which[..., None], SKY, 0).reshape(-1, 3)
+    return Surroundings(
+        radiance=radiance, coverage=CoverageMap.of(which.ravel(), 0 * which.ravel() > 0)
+    )
+
+
+def _of_upper_half(image) -> np.ndarray:
+    """(3,) what the sky brings to the ground, W/m^2."""
+    weight = solid_angles(HEIGHT, WIDTH)[:, None] * np.maximum(_UP, 0)
+    return (image * weight[..., None]).sum(axis=(0, 1))
+
+
+@pytest.mark.parametrize("clips", [False, True])
+def test_sun_and_sky_are_found_by_the_light_that_they_cast(yard, clips: bool):
+    surface, lit, _ = _lit(yard, Environment(SKY, True).under(SUN))
+    saturation = float(np.quantile(lit.max(axis=1), 0.85)) if clips else np.inf
+    clipped = lit.max(axis=1) > saturation
+    shown = np.where(clipped[:, None], saturation, lit).astype(np.float32)
+    # A camera that looked north, not up.
+    directions = directions_of_pixels(HEIGHT, WIDTH, True)
+    seen = _seen((directions[..., 1] > 0.5) & (np.abs(directions[..., 2]) < 0.3))
+    found = light_from_outside(
+        surface, shown, CoverageMap.of(~clipped, clipped), seen, True, seed=3
+    )
+    assert found is not None
+    sun = found.environment.sun
+    assert np.degrees(np.arccos(sun.direction @ TOWARDS)) < 1
+    np.testing.assert_allclose(sun.irradiance, SUN.irradiance, rtol=0.25 if clips else 0.1)
+    assert found.sun_error < 0.3
+    np.testing.assert_allclose(
+        _of_upper_half(found.environment.image), _of_upper_half(SKY), rtol=0.35
+    )
+    # What was seen stays what it was.
+    known = seen.coverage.measured.reshape(HEIGHT, WIDTH)
+    np.testing.assert_array_equal(found.environment.image[known], SKY[known])
+    np.testing.assert_array_equal(found.confidence, known.astype(np.float32))
+    assert 0.2 < found.open_share < 0.7
+
+
+def test_no_sun_is_found_where_none_shines(yard):
+    surface, lit, _ = _lit(yard, Environment(SKY, True))
+    every = np.ones(len(lit), np.bool_)
+    found = light_from_outside(
+        surface, lit, CoverageMap.of(every, ~every), _seen(_UP > 0.9), True, seed=3
+    )
+    assert found is not None
+    sun = _of_upper_half(found.environment.image)
+    assert (
+        not found.environment.sun.shines
+        or (found.environment.sun.irradiance * TOWARDS[2] < 0.1 * sun).all()
+    )
+    np.testing.assert_allclose(sun, _of_upper_half(SKY), rtol=0.35)
+
+
+def test_a_closed_room_has_no_light_from_outside(yard):
+    roof = quad((0, 0, 3), (0, 8, 0), (8, 0, 0))
+    south = quad((0, 0, 0), (0, 0, 3), (8, 0, 0))
+    closed = world_of([quad((0, 0, 0), (8, 0, 0), (0, 8, 0), (40, 40)), roof, south,
+                       quad((0, 8, 0), (8, 0, 0), (0, 0, 3)), quad((0, 0, 0), (0, 8, 0), (0, 0, 3)),
+                       quad((8, 0, 0), (0, 0, 3), (0, 8, 0))])  # fmt: skip
+    lit = np.ones((len(closed.texels), 3), np.float32)
+    every = np.ones(len(lit), np.bool_)
+    surface = TexturedScene(closed.scene, closed.texels, closed.rays)
+    found = light_from_outside(
+        surface, lit, CoverageMap.of(every, ~every), Surroundings.unseen(), True, seed=3
+    )
+    assert found is None
+
+
+def test_what_is_found_is_kept_as_it_is():
+    given = Outside(
+        environment=Environment(SKY, True).under(SUN),
+        confidence=_UP.astype(np.float32),
+        open_share=0.5,
+    )
+    same = Outside.restored(given.arrays())
+    assert same.environment.sun.half_angle == SUN.half_angle
+    assert same.environment.z_up
+    np.testing.assert_array_equal(same.environment.sun.irradiance, SUN.irradiance)
+    np.testing.assert_array_equal(same.environment.image, SKY)
+    assert same.open_share == 0.5
+    assert np.isnan(same.sun_error)
+    assert not Outside.given(Environment(SKY, True).under(NO_SUN)).environment.sun.shines

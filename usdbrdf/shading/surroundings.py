@@ -1,0 +1,102 @@
+"""What the frames show of the far surroundings: rays that miss the mesh measure them, direction by
+direction, as rays that meet it measure its texels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy import ndimage
+
+from usdbrdf import calibration
+from usdbrdf.files.frames import FramePixels, read_frame, read_frames
+from usdbrdf.job.progress import progress
+from usdbrdf.model.arrays import Array, Bool, Float, Long
+from usdbrdf.model.camera import Camera
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.texels import CoverageMap
+from usdbrdf.texturing import psquare
+from usdbrdf.texturing.psquare import QuantileState
+from usdbrdf.transport.environment import pixels_of_directions
+from usdbrdf.transport.rays import RayScene
+
+# Of the picture of the surroundings; three quarters of a degree, wider than what parallax in a
+# scan some metres wide leaves of far things.
+HEIGHT, WIDTH = 256, 512
+# Pixels between the rays that look whether a frame shows anything but the mesh.
+_STRIDE = 8
+_LEAST_OUTSIDE = calibration.number("outside.least_seen")
+_QUANTILE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """Of D = HEIGHT x WIDTH directions: radiance (D, 3) float32, W/(m^2 sr), the median of what
+    frames measured, what saturates them where all clip, 0 elsewhere; and the coverage."""
+
+    radiance: Float
+    coverage: CoverageMap
+
+    @classmethod
+    def unseen(cls) -> Surroundings:
+        none = np.zeros(HEIGHT * WIDTH, np.bool_)
+        return cls(
+            radiance=np.zeros((HEIGHT * WIDTH, 3), np.float32), coverage=CoverageMap.of(none, none)
+        )
+
+
+def share_outside(rays: RayScene, frames: Frames) -> Float:
+    """(N,) share of each frame's pixels that show no surface."""
+    shares = []
+    for i in range(len(frames)):
+        camera = frames.camera(i)
+        hits = rays.closest(*camera.rays(camera.pixels(_STRIDE)))
+        shares.append((hits.face < 0).mean())
+    return np.array(shares, np.float32)
+
+
+def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surroundings:
+    """All that the frames show beside the mesh; nothing where they hardly look past it."""
+    shares = share_outside(rays, frames)
+    if shares.mean() < _LEAST_OUTSIDE:
+        return Surroundings.unseen()
+    state = QuantileState.empty(HEIGHT * WIDTH)
+    saturates = np.zeros(HEIGHT * WIDTH, np.float32)
+    looking = np.flatnonzero(shares > 0).tolist()
+    images = read_frames(partial(read_frame, frames), looking)
+    for i, pixels in progress(images, total=len(looking), label="shade: outside", unit="frames"):
+        direction, radiance, clipped = _seen_in_frame(rays, frames.camera(i), pixels, z_up)
+        psquare.update(state, direction, radiance, _QUANTILE)
+        limit = np.float32(frames.saturation_radiance[i])
+        saturates[clipped] = np.maximum(saturates[clipped], limit)
+    measured = state.samples > 0
+    found = np.where(
+        measured[:, None], psquare.quantile(state, _QUANTILE), saturates[:, None]
+    ).astype(np.float32)
+    return Surroundings(
+        radiance=found, coverage=CoverageMap.of(measured, ~measured & (saturates > 0))
+    )
+
+
+def _seen_in_frame(
+    rays: RayScene, camera: Camera, pixels: FramePixels, z_up: bool
+) -> tuple[Array, Float, Long]:
+    """Directions of which one frame shows all valid pixels, (M,) int32, and their mean (M, 3);
+    and those of which it shows saturated ones alone, (K,)."""
+    _, towards = camera.rays(camera.pixels())
+    faces = rays.closest(camera.eye[None].astype(np.float32), towards).face
+    miss = (faces < 0).reshape(pixels.valid.shape)
+    # A pixel beside the mesh shows some of it.
+    alone: Bool = ndimage.binary_erosion(miss, np.ones((3, 3)))
+    which = np.flatnonzero(alone)
+    place = pixels_of_directions(towards[which], HEIGHT, WIDTH, z_up)
+    count, valid, clipped = (
+        np.bincount(place, weights, HEIGHT * WIDTH)
+        for weights in (None, pixels.valid.ravel()[which], pixels.clipped.ravel()[which])
+    )
+    whole = np.flatnonzero((count > 0) & (valid == count))
+    shown = np.nan_to_num(pixels.radiance.reshape(-1, 3)[which])
+    sums = [np.bincount(place, shown[:, c], HEIGHT * WIDTH)[whole] for c in range(3)]
+    mean = (np.stack(sums, axis=-1) / count[whole, None]).astype(np.float32)
+    return whole.astype(np.int32), mean, np.flatnonzero((count > 0) & (clipped == count))
