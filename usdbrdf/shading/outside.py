@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
@@ -44,10 +43,13 @@ from usdbrdf.transport.warps import cosine_rays
 
 # Texels that are asked, at most and at least on one side of one object (a segment), segments, and
 # the rays by which each of them meets the sky.
-_PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS, _RAYS = 120, 30, 80, 256
+_PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS, _RAYS = 240, 30, 80, 1024
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 # Lower and upper elevation of a band of patches, degrees, and their number.
-_BANDS = ((-90, -30, 4), (-30, 0, 8), (0, 15, 12), (15, 40, 12), (40, 65, 8), (65, 90, 1))
+_BANDS = (
+    (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
+    (65, 90, 1),
+)  # fmt: skip
 _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
 # Directions of the first search for the sun; how many of them are followed; how much finer each of
@@ -57,14 +59,15 @@ _DIRECTIONS, _FOLLOWED, _FINER, _REFINED = 3000, 16, 2.5, 6
 _STRENGTHS = np.geomspace(0.25, 128, 10)
 _OUTLIER = 1.5
 _NEAR = 0.3  # radians in which the sun is looked for again
+_BESIDE = 0.4  # radians within which the sky is alike
 _SEED = 0x51C4
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
 class Asked(NamedTuple):
     """N texels that are asked: their numbers, segments counted from 0 and objects, what they
-    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), and S of
-    what was seen."""
+    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), and S
+    of what was seen."""
 
     index: Long
     segment: Int
@@ -157,7 +160,9 @@ def light_from_outside(
     if asked is None:
         return None
     measured, clipped = seen.coverage.measured, seen.coverage.clipped
-    patches = _patches(clipped, z_up)
+    # What long exposures alone show may be no brighter than the rest.
+    limit = seen.radiance.max(axis=1) * clipped
+    patches = _patches(limit > limit.max() / 2, z_up)
     share, open_share = _shares(surface, asked, np.where(measured, -1, patches), z_up, seed)
     if open_share < _LEAST_OPEN:
         return None
@@ -223,7 +228,8 @@ def _asked(
     place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
     kept = rank[place < _PER_SEGMENT]
     index = usable[kept]
-    environment = Environment(image=seen.radiance.reshape(HEIGHT, WIDTH, 3), z_up=z_up)
+    known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
+    environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
     irradiance = irradiance_at(
         surface.rays, surface.texture(lit), lights_from_radiance(surface.scene, texels, lit),
         environment, texels.position[index], texels.normal[index], independent_tiles(len(index)),
@@ -294,7 +300,7 @@ class Sources(NamedTuple):
         return np.asarray(np.einsum("kn,kc->nc", self.share, np.exp(log_radiance)))
 
 
-_LOWER_BOUND = calibration.pair("lamps.prior")
+_ABOVE_LIMIT = calibration.pair("outside.above_limit")
 _SKY_DEVIATION = calibration.number("outside.sky_deviation")
 _ALIKE = calibration.number("outside.alike")
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
@@ -306,10 +312,8 @@ def _sky(
     asked: Asked, seen: Surroundings, patches: Int, share: Double, used: Long, z_up: bool
 ) -> Sources:
     """The patches that light what is asked."""
-    known = seen.coverage.measured
-    if known.any():
-        usual = np.median(seen.radiance[known], axis=0)
-    else:
+    known, usual = seen.coverage.measured, _usual_sky(seen)
+    if not usual.any():
         usual = np.median(asked.reflected, axis=0) / np.pi
     bound = used >= _PATCHES
     mean = np.tile(np.log(np.maximum(usual, 1e-6 * usual.max() + 1e-30)), (len(used), 1))
@@ -317,13 +321,22 @@ def _sky(
     centre = np.zeros((len(used), 3))
     for k, patch in enumerate(used):
         centre[k] = directions[patches % _PATCHES == patch % _PATCHES].mean(axis=0)
+        near = known & (directions @ centre[k] > np.cos(_BESIDE) * np.linalg.norm(centre[k]))
         if bound[k]:
-            mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _LOWER_BOUND[0]
+            mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _ABOVE_LIMIT[0]
+        elif near.any():
+            mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), 1e-30))
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    near = np.argwhere(np.triu(centre @ centre.T > np.cos(np.radians(45)), 1))
+    near = np.argwhere(np.triu(centre @ centre.T > np.cos(_BESIDE), 1))
     near = near[~bound[near].any(axis=1)]
-    deviation = np.where(bound, _LOWER_BOUND[1], _SKY_DEVIATION)
+    deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
     return Sources(share[used], mean, deviation, bound, near)
+
+
+def _usual_sky(seen: Surroundings) -> Double:
+    """(3,) the median radiance of what frames show of the surroundings; 0 where they show nothing."""
+    known = seen.radiance[seen.coverage.measured].astype(np.float64)
+    return np.median(known, axis=0) if len(known) else np.zeros(3)
 
 
 def _with_sun(
@@ -352,7 +365,8 @@ _INDEPENDENT = calibration.number("outside.independent")
 USUAL_ALBEDO = calibration.pair("outside.albedo")
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
-_ITERATIONS, _LEAST_NOISE = 40, 0.02
+_ITERATIONS = 40
+_LEAST_NOISE = calibration.number("outside.least_noise")
 
 
 class Solution(NamedTuple):
@@ -407,7 +421,7 @@ def _solved_channel(
         residual = observed - np.log(total) - albedo[asked.segment]
         # What clips reflects at least as much: it says something where the model says less.
         counts = counted & (~asked.clipped | (residual > 0))
-        noise = max(_LEAST_NOISE, 1.4826 * float(np.median(np.abs(residual[~asked.clipped]))))
+        noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
         jacobian = np.concatenate([(parts / total).T, of_segment], axis=1)
@@ -424,6 +438,16 @@ def _solved_channel(
         if np.abs(step).max() < 1e-4:
             break
     return g, albedo, np.float64(mean)
+
+
+def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
+    """(M,) how much the residuals (N,) of each segment scatter: plain walls tell more than what is
+    patterned."""
+    off = np.abs(residual)
+    usual = float(np.median(off[~asked.clipped]))
+    own = [off[(asked.segment == k) & ~asked.clipped] for k in range(count)]
+    middle = np.array([np.median(some) if len(some) else usual for some in own])
+    return np.maximum(_LEAST_NOISE, 1.4826 * middle)
 
 
 def _add_priors(
@@ -482,26 +506,12 @@ def _jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
 
 
 def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double) -> Float:
-    """(HEIGHT, WIDTH, 3): what was measured, and the patches, without their edges."""
-    filled = np.zeros((HEIGHT * WIDTH, 3))
-    weight = np.zeros(HEIGHT * WIDTH)
+    """(HEIGHT, WIDTH, 3): what was measured, and the patches."""
+    filled = np.tile(_usual_sky(seen), (HEIGHT * WIDTH, 1))
     for patch, value in zip(used, radiance, strict=True):
-        own = patches == patch
-        filled[own], weight[own] = value, 1
-    smooth, total = (
-        _blurred(values.reshape(HEIGHT, WIDTH, -1)).reshape(HEIGHT * WIDTH, -1)
-        for values in (filled, weight)
-    )
-    filled = np.where(patches[:, None] < _PATCHES, smooth / np.maximum(total, 1e-9), filled)
+        filled[patches == patch] = value
     known = seen.coverage.measured[:, None]
     return np.where(known, seen.radiance, filled).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
-
-
-def _blurred(picture: Double) -> Double:
-    """By some fifteen degrees; a picture of the surroundings goes on at its sides."""
-    sides = ("nearest", "wrap", "nearest")
-    width = HEIGHT / 12
-    return np.asarray(ndimage.gaussian_filter(picture, (width, width, 0), mode=sides))
 
 
 def _find_sun(
@@ -509,7 +519,8 @@ def _find_sun(
 ) -> Sun:
     """The direction above the horizon whose shadows are in the texture, ``near`` one if that is
     given; irradiance (N, 3) without it."""
-    texels = surface.texels
+    texels, asked = surface.texels, asked.of(np.s_[::2])
+    irradiance = irradiance[::2]
     normal = texels.normal[asked.index].astype(np.float64)
     origin = lift_from_surface(
         texels.position[asked.index], texels.normal[asked.index], surface.diagonal_m
