@@ -23,7 +23,13 @@ from usdbrdf.asset.layers.task_layers import (
     write_texturing_layer,
 )
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.asset.properties import Aov, FittedObject, ShadedObject, TexturedObject
+from usdbrdf.asset.properties import (
+    Aov,
+    FittedObject,
+    LightFromOutside,
+    ShadedObject,
+    TexturedObject,
+)
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.files.images import write_exr, write_preview_png
 from usdbrdf.model.capture import Frames, Scan
@@ -121,6 +127,31 @@ def aovs_of(asset, identifier, names):
     return tuple(maps)
 
 
+SUN_DIRECTION = (0.48, 0.6, 0.64)
+SUN_IRRADIANCE = (12.0, 9.0, 6.0)
+
+
+def sky_of(asset):
+    """Light from outside: a sky that is brighter above and ahead, and a sun."""
+    (asset.folder / "textures").mkdir(exist_ok=True)
+    picture = np.ones((8, 16, 3), np.float32)
+    picture[:4] *= 2
+    picture[:, 6:10] *= 3
+    write_exr(asset.folder / asset.sky, picture)
+    write_exr(asset.folder / asset.sky_confidence, picture[..., :1] * 0)
+    return LightFromOutside(
+        sky=asset.sky,
+        confidence=asset.sky_confidence,
+        source="estimated",
+        open_share=0.4,
+        sky_error=0.2,
+        sun_irradiance=SUN_IRRADIANCE,
+        sun_direction=SUN_DIRECTION,
+        sun_half_angle=0.00465,
+        sun_error=0.1,
+    )
+
+
 @dataclass
 class Built:
     """An asset on disk and what went into it."""
@@ -132,6 +163,7 @@ class Built:
     textured: tuple[TexturedObject, ...] = ()
     shaded: tuple[ShadedObject, ...] = ()
     fitted: tuple[FittedObject, ...] = ()
+    outside: LightFromOutside | None = None
 
     def draft(self, role):
         provenance = Provenance(
@@ -157,7 +189,9 @@ class Built:
             if item.emitter
         ]
         world = world_from_root(open_weaker(self.asset, "texturing"))
-        write_lights_layer(self.asset.lights_layer, self.draft("shading"), lamps, None, world)
+        write_lights_layer(
+            self.asset.lights_layer, self.draft("shading"), lamps, self.outside, world
+        )
 
     def write_layer(self, role, path=None):
         """Write (again) the layer of one stage from the kept values."""
@@ -169,7 +203,7 @@ class Built:
             scanned = open_weaker(self.asset, "texturing")
             write_texturing_layer(path, self.asset.uv_layer, draft, self.textured, scanned)
         elif role == "shading":
-            write_shading_layer(path, draft, self.shaded, None)
+            write_shading_layer(path, draft, self.shaded, self.outside)
             self.write_lights()
         else:
             write_material_layer(path, draft, self.fitted)

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
+from tests.synthetic_asset import SUN_DIRECTION, SUN_IRRADIANCE, sky_of
 from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS, USDLUX, Lamp, write_lights_layer
-from usdbrdf.asset.readers.render_scene import render_scene_from_stage
-from usdbrdf.files.images import write_exr
-from usdbrdf.model.light import LampShape
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.render_scene import render_scene_from_stage, sky_of_picture
+from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.model.light import DistantLight, LampShape, SkyLight
 from usdbrdf.validation.validate import validate
 
 RADIANCE = np.array([8.0, 4.0, 2.0])
@@ -141,6 +144,45 @@ def test_both_variants_validate(built):
     edits.GetPrimAtPath("/room").variantSelections[LIGHTS] = USDLUX
     edits.Save()
     assert [str(found) for found in validate(built.asset.root_layer)] == []
+
+
+@pytest.mark.parametrize(("up_axis", "unit"), [("Z", 1.0), ("Y", 0.01)])
+def test_light_from_outside_is_a_dome_and_a_sun(tmp_path, synthetic, up_axis, unit):
+    scan = synthetic.make_scan(tmp_path / "capture", up_axis=up_axis, unit=unit)
+    built = synthetic.build(tmp_path / "out" / "room", scan)
+    built.outside = sky_of(built.asset)
+    built.write_layer("shading")
+    stage = opened(built, USDLUX)
+    found = render_scene_from_stage(stage, TIME, pytest.fail).lights
+    (sky,) = (light for light in found if isinstance(light, SkyLight))
+    (sun,) = (light for light in found if isinstance(light, DistantLight))
+    np.testing.assert_allclose(sun.towards, -np.array(SUN_DIRECTION), atol=1e-6)
+    np.testing.assert_allclose(sun.irradiance, SUN_IRRADIANCE, rtol=1e-5)
+    assert sun.half_angle == pytest.approx(0.00465, rel=1e-4)
+    picture = read_exr(built.asset.folder / built.asset.sky)
+    np.testing.assert_array_equal(sky.image, picture)
+    turned = sky_of_picture(picture, up_axis)
+    np.testing.assert_allclose(sky.world_from_here, turned.world_from_here, atol=1e-6)
+    off = render_scene_from_stage(opened(built, EMISSIVE), TIME, pytest.fail).lights
+    assert not [light for light in off if isinstance(light, (SkyLight, DistantLight))]
+    # What transport takes is the same.
+    maps = AssetMaps(open_measured(built.asset))
+    environment = maps.environment("estimate")
+    assert environment.z_up == (up_axis == "Z")
+    np.testing.assert_array_equal(environment.image, picture)
+    np.testing.assert_allclose(environment.sun.irradiance, SUN_IRRADIANCE, rtol=1e-6)
+    np.testing.assert_allclose(environment.sun.direction, SUN_DIRECTION, rtol=1e-6)
+    assert not maps.environment("none").image.any()
+    assert [str(found) for found in validate(built.asset.root_layer)] == []
+
+
+def test_where_nothing_else_shines_the_light_from_outside_is_on(built):
+    built.outside = sky_of(built.asset)
+    write_lights_layer(
+        built.asset.lights_layer, built.draft("shading"), [], built.outside, np.eye(4)
+    )
+    layer = Sdf.Layer.FindOrOpen(str(built.asset.lights_layer))
+    assert layer.GetPrimAtPath("/room").variantSelections[LIGHTS] == USDLUX
 
 
 def test_a_ball_is_hidden_inside_its_light(built):

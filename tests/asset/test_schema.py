@@ -14,6 +14,7 @@ from typing import Annotated
 import pytest
 from pxr import Plug, Sdf, Usd
 
+from tests.synthetic_asset import sky_of
 from usdbrdf.asset import properties
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import author_record, over
@@ -40,7 +41,7 @@ UNITS = (
     "metres|seconds|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
     "units of the pixel values|[Nn]umber of|Loss of the fit"
 )
-NAMES = ("Object", "Capture", "Aov", "Texturing", "Shading", "MaterialFit", "Emitter")
+NAMES = ("Object", "Capture", "Aov", "Texturing", "Shading", "MaterialFit", "Emitter", "Outside")
 
 
 def run_python(code, *arguments, **environment):
@@ -131,6 +132,8 @@ def test_every_attribute_is_known_and_documented(name):
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one."""
     verify()
+    built.outside = sky_of(built.asset)
+    built.write_layer("shading")
     authored = {}
     declared = {
         name: (fact.type, VARIABILITY[fact.is_uniform])

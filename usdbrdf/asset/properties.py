@@ -264,8 +264,8 @@ class LightFromOutside:
         picture is known: 1 where photographs show it or a file told it, 0.5 where it clips in all
         of them, 0 where it was inferred from the light that it casts.""", stored=path_in_layer,
         read=path_in_asset)]
-    source: Annotated[str, Fact(OUTSIDE, "source", "token", "estimated", """Whether the capture
-        tells the light or a file did.""", tokens=("estimated", "given"))]
+    source: Annotated[str, Fact(OUTSIDE, "source", "token", "estimated", """estimated: the
+        capture tells the light; given: a file did.""", tokens=("estimated", "given"))]
     open_share: Annotated[float, Fact(OUTSIDE, "openShare", "float", 0.0, """Share of the light's
         directions that leave the scan; 0 to 1, without unit.""", low=0, high=1)]
     sky_error: Annotated[float, Fact(OUTSIDE, "skyError", "float", 0.0, """Relative standard error

@@ -1,31 +1,28 @@
-"""The light from outside that no frame shows, inferred from the light that it casts.
+"""The light from outside: what frames show of it, and the rest by the light that it casts.
 
 What texels reflect is their albedo times S, and S is the light of what was seen, that of patches of
-the sky, and the sun. On one side of one object the albedo varies about one value, so that the
-contrasts there tell of the light: the sun's direction is the one whose shadows are found in the
-texture, and its irradiance and the patches' radiance follow by least squares on the logarithms,
-with outliers weighed as under Student's t. What clips is a lower bound. Where nothing that was seen
-lights the scan, contrasts leave the level open: then it is the one at which the mean albedo is what
-is usual, and nothing reflects more than it receives.
+sky that no frame shows, and the sun. Contrasts on one side of one object tell of the light: first
+of the sun's direction (``sun_direction``), then of its irradiance and the patches' radiance
+(``outside_light``).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
+from usdbrdf.shading.outside_light import Asked, Sources, jackknife, solved
+from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import (
     NO_SUN,
@@ -52,32 +49,9 @@ _BANDS = (
 )  # fmt: skip
 _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
-# Directions of the first search for the sun; how many of them are followed; how much finer each of
-# the next searches is, of which there are so many; candidates for its irradiance, in units of the
-# median S.
-_DIRECTIONS, _FOLLOWED, _FINER, _REFINED = 3000, 16, 2.5, 6
-_STRENGTHS = np.geomspace(0.25, 128, 10)
-_OUTLIER = 1.5
-_NEAR = 0.3  # radians in which the sun is looked for again
-_BESIDE = 0.4  # radians within which the sky is alike
+_BESIDE = calibration.number("outside.alike_within")
 _SEED = 0x51C4
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
-
-
-class Asked(NamedTuple):
-    """N texels that are asked: their numbers, segments counted from 0 and objects, what they
-    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), and S
-    of what was seen."""
-
-    index: Long
-    segment: Int
-    object: Int
-    reflected: Double
-    clipped: Bool
-    irradiance: Double
-
-    def of(self, which: Array) -> Asked:
-        return Asked._make(values[which] for values in self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +68,9 @@ class Outside:
 
     environment: Environment
     confidence: Float
-    open_share: float = float("nan")
-    sky_error: float = float("nan")
-    sun_error: float = float("nan")
+    open_share: float = math.nan
+    sky_error: float = math.nan
+    sun_error: float = math.nan
 
     @classmethod
     def given(cls, environment: Environment) -> Outside:
@@ -104,6 +78,11 @@ class Outside:
         return cls(
             environment=environment, confidence=np.ones(environment.image.shape[:2], np.float32)
         )
+
+    @property
+    def is_estimated(self) -> bool:
+        """Not told by a file."""
+        return not math.isnan(self.open_share)
 
     def arrays(self) -> dict[str, Array]:
         """All of it."""
@@ -172,20 +151,20 @@ def light_from_outside(
     level = solved(asked, sky)
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.
-    sun = _find_sun(surface, asked, asked.irradiance + sky.irradiance(sky.mean), z_up)
+    sun = find_sun(surface, asked, asked.irradiance + sky.irradiance(sky.mean), z_up)
     for _ in range(2):
         with_sun = _with_sun(surface, asked, sky, sun, seed)
         found = solved(*with_sun)
         light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
-        sun = _find_sun(surface, asked, light, z_up, sun)
-    error = _jackknife(*with_sun, found)
+        sun = find_sun(surface, asked, light, z_up, sun)
+    error = jackknife(*with_sun, found)
     sun_error = float(error[-1].max())
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     shines = sun_error < _MOST_SUN_ERROR and strength > _LEAST_SUN
     if shines:
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
-        sun, found, error = NO_SUN, level, _jackknife(asked, sky, level)
+        sun, found, error = NO_SUN, level, jackknife(asked, sky, level)
     radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]))
     weight = share[used].mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
@@ -193,8 +172,8 @@ def light_from_outside(
         environment=Environment(radiance, z_up).under(sun),
         confidence=seen.coverage.stored().reshape(HEIGHT, WIDTH),
         open_share=open_share,
-        sky_error=float(np.average(of_sky, weights=weight)) if len(used) else float("nan"),
-        sun_error=sun_error if shines else float("nan"),
+        sky_error=float(np.average(of_sky, weights=weight)) if len(used) else math.nan,
+        sun_error=sun_error if shines else math.nan,
     )
 
 
@@ -237,13 +216,12 @@ def _asked(
     ).mean  # fmt: skip
     reflected = np.pi * lit[index].astype(np.float64)
     bright = np.flatnonzero((reflected > 0).all(axis=1))
-    index, kept, irradiance, reflected = (
-        values[bright] for values in (index, kept, irradiance, reflected)
-    )
+    index, kept, irradiance = index[bright], kept[bright], irradiance[bright]
+    reflected = reflected[bright]
     return Asked(
-        index=index,
+        texel=index,
         segment=np.unique(segment[kept], return_inverse=True)[1].astype(np.int32),
-        object=owner[kept].astype(np.int32),
+        owner=owner[kept].astype(np.int32),
         reflected=reflected,
         clipped=~measured[kept],
         irradiance=np.maximum(irradiance, _DARK * np.median(reflected)).astype(np.float64),
@@ -273,36 +251,20 @@ def _shares(
 ) -> tuple[Double, float]:
     """What each patch (-1: none) of radiance 1 brings to the texels asked, (2 _PATCHES, N), W/m^2;
     and the share of the light's directions that leave the scan."""
-    texels, count = surface.texels, len(asked.index)
-    normal = texels.normal[asked.index]
-    origin = lift_from_surface(texels.position[asked.index], normal, surface.diagonal_m)
-    towards = cosine_rays(normal, asked.index, seed ^ _SEED, _RAYS)
+    texels, count = surface.texels, len(asked.texel)
+    normal = texels.normal[asked.texel]
+    origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
+    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, _RAYS)
     out = np.flatnonzero(surface.rays.closest(origin, towards).face < 0)
     patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
     texel, kept = out % count, patch >= 0
     met = np.bincount(patch[kept] * count + texel[kept], minlength=2 * _PATCHES * count)
-    return np.pi / _RAYS * met.reshape(2 * _PATCHES, count), len(out) / len(towards)
-
-
-class Sources(NamedTuple):
-    """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
-    the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
-    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2)."""
-
-    share: Double
-    mean: Double
-    deviation: Double
-    bound: Bool
-    pairs: Long
-
-    def irradiance(self, log_radiance: Double) -> Double:
-        """(N, 3) W/m^2 of all of them."""
-        return np.asarray(np.einsum("kn,kc->nc", self.share, np.exp(log_radiance)))
+    brought = np.asarray(np.pi / _RAYS * met.reshape(2 * _PATCHES, count), np.float64)
+    return brought, len(out) / len(towards)
 
 
 _ABOVE_LIMIT = calibration.pair("outside.above_limit")
 _SKY_DEVIATION = calibration.number("outside.sky_deviation")
-_ALIKE = calibration.number("outside.alike")
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
 _LEAST_SUN = calibration.number("outside.least_sun")
 _MOST_SUN_ERROR = calibration.number("outside.most_sun_error")
@@ -334,7 +296,7 @@ def _sky(
 
 
 def _usual_sky(seen: Surroundings) -> Double:
-    """(3,) the median radiance of what frames show of the surroundings; 0 where they show nothing."""
+    """(3,) the median radiance of what frames show of the surroundings, 0 without any."""
     known = seen.radiance[seen.coverage.measured].astype(np.float64)
     return np.median(known, axis=0) if len(known) else np.zeros(3)
 
@@ -344,8 +306,8 @@ def _with_sun(
 ) -> tuple[Asked, Sources]:
     """The sun as the last of the sources; without the texels that see some of its disc only, whose
     share of it is not known as well as that."""
-    share = sunlit(surface, asked.index, sun, seed).astype(np.float64)
-    cosine = np.maximum(surface.texels.normal[asked.index] @ sun.direction, 0)
+    share = sunlit(surface, asked.texel, sun, seed).astype(np.float64)
+    cosine = np.maximum(surface.texels.normal[asked.texel] @ sun.direction, 0)
     kept = (share < 0.02 * cosine + 1e-6) | (share > 0.98 * cosine)
     strength = np.log(np.median(asked.irradiance, axis=0))
     sources = Sources(
@@ -360,151 +322,6 @@ def _with_sun(
     return chosen._replace(segment=segment), sources
 
 
-_FREEDOM = calibration.number("lamps.student_freedom")
-_INDEPENDENT = calibration.number("outside.independent")
-USUAL_ALBEDO = calibration.pair("outside.albedo")
-_OF_SEGMENT = calibration.number("outside.albedo_of_segment")
-_WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
-_ITERATIONS = 40
-_LEAST_NOISE = calibration.number("outside.least_noise")
-
-
-class Solution(NamedTuple):
-    """log_radiance (K, 3) of the sources, log_albedo (M, 3) of the segments, and the logarithm of
-    the mean albedo, (3,)."""
-
-    log_radiance: Double
-    log_albedo: Double
-    mean: Double
-
-
-def solved(
-    asked: Asked, sources: Sources, start: Solution | None = None, iterations: int = _ITERATIONS
-) -> Solution:
-    """The strengths that explain best what the texels reflect."""
-    if start is None:
-        light = np.log(asked.irradiance + sources.irradiance(sources.mean))
-        rest = np.log(asked.reflected) - light
-        num = int(asked.segment.max()) + 1
-        albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
-        start = Solution(sources.mean.copy(), albedo, np.full(3, USUAL_ALBEDO[0]))
-    found = start
-    # Which channel it is that clips, what does not clip tells first.
-    for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
-        if counted is None:
-            light = asked.irradiance + sources.irradiance(found.log_radiance)
-            brightest = (np.log(light) + found.log_albedo[asked.segment]).argmax(axis=1)
-            counted = ~asked.clipped[:, None] | (np.arange(3) == brightest[:, None])
-        channels = [
-            _solved_channel(asked, sources, found, c, counted[:, c], iterations) for c in range(3)
-        ]
-        found = Solution(*(np.stack(parts, axis=-1) for parts in zip(*channels, strict=True)))
-    return found
-
-
-def _solved_channel(
-    asked: Asked, sources: Sources, start: Solution, channel: int, counted: Bool, iterations: int
-) -> tuple[Double, Double, Double]:
-    """One channel's part of ``solved``: Gauss-Newton steps on the weighted squares of the texels
-    that are ``counted`` (N,)."""
-    known, observed = asked.irradiance[:, channel], np.log(asked.reflected[:, channel])
-    g, albedo = start.log_radiance[:, channel].copy(), start.log_albedo[:, channel].copy()
-    mean = float(start.mean[channel])
-    num_sources, num_segments = len(g), len(albedo)
-    size = np.bincount(asked.segment, minlength=num_segments)
-    effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
-    of_segment = np.zeros((len(observed), num_segments))
-    of_segment[np.arange(len(observed)), asked.segment] = 1
-    for _ in range(iterations):
-        parts = np.exp(g)[:, None] * sources.share
-        total = known + parts.sum(axis=0)
-        residual = observed - np.log(total) - albedo[asked.segment]
-        # What clips reflects at least as much: it says something where the model says less.
-        counts = counted & (~asked.clipped | (residual > 0))
-        noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
-        weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
-        weight = weight * effective * counts
-        jacobian = np.concatenate([(parts / total).T, of_segment], axis=1)
-        rows = num_sources + num_segments + 1
-        curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
-        curvature[:-1, :-1] = jacobian.T @ (jacobian * weight[:, None])
-        gradient[:-1] = jacobian.T @ (weight * residual)
-        _add_priors(curvature, gradient, sources, channel, (g, albedo, mean))
-        damped = curvature + 1e-3 * np.diag(np.diag(curvature))
-        step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
-        g += step[:num_sources]
-        albedo += step[num_sources:-1]
-        mean += float(step[-1])
-        if np.abs(step).max() < 1e-4:
-            break
-    return g, albedo, np.float64(mean)
-
-
-def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
-    """(M,) how much the residuals (N,) of each segment scatter: plain walls tell more than what is
-    patterned."""
-    off = np.abs(residual)
-    usual = float(np.median(off[~asked.clipped]))
-    own = [off[(asked.segment == k) & ~asked.clipped] for k in range(count)]
-    middle = np.array([np.median(some) if len(some) else usual for some in own])
-    return np.maximum(_LEAST_NOISE, 1.4826 * middle)
-
-
-def _add_priors(
-    curvature: Double,
-    gradient: Double,
-    sources: Sources,
-    channel: int,
-    at: tuple[Double, Double, float],
-) -> None:
-    """What is known of sources and albedos before the evidence."""
-    g, albedo, mean = at
-    k, last = len(g), len(gradient) - 1
-    index = np.arange(k)
-    off = sources.mean[:, channel] - g
-    precision = sources.deviation**-2.0
-    curvature[index, index] += precision
-    gradient[:k] += precision * off
-    for a, b in sources.pairs:
-        apart = (g[a] - g[b]) / _ALIKE**2
-        for one, other, sign in ((a, b, 1.0), (b, a, -1.0)):
-            curvature[one, one] += _ALIKE**-2
-            curvature[one, other] -= _ALIKE**-2
-            gradient[one] -= sign * apart
-    segment = np.arange(k, last)
-    off = albedo - mean
-    precision_of = _OF_SEGMENT**-2
-    curvature[segment, segment] += precision_of
-    curvature[segment, last] -= precision_of
-    curvature[last, segment] -= precision_of
-    curvature[last, last] += precision_of * len(albedo) + USUAL_ALBEDO[1] ** -2
-    gradient[segment] -= precision_of * off
-    gradient[last] += precision_of * off.sum() + (USUAL_ALBEDO[0] - mean) / USUAL_ALBEDO[1] ** 2
-    # Nothing reflects more than it receives.
-    over = np.maximum(albedo - np.log(_WHITEST), 0)
-    curvature[segment, segment] += (over > 0) * _AS_WHITE**-2
-    gradient[segment] -= over * _AS_WHITE**-2
-
-
-_BLOCKS = 10
-
-
-def _jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
-    """(K, 3) standard errors of the logarithms, if objects err as a whole."""
-    objects = np.unique(asked.object)
-    block = np.searchsorted(objects, asked.object) % min(_BLOCKS, max(len(objects), 2))
-    moved, blocks = np.zeros_like(found.log_radiance), np.unique(block)
-    for number in blocks:
-        kept = block != number
-        some = asked.of(kept)
-        numbers, segment = np.unique(some.segment, return_inverse=True)
-        some = some._replace(segment=segment.astype(np.int32))
-        start = found._replace(log_albedo=found.log_albedo[numbers])
-        part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
-        moved += (part.log_radiance - found.log_radiance) ** 2
-    return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))
-
-
 def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double) -> Float:
     """(HEIGHT, WIDTH, 3): what was measured, and the patches."""
     filled = np.tile(_usual_sky(seen), (HEIGHT * WIDTH, 1))
@@ -512,93 +329,3 @@ def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double) -> 
         filled[patches == patch] = value
     known = seen.coverage.measured[:, None]
     return np.where(known, seen.radiance, filled).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
-
-
-def _find_sun(
-    surface: TexturedScene, asked: Asked, irradiance: Double, z_up: bool, near: Sun | None = None
-) -> Sun:
-    """The direction above the horizon whose shadows are in the texture, ``near`` one if that is
-    given; irradiance (N, 3) without it."""
-    texels, asked = surface.texels, asked.of(np.s_[::2])
-    irradiance = irradiance[::2]
-    normal = texels.normal[asked.index].astype(np.float64)
-    origin = lift_from_surface(
-        texels.position[asked.index], texels.normal[asked.index], surface.diagonal_m
-    )
-    level = np.median(irradiance.mean(axis=1))
-    reflected, without = np.log(asked.reflected.max(axis=1)), irradiance.mean(axis=1)
-    first = np.searchsorted(asked.segment, np.arange(asked.segment.max() + 2))
-    strengths = level * _STRENGTHS
-
-    def cost(directions: Double) -> Double:
-        """(M,) of the best strength in each direction."""
-        cosine = np.maximum(directions @ normal.T, 0)
-        rays = np.repeat(directions.astype(np.float32), len(origin), axis=0)
-        free = surface.rays.closest(origin, rays).face < 0
-        share = cosine * free.reshape(cosine.shape)
-        return _costs(reflected, without, share, asked.clipped, first, strengths)
-
-    def costs(directions: Double) -> Double:
-        parts = np.array_split(directions, max(1, len(directions) // 32))
-        with ThreadPoolExecutor(2) as pool:
-            return np.concatenate(list(pool.map(cost, parts)))
-
-    tried = _spread(2 * _DIRECTIONS)
-    tried = tried[tried[:, 2 if z_up else 1] > 0]
-    if near:
-        tried = tried[tried @ near.direction > np.cos(_NEAR)]
-    # The way down is rough: a shadow's edge counts when it passes a texel.
-    reach = 1.5 * float(np.sqrt(2 * np.pi / _DIRECTIONS))
-    kept = tried[np.argsort(costs(tried), kind="stable")[:_FOLLOWED]]
-    for _ in range(_REFINED):
-        around = np.stack([_around(direction, reach) for direction in kept])
-        cost_around = costs(around.reshape(-1, 3)).reshape(len(kept), -1)
-        best = cost_around.argmin(axis=1)
-        order = np.argsort(cost_around.min(axis=1), kind="stable")
-        kept = around[np.arange(len(kept)), best][order][: max(1, len(kept) // 2)]
-        reach /= _FINER
-    return Sun(kept[0], np.full(3, level))
-
-
-def _spread(count: int) -> Double:
-    """(count, 3) unit directions, evenly over the sphere: a Fibonacci lattice."""
-    i = np.arange(count) + 0.5
-    z, turn = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5)) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
-
-
-def _around(direction: Double, reach: float) -> Double:
-    """(M, 3) unit directions on a grid within ``reach`` radians of one."""
-    steps = np.linspace(-reach, reach, 9)
-    x, y = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps))
-    right = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
-    right /= np.linalg.norm(right)
-    near = direction + x * right + y * np.cross(direction, right)
-    return np.asarray(near / np.linalg.norm(near, axis=1, keepdims=True))
-
-
-@loop
-def _costs(
-    reflected: Double, without: Double, share: Double, clipped: Bool, first: Long, strengths: Double
-) -> Double:
-    """(M,) for each row of ``share`` (M, N) the least cost of all strengths: mean distance of the
-    logarithms from their segment's median, none counting more than as an outlier."""
-    count, points = share.shape
-    best = np.empty(count)
-    rest = np.empty(points)
-    for m in range(count):
-        best[m] = np.inf
-        for strength in strengths:
-            total = 0.0
-            for k in range(len(first) - 1):
-                low, high = first[k], first[k + 1]
-                for i in range(low, high):
-                    rest[i] = reflected[i] - np.log(without[i] + strength * share[m, i])
-                middle = np.median(rest[low:high])
-                for i in range(low, high):
-                    off = rest[i] - middle
-                    if not (clipped[i] and off < 0):
-                        total += min(abs(off), _OUTLIER)
-            best[m] = min(best[m], total / points)
-    return best

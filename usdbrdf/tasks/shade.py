@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,16 @@ from usdbrdf.asset.layers.task_layers import (
 )
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import LightFromOutside, ShadedObject, colour
+from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
-from usdbrdf.files.images import needs_float, write_exr
 from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.options import ESTIMATE, NO_LIGHT, ShadeOptions, kind_of_light
+from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
-from usdbrdf.shading.outside import Outside, estimated_outside
 from usdbrdf.shading.shaded import Shaded, shade_surface
+from usdbrdf.tasks.outside import outside_of, write_outside
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.denoise import chosen_filter
-from usdbrdf.transport.environment import environment_from_file
 
 
 def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
@@ -56,11 +53,11 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
-        outside = _outside(run, maps, options, task.header.up_axis)
+        outside = outside_of(run, maps, options, task.header.up_axis)
         shaded = shade_surface(
             run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
         )
-        published = _write_outside(run, asset, outside, options) if outside else None
+        published = write_outside(run, asset, outside, options) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = _write_maps(writer, shaded)
         layer = run.output(f"layers/{asset.layer('shading').name}")
@@ -79,45 +76,12 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
-        identifiers = [item.identifier for item in objects]
-        for doubt in shaded.doubts(identifiers):
+        for doubt in shaded.doubts(identifiers := [item.identifier for item in objects]):
             warn(doubt)
         summary = {**shaded.summary(identifiers), "denoise": lightmap_filter}
         return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work)
-
-
-def _outside(run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str) -> Outside | None:
-    """The light from outside as a file tells it, or the capture; None without any."""
-    if isinstance(options.environment, Path):
-        return Outside.given(environment_from_file(options.environment, up_axis))
-    if options.environment == NO_LIGHT:
-        return None
-    return estimated_outside(
-        run, maps.surface, maps.frames, maps.lit, maps.coverage, up_axis == "Z",
-        options.sampling.seed,
-    )  # fmt: skip
-
-
-def _write_outside(
-    run: TaskRun, asset: Asset, outside: Outside, options: ShadeOptions
-) -> LightFromOutside:
-    """Its pictures, and the record that names them."""
-    image, sun = outside.environment.image, outside.environment.sun
-    write_exr(run.output(asset.sky), image, half=not needs_float(image))
-    write_exr(run.output(asset.sky_confidence), outside.confidence[..., None], half=True)
-    return LightFromOutside(
-        sky=asset.sky,
-        confidence=asset.sky_confidence,
-        source="given" if isinstance(options.environment, Path) else "estimated",
-        open_share=outside.open_share,
-        sky_error=outside.sky_error,
-        sun_irradiance=colour(sun.irradiance),
-        sun_direction=colour(sun.direction),
-        sun_half_angle=sun.half_angle,
-        sun_error=outside.sun_error,
-    )
 
 
 def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:

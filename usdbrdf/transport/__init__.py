@@ -11,6 +11,7 @@ Its face, which is all that the rest of the package calls:
     lobe_radiance    lobe_radiance of known lobes, lobe_basis for roughnesses that are tried, and
                      specular_irradiance that they bring to other surfaces
     renderer_match   what to write for renderers with another lobe
+    sunlight         what the sun brings to texels
     brdf             the lobe's equations
     denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things

@@ -82,7 +82,8 @@ def pixels_of_directions(directions: Float, height: int, width: int, z_up: bool)
     up, ahead = (z, -y) if z_up else (y, z)
     row = ((0.5 - np.arcsin(np.clip(up, -1, 1)) / np.pi) * height).astype(np.int64)
     column = ((0.5 - np.arctan2(x, ahead) / (2 * np.pi)) * width).astype(np.int64)
-    return np.minimum(row, height - 1) * width + np.clip(column, 0, width - 1)
+    place = np.minimum(row, height - 1) * width + np.clip(column, 0, width - 1)
+    return np.asarray(place, np.int64)
 
 
 def solid_angles(height: int, width: int) -> Double:

@@ -55,7 +55,8 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
     normal = np.repeat(texels.geometric_normal[index], count, axis=0)
     origin = lift_from_surface(position, normal, surface.diagonal_m)
     hits = surface.rays.closest(origin, towards_sun(sun, drawn[..., 2:].reshape(-1, 2)))
-    return (hits.face < 0).reshape(-1, count).mean(axis=1, dtype=np.float32)
+    share: Float = (hits.face < 0).reshape(-1, count).mean(axis=1, dtype=np.float32)
+    return share
 
 
 def towards_sun(sun: Sun, drawn: Double) -> Float:

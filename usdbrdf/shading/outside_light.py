@@ -1,0 +1,195 @@
+"""How strong the sources of light outside are: least squares on the logarithms of what texels
+reflect, pi L_d = albedo S, where S is what was seen and each source's share times its strength.
+
+On one segment (a facing of one object) the albedo varies about one value. Outliers weigh as under
+Student's t, and each segment by how much its texels scatter. What clips is a lower bound. Before
+the evidence albedos are about what is usual, and nothing reflects much more than it receives: which
+fixes the level of the light where next to nothing that was seen lights the scan.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
+
+
+class Asked(NamedTuple):
+    """N texels that are asked: their numbers, segments counted from 0 and objects, what they
+    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), and S
+    of what was seen."""
+
+    texel: Long
+    segment: Int
+    owner: Int
+    reflected: Double
+    clipped: Bool
+    irradiance: Double
+
+    def of(self, which: Array) -> Asked:
+        return Asked._make(values[which] for values in self)
+
+
+class Sources(NamedTuple):
+    """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
+    the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
+    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2)."""
+
+    share: Double
+    mean: Double
+    deviation: Double
+    bound: Bool
+    pairs: Long
+
+    def irradiance(self, log_radiance: Double) -> Double:
+        """(N, 3) W/m^2 of all of them."""
+        return np.asarray(np.einsum("kn,kc->nc", self.share, np.exp(log_radiance)))
+
+
+_FREEDOM = calibration.number("outside.student_freedom")
+_INDEPENDENT = calibration.number("outside.independent")
+USUAL_ALBEDO = calibration.pair("outside.albedo")
+_OF_SEGMENT = calibration.number("outside.albedo_of_segment")
+_WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
+_ALIKE = calibration.number("outside.alike")
+_ITERATIONS = 40
+_LEAST_NOISE = calibration.number("outside.least_noise")
+
+
+class Solution(NamedTuple):
+    """log_radiance (K, 3) of the sources, log_albedo (M, 3) of the segments, and the logarithm of
+    the mean albedo, (3,)."""
+
+    log_radiance: Double
+    log_albedo: Double
+    mean: Double
+
+
+def solved(
+    asked: Asked, sources: Sources, start: Solution | None = None, iterations: int = _ITERATIONS
+) -> Solution:
+    """The strengths that explain best what the texels reflect."""
+    if start is None:
+        light = np.log(asked.irradiance + sources.irradiance(sources.mean))
+        rest = np.log(asked.reflected) - light
+        num = int(asked.segment.max()) + 1
+        albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
+        start = Solution(sources.mean.copy(), albedo, np.full(3, USUAL_ALBEDO[0]))
+    found = start
+    # Which channel it is that clips, what does not clip tells first.
+    for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
+        if counted is None:
+            light = asked.irradiance + sources.irradiance(found.log_radiance)
+            brightest = (np.log(light) + found.log_albedo[asked.segment]).argmax(axis=1)
+            counted = ~asked.clipped[:, None] | (np.arange(3) == brightest[:, None])
+        channels = [
+            _solved_channel(asked, sources, found, c, counted[:, c], iterations) for c in range(3)
+        ]
+        found = Solution(*(np.stack(parts, axis=-1) for parts in zip(*channels, strict=True)))
+    return found
+
+
+def _solved_channel(
+    asked: Asked, sources: Sources, start: Solution, channel: int, counted: Bool, iterations: int
+) -> tuple[Double, Double, Double]:
+    """One channel's part of ``solved``: Gauss-Newton steps on the weighted squares of the texels
+    that are ``counted`` (N,)."""
+    known, observed = asked.irradiance[:, channel], np.log(asked.reflected[:, channel])
+    g, albedo = start.log_radiance[:, channel].copy(), start.log_albedo[:, channel].copy()
+    mean = float(start.mean[channel])
+    num_sources, num_segments = len(g), len(albedo)
+    size = np.bincount(asked.segment, minlength=num_segments)
+    effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
+    of_segment = np.zeros((len(observed), num_segments))
+    of_segment[np.arange(len(observed)), asked.segment] = 1
+    for _ in range(iterations):
+        parts = np.exp(g)[:, None] * sources.share
+        total = known + parts.sum(axis=0)
+        residual = observed - np.log(total) - albedo[asked.segment]
+        # What clips reflects at least as much: it says something where the model says less.
+        counts = counted & (~asked.clipped | (residual > 0))
+        noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
+        weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
+        weight = weight * effective * counts
+        jacobian = np.concatenate([(parts / total).T, of_segment], axis=1)
+        rows = num_sources + num_segments + 1
+        curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
+        curvature[:-1, :-1] = jacobian.T @ (jacobian * weight[:, None])
+        gradient[:-1] = jacobian.T @ (weight * residual)
+        _add_priors(curvature, gradient, sources, channel, (g, albedo, mean))
+        damped = curvature + 1e-3 * np.diag(np.diag(curvature))
+        step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
+        g += step[:num_sources]
+        albedo += step[num_sources:-1]
+        mean += float(step[-1])
+        if np.abs(step).max() < 1e-4:
+            break
+    return g, albedo, np.array(mean)
+
+
+def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
+    """(M,) how much the residuals (N,) of each segment scatter: plain walls tell more than what is
+    patterned."""
+    off = np.abs(residual)
+    usual = float(np.median(off[~asked.clipped]))
+    own = [off[(asked.segment == k) & ~asked.clipped] for k in range(count)]
+    middle = np.array([np.median(some) if len(some) else usual for some in own])
+    return np.maximum(_LEAST_NOISE, 1.4826 * middle)
+
+
+def _add_priors(
+    curvature: Double,
+    gradient: Double,
+    sources: Sources,
+    channel: int,
+    at: tuple[Double, Double, float],
+) -> None:
+    """What is known of sources and albedos before the evidence."""
+    g, albedo, mean = at
+    k, last = len(g), len(gradient) - 1
+    index = np.arange(k)
+    off = sources.mean[:, channel] - g
+    precision = sources.deviation**-2.0
+    curvature[index, index] += precision
+    gradient[:k] += precision * off
+    for a, b in sources.pairs:
+        apart = (g[a] - g[b]) / _ALIKE**2
+        for one, other, sign in ((a, b, 1.0), (b, a, -1.0)):
+            curvature[one, one] += _ALIKE**-2
+            curvature[one, other] -= _ALIKE**-2
+            gradient[one] -= sign * apart
+    segment = np.arange(k, last)
+    off = albedo - mean
+    precision_of = _OF_SEGMENT**-2
+    curvature[segment, segment] += precision_of
+    curvature[segment, last] -= precision_of
+    curvature[last, segment] -= precision_of
+    curvature[last, last] += precision_of * len(albedo) + USUAL_ALBEDO[1] ** -2
+    gradient[segment] -= precision_of * off
+    gradient[last] += precision_of * off.sum() + (USUAL_ALBEDO[0] - mean) / USUAL_ALBEDO[1] ** 2
+    # Nothing reflects more than it receives.
+    over = np.maximum(albedo - np.log(_WHITEST), 0)
+    curvature[segment, segment] += (over > 0) * _AS_WHITE**-2
+    gradient[segment] -= over * _AS_WHITE**-2
+
+
+_BLOCKS = 10
+
+
+def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
+    """(K, 3) standard errors of the logarithms, if objects err as a whole."""
+    objects = np.unique(asked.owner)
+    block = np.searchsorted(objects, asked.owner) % min(_BLOCKS, max(len(objects), 2))
+    moved, blocks = np.zeros_like(found.log_radiance), np.unique(block)
+    for number in blocks:
+        kept = block != number
+        some = asked.of(kept)
+        numbers, segment = np.unique(some.segment, return_inverse=True)
+        some = some._replace(segment=segment.astype(np.int32))
+        start = found._replace(log_albedo=found.log_albedo[numbers])
+        part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
+        moved += (part.log_radiance - found.log_radiance) ** 2
+    return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))

@@ -1,0 +1,116 @@
+"""Where the sun stands: in the direction whose shadows are found in the texture.
+
+For a direction, texels that see the sun get its light by the cosine law and the others none. With
+the right one, and the right strength, what is left of the contrasts on each segment is least."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.kernel import loop
+from usdbrdf.model.arrays import Bool, Double, Long
+from usdbrdf.shading.outside_light import Asked
+from usdbrdf.transport.environment import Sun
+from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.rays import lift_from_surface
+
+# Directions of the first search; how many of them are followed; how much finer each of the next
+# searches is, of which there are so many; candidates for the sun's irradiance, in units of the
+# median S.
+_DIRECTIONS, _FOLLOWED, _FINER, _REFINED = 3000, 16, 2.5, 6
+_STRENGTHS = np.geomspace(0.25, 128, 10)
+_NEAR = 0.3  # radians in which the sun is looked for again
+_OUTLIER = calibration.number("outside.outlier")
+
+
+def find_sun(
+    surface: TexturedScene, asked: Asked, irradiance: Double, z_up: bool, near: Sun | None = None
+) -> Sun:
+    """The direction above the horizon whose shadows are in the texture, ``near`` one if that is
+    given; irradiance (N, 3) without it."""
+    texels, some = surface.texels, np.arange(0, len(asked.texel), 2)
+    asked, irradiance = asked.of(some), irradiance[some]
+    normal = texels.normal[asked.texel].astype(np.float64)
+    origin = lift_from_surface(
+        texels.position[asked.texel], texels.normal[asked.texel], surface.diagonal_m
+    )
+    level = np.median(irradiance.mean(axis=1))
+    reflected, without = np.log(asked.reflected.max(axis=1)), irradiance.mean(axis=1)
+    first = np.searchsorted(asked.segment, np.arange(asked.segment.max() + 2))
+    strengths = level * _STRENGTHS
+
+    def cost(directions: Double) -> Double:
+        """(M,) of the best strength in each direction."""
+        cosine = np.maximum(directions @ normal.T, 0)
+        rays = np.repeat(directions.astype(np.float32), len(origin), axis=0)
+        free = surface.rays.closest(origin, rays).face < 0
+        share = cosine * free.reshape(cosine.shape)
+        return _costs(reflected, without, share, asked.clipped, first, strengths)
+
+    def costs(directions: Double) -> Double:
+        parts = np.array_split(directions, max(1, len(directions) // 32))
+        with ThreadPoolExecutor(2) as pool:
+            return np.concatenate(list(pool.map(cost, parts)))
+
+    tried = _spread(2 * _DIRECTIONS)
+    tried = tried[tried[:, 2 if z_up else 1] > 0]
+    if near:
+        tried = tried[tried @ near.direction > np.cos(_NEAR)]
+    # The way down is rough: a shadow's edge counts when it passes a texel.
+    reach = 1.5 * float(np.sqrt(2 * np.pi / _DIRECTIONS))
+    kept = tried[np.argsort(costs(tried), kind="stable")[:_FOLLOWED]]
+    for _ in range(_REFINED):
+        around = np.stack([_around(direction, reach) for direction in kept])
+        cost_around = costs(around.reshape(-1, 3)).reshape(len(kept), -1)
+        best = cost_around.argmin(axis=1)
+        order = np.argsort(cost_around.min(axis=1), kind="stable")
+        kept = around[np.arange(len(kept)), best][order][: max(1, len(kept) // 2)]
+        reach /= _FINER
+    return Sun(kept[0], np.full(3, level))
+
+
+def _spread(count: int) -> Double:
+    """(count, 3) unit directions, evenly over the sphere: a Fibonacci lattice."""
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5)) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
+
+
+def _around(direction: Double, reach: float) -> Double:
+    """(M, 3) unit directions on a grid within ``reach`` radians of one."""
+    steps = np.linspace(-reach, reach, 9)
+    x, y = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps))
+    right = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
+    right /= np.linalg.norm(right)
+    near = direction + x * right + y * np.cross(direction, right)
+    return np.asarray(near / np.linalg.norm(near, axis=1, keepdims=True))
+
+
+@loop
+def _costs(
+    reflected: Double, without: Double, share: Double, clipped: Bool, first: Long, strengths: Double
+) -> Double:
+    """(M,) for each row of ``share`` (M, N) the least cost of all strengths: mean distance of the
+    logarithms from their segment's median, none counting more than as an outlier."""
+    count, points = share.shape
+    best = np.empty(count)
+    rest = np.empty(points)
+    for m in range(count):
+        best[m] = np.inf
+        for strength in strengths:
+            total = 0.0
+            for k in range(len(first) - 1):
+                low, high = first[k], first[k + 1]
+                for i in range(low, high):
+                    rest[i] = reflected[i] - np.log(without[i] + strength * share[m, i])
+                middle = np.median(rest[low:high])
+                for i in range(low, high):
+                    off = rest[i] - middle
+                    if not (clipped[i] and off < 0):
+                        total += min(abs(off), _OUTLIER)
+            best[m] = min(best[m], total / points)
+    return best
