@@ -134,6 +134,7 @@ ENGINEERING: dict[str, str] = {
     "_AT_A_TIME": "memory",
     "_BANDS": "discretisation of the sky",
     "_BATCH": "memory",
+    "_BRIGHTEST": "steps of a search",
     "_BLOCKS": "blocks of a jackknife",
     "_COUNTED_PIXELS": "time",
     "_DARK": "numerics",

@@ -276,8 +276,9 @@ class LightFromOutside:
     sun_direction: Annotated[Colour, Fact(OUTSIDE, "sunDirection", "vector3f", (0, 0, 1), """Unit
         vector towards the sun, in the frame of the world.""",
         when=lambda outside: any(outside.sun_irradiance))]
-    sun_half_angle: Annotated[float, Fact(OUTSIDE, "sunHalfAngle", "float", 0.00465, """Of the sun's
-        disc, in radians.""", low=0, when=lambda outside: any(outside.sun_irradiance))]
+    sun_half_angle: Annotated[float, Fact(OUTSIDE, "sunHalfAngle", "float", 0.00465, """Half of the
+        angle of the sun's disc, in radians.""", low=0,
+        when=lambda outside: any(outside.sun_irradiance))]
     sun_error: Annotated[float, Fact(OUTSIDE, "sunError", "float", 0.0, """Relative standard error
         of the sun's irradiance in the worst channel; without unit.""", low=0)]
 

@@ -21,7 +21,7 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.outside_light import Asked, Sources, jackknife, solved
+from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import (
@@ -158,13 +158,14 @@ def light_from_outside(
         light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
         sun = find_sun(surface, asked, light, z_up, sun)
     error = jackknife(*with_sun, found)
+    found = levelled(*with_sun, found)
     sun_error = float(error[-1].max())
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     shines = sun_error < _MOST_SUN_ERROR and strength > _LEAST_SUN
     if shines:
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
-        sun, found, error = NO_SUN, level, jackknife(asked, sky, level)
+        sun, found, error = NO_SUN, levelled(asked, sky, level), jackknife(asked, sky, level)
     radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]))
     weight = share[used].mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)

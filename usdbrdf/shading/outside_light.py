@@ -152,7 +152,8 @@ def _add_priors(
     k, last = len(g), len(gradient) - 1
     index = np.arange(k)
     off = sources.mean[:, channel] - g
-    precision = sources.deviation**-2.0
+    # Together they are as far from what is usual as one of them may be: their errors agree.
+    precision = sources.deviation**-2.0 / np.where(sources.bound, 1, max((~sources.bound).sum(), 1))
     curvature[index, index] += precision
     gradient[:k] += precision * off
     for a, b in sources.pairs:
@@ -176,6 +177,33 @@ def _add_priors(
     gradient[segment] -= over * _AS_WHITE**-2
 
 
+_MOSTLY_INFERRED = calibration.number("outside.level_unknown")
+_OVER_ONE = calibration.number("outside.over_one")
+
+
+def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
+    """The same, but where nearly all light is inferred: contrasts then leave its level and colour
+    open. It is taken to be white as a whole, and as bright as it must be for hardly a texel to
+    reflect more than it receives."""
+    inferred = sources.irradiance(found.log_radiance)
+    share = np.median(inferred.sum(axis=1) / (inferred + asked.irradiance).sum(axis=1))
+    if share < _MOSTLY_INFERRED:
+        return found
+    colour = np.log(inferred.mean(axis=0))
+    shift = colour.mean() - colour
+    reflected = asked.reflected[~asked.clipped]
+    inferred, known = (
+        light[~asked.clipped] for light in (inferred * np.exp(shift), asked.irradiance)
+    )
+    for factor in np.geomspace(1, _BRIGHTEST, _STEPS):
+        over = (reflected > known + factor * inferred).any(axis=1).mean()
+        if over < _OVER_ONE:
+            break
+    shift = shift + np.log(factor)
+    return found._replace(log_radiance=found.log_radiance + shift)
+
+
+_BRIGHTEST, _STEPS = 4.0, 57
 _BLOCKS = 10
 
 
