@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import ParamSpec
 
 from usdbrdf.asset.adopt import adopt, is_damaged
+from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.errors import OwnershipConflict
@@ -108,8 +109,8 @@ def working_on(
             for copy in adopt(asset, [asset.folder / file for file in edited]):
                 say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")
         yield asset
-        if known_hashes(state) != before:
-            warn_of_edits(Asset.at(asset.folder))
+        if known_hashes(state) != before and is_edited(made := Asset.at(asset.folder)):
+            warn_of_edits(made)
 
 
 def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:

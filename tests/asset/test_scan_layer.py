@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdMedia
 
+from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import relative_path
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import capture_camera, frames_from_stage, scene_from_stage
@@ -216,3 +217,12 @@ def test_the_thumbnail_is_there(built):
     assert os.path.isfile(thumbnail.resolvedPath)
     # What the scan layer says of the asset is not lost.
     assert stage.GetDefaultPrim().GetAssetInfo()["name"] == "room"
+
+
+def test_it_is_known_whether_an_artist_wrote_anything(built):
+    assert not is_edited(built.asset)
+    before = built.asset.edits_layer.read_text()
+    built.asset.edits_layer.write_text(before + '\nover "elsewhere" {}\n')
+    assert is_edited(built.asset)
+    built.asset.edits_layer.unlink()
+    assert is_edited(built.asset)

@@ -18,6 +18,7 @@ _PSI_GRID = np.linspace(0, 1, 201)
 POSTERIOR = ("phi_median", "psi_median", "psi_upper")
 _MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
+_NO_LOBE = calibration.number("fit.no_lobe")
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 
@@ -29,7 +30,9 @@ class LobeEstimate(NamedTuple):
     light; of_rays, what the rays' noise alone does to phi and psi, beside the stated errors until
     ``mean_of_repeats`` adds it to them. phi_median, psi_median, psi_upper: medians of either, and
     what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
-    highlight shows, the frames still say that psi is small or phi large."""
+    highlight shows, the frames still say that psi is small or phi large. Where no lobe at all is
+    clearly likelier than one, both being alike before, psi_median is 0: the simpler model explains
+    as much."""
 
     phi: float
     psi: float
@@ -64,14 +67,19 @@ def lobe_from_costs(
     # Where rays are noisy, what they show is badly known as well, as the place of a mirrored lamp.
     noise_ratio = max(1.0, noisy / max(least, 1e-12))
     temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
-    density = np.exp(-0.5 * (surface - surface.min()) / temper)
+    lowest = min(float(surface.min()), without)
+    density = np.exp(-0.5 * (surface - lowest) / temper)
     density *= np.gradient(phis)[:, None]
+    # There may be no lobe at all, which was as likely before as that there is one.
+    none = math.exp(-0.5 * (without - lowest) / temper)
+    none /= none + float(density.sum()) / len(_PSI_GRID)
     density /= density.sum()
     phi_error = _deviation(density.sum(axis=1), phis, phi)
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
     psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (0.5, 0.95))
+    psi_median = 0.0 if none > _NO_LOBE else psi_median
     (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,

@@ -28,7 +28,7 @@ from usdbrdf.asset.layers.author import (
 from usdbrdf.asset.layout import ROLES, Asset, relative_path, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Scan
@@ -76,10 +76,23 @@ def check_root(asset: Asset, header: StageHeader) -> None:
 
 def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:
     """edits.usda: empty, for the artist. Written once, never again."""
+    export(_no_edits(header), path, folder=asset.folder)
+
+
+def _no_edits(header: StageHeader) -> Sdf.Layer:
     layer = new_layer(header, Provenance(role="edits", version=_VERSION))
     layer.documentation = "Yours: stronger than everything that was measured, never overwritten."
     over(layer, f"/{header.name}")
-    export(layer, path, folder=asset.folder)
+    return layer
+
+
+def is_edited(asset: Asset) -> bool:
+    """Whether an artist's edits.usda is another than the one that was written."""
+    try:
+        empty = _no_edits(read_header(asset.layer("scan"))).ExportToString()
+        return asset.edits_layer.read_bytes() != empty.encode("utf-8")
+    except (OSError, InputRefused):
+        return True
 
 
 def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
