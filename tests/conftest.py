@@ -37,6 +37,7 @@ SLOW = (
     "relighting/test_relight.py",
     "shading/test_denoise.py",
     "shading/test_denoise_default.py",
+    "shading/test_outside.py",
     "tasks/test_texture.py",
     "test_cli.py",
     "test_convert.py",

@@ -91,7 +91,7 @@ def test_sun_and_sky_are_found_by_the_light_that_they_cast(yard, clips: bool):
     sun = found.environment.sun
     assert np.degrees(np.arccos(sun.direction @ TOWARDS)) < 1
     np.testing.assert_allclose(sun.irradiance, SUN.irradiance, rtol=0.25 if clips else 0.1)
-    assert found.sun_error < 0.3
+    assert found.sun_error < 0.4
     np.testing.assert_allclose(
         _of_upper_half(found.environment.image), _of_upper_half(SKY), rtol=0.35
     )

@@ -121,3 +121,17 @@ def test_the_sun_of_a_picture_is_taken_apart_and_all_light_stays():
     np.testing.assert_allclose(found.sun.irradiance, expected, rtol=1e-5)
     assert found.sun.direction @ towards > np.cos(0.005)
     np.testing.assert_allclose(found.image, 0.5)
+
+
+def test_no_sun_comes_around_the_corner_of_a_room():
+    # Sun from behind a wall that ends at the floor's edge: the floor's border texels reach beyond.
+    world = world_of([
+        quad((0, 0, 0), (4, 0, 0), (0, 4, 0), (15, 15)),
+        quad((0.1, -4, -1), (0, 0, 30), (0, 12, 0)),
+    ])  # fmt: skip
+    sun = Sun(np.array([-0.6, 0.0, 0.8]), IRRADIANCE)
+    floor = np.arange(*world.texels.of_object(0).indices(len(world.texels)))
+    share = sunlit(_surface(world), floor, sun, 0)
+    inside = world.texels.position[floor, 0] > 0.1
+    assert not share[inside].any()
+    assert inside.mean() > 0.9

@@ -55,7 +55,14 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
     normal = np.repeat(texels.geometric_normal[index], count, axis=0)
     origin = lift_from_surface(position, normal, surface.diagonal_m)
     hits = surface.rays.closest(origin, towards_sun(sun, drawn[..., 2:].reshape(-1, 2)))
-    share: Float = (hits.face < 0).reshape(-1, count).mean(axis=1, dtype=np.float32)
+    free = np.flatnonzero(hits.face < 0)
+    # In a corner some of a texel's square lies beyond the other wall, where the sun may shine.
+    centre = lift_from_surface(texels.position[index], texels.geometric_normal[index],
+                               surface.diagonal_m)[free // count]  # fmt: skip
+    way = surface.rays.closest(centre, origin[free] - centre)
+    seen = np.zeros(len(origin), np.float32)
+    seen[free] = (way.face < 0) | (way.distance > 1)
+    share: Float = seen.reshape(-1, count).mean(axis=1)
     return share
 
 
