@@ -101,7 +101,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         ("--max-texels N", "texels", "default: as many as the memory holds"),
         ("--standard-error E", "relative", "(default: 0.03)"),
         ("--rays N", "rays per texel", "default: 2048"),
-        ("--environment HDR", "latitude-longitude", "default: black"),
+        ("--environment estimate|none|HDR", "latitude-longitude", "(default: estimate)"),
         ("--seed N", "random", "(default: 0)"),
     ):
         said = text.split(f" {name} ")[-1].split(" --")[0]
@@ -136,7 +136,7 @@ def test_an_option_means_the_same_in_each_command(name, capsys):
     everything = " ".join(capsys.readouterr().out.split())
     main([name, "--help"])
     own = " ".join(capsys.readouterr().out.split())
-    for option in ("--seed N seed", "--environment HDR lat"):
+    for option in ("--seed N seed", "--environment estimate|none|HDR light"):
         sentence = own[own.index(option) :].split(" --")[0].split(" exit codes")[0]
         assert sentence in everything
 

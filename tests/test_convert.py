@@ -327,7 +327,8 @@ def test_an_environment_lights_an_open_scene_by_pi_times_its_radiance(tmp_path):
     coarse = replace(
         OPTIONS,
         texture=replace(OPTIONS.texture, texel_size=0.1),
-        shade=replace(OPTIONS.shade, denoise="none"),
+        shade=replace(OPTIONS.shade, denoise="none", environment="none"),
+        fit=replace(OPTIONS.fit, environment="none"),
     )
     usdbrdf.convert(made.folder, folder, coarse)
     file = folder / "textures" / "box.irradiance.exr"

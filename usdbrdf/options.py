@@ -133,8 +133,8 @@ def kind_of_light(environment: Surroundings) -> str:
 
 
 def _environment() -> Surroundings:
-    text = """light from outside the scan: estimate: what the frames show and what its light and
-        shadows tell; none; or a latitude-longitude picture"""
+    told = "what the frames show and what its light and shadows tell"
+    text = f"light from outside the scan: estimate: {told}; none; or a latitude-longitude picture"
     more = {"file": True, "words": (ESTIMATE, NO_LIGHT), "shared": "light transport", "help": text}
     return option("--environment estimate|none|HDR", ESTIMATE, **more)
 

@@ -146,3 +146,22 @@ def test_what_is_found_is_kept_as_it_is():
     assert same.open_share == 0.5
     assert np.isnan(same.sun_error)
     assert not Outside.given(Environment(SKY, True).under(NO_SUN)).environment.sun.shines
+
+
+def test_a_lone_object_in_the_open_gets_light_that_lets_nothing_reflect_too_much():
+    lone = world_of(box((0, 0, 0), (1, 1, 1), (16, 16)))
+    surface, lit, _ = _lit(lone, Environment(SKY, True))
+    every = np.ones(len(lit), np.bool_)
+    coverage = CoverageMap.of(every, ~every)
+    found = light_from_outside(surface, lit, coverage, Surroundings.unseen(), True, seed=3)
+    assert found is not None
+    arriving = irradiance_at(
+        surface.rays, surface.texture(lit), lights_from_radiance(lone.scene, lone.texels, lit),
+        found.environment, lone.texels.position, lone.texels.normal,
+        independent_tiles(len(lit)), Sampling(standard_error=0.02, max_rays=512),
+        surface.diagonal_m,
+    ).mean  # fmt: skip
+    albedo = np.pi * lit / np.maximum(arriving, 1e-6)
+    assert (albedo > 1).any(axis=1).mean() < 0.03
+    # Not black either.
+    assert 0.1 < np.median(albedo) < 0.7

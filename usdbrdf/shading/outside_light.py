@@ -208,10 +208,14 @@ _BLOCKS = 10
 
 
 def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
-    """(K, 3) standard errors of the logarithms, if objects err as a whole."""
-    objects = np.unique(asked.owner)
-    block = np.searchsorted(objects, asked.owner) % min(_BLOCKS, max(len(objects), 2))
+    """(K, 3) standard errors of the logarithms, if objects (segments where they are few) err as a
+    whole; infinite where there is but one."""
+    few = len(np.unique(asked.owner)) < _BLOCKS
+    _, block = np.unique(asked.segment if few else asked.owner, return_inverse=True)
+    block %= _BLOCKS
     moved, blocks = np.zeros_like(found.log_radiance), np.unique(block)
+    if len(blocks) < 2:
+        return np.full_like(found.log_radiance, np.inf)
     for number in blocks:
         kept = block != number
         some = asked.of(kept)

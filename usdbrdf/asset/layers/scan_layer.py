@@ -90,7 +90,7 @@ def is_edited(asset: Asset) -> bool:
     """Whether an artist's edits.usda is another than the one that was written."""
     try:
         empty = _no_edits(read_header(asset.layer("scan"))).ExportToString()
-        return asset.edits_layer.read_bytes() != empty.encode("utf-8")
+        return bool(asset.edits_layer.read_bytes() != empty.encode("utf-8"))
     except (OSError, InputRefused):
         return True
 
