@@ -75,6 +75,11 @@ class OptionField(NamedTuple):
 
     def check(self, value: Any, subject: str) -> None:
         """Raise UsageError for a value that is none of the choices or out of the limits."""
+        if self.option is not None and self.option.words and not isinstance(value, Path):
+            if value not in self.option.words:
+                words = " or ".join(self.option.words)
+                raise UsageError(f"{subject}: expected {words}, or a Path. [usage.option]")
+            return
         if value is None or self.option is None:
             return
         (low, high), counts = self.option.limits, self.option.counts

@@ -38,7 +38,7 @@ from usdbrdf.validation.rule import AssetStage
 VARIABILITY = {True: Sdf.VariabilityUniform, False: Sdf.VariabilityVarying}
 SCHEMAS = Path(__file__).resolve().parents[2] / "schemas"
 UNITS = (
-    "metres|seconds|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
+    "metres|seconds|radians|pixels|texels|counted from 0|without unit|pure numbers|W m-2 sr-1|"
     "units of the pixel values|[Nn]umber of|Loss of the fit"
 )
 NAMES = ("Object", "Capture", "Aov", "Texturing", "Shading", "MaterialFit", "Emitter", "Outside")

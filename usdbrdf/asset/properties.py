@@ -272,9 +272,9 @@ class LightFromOutside:
         of what was inferred of the picture; without unit.""", low=0)]
     sun_irradiance: Annotated[Colour, Fact(OUTSIDE, "sunIrradiance", "color3f", (0, 0, 0), """What
         the sun brings to a surface that faces it, linear Rec.709, in W m-2 where the capture is
-        calibrated; black where there is no sun.""", low=0)]
+        calibrated, else in the units of the pixel values; black where there is no sun.""", low=0)]
     sun_direction: Annotated[Colour, Fact(OUTSIDE, "sunDirection", "vector3f", (0, 0, 1), """Unit
-        vector towards the sun, in the frame of the world.""",
+        vector towards the sun, in the frame of the world; without unit.""",
         when=lambda outside: any(outside.sun_irradiance))]
     sun_half_angle: Annotated[float, Fact(OUTSIDE, "sunHalfAngle", "float", 0.00465, """Half of the
         angle of the sun's disc, in radians.""", low=0,

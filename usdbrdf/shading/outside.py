@@ -19,7 +19,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
@@ -51,6 +51,7 @@ _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
 _BESIDE = calibration.number("outside.alike_within")
 _SEED = 0x51C4
+_DARKEST = 1e-3  # of what is usual: darker sky is none
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
@@ -135,7 +136,7 @@ def light_from_outside(
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
     light leaves it. seen: what the frames show of it."""
-    asked = _asked(surface, lit, coverage, seen, z_up, seed)
+    asked = _asked(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
     measured, clipped = seen.coverage.measured, seen.coverage.clipped
@@ -145,23 +146,27 @@ def light_from_outside(
     share, open_share = _shares(surface, asked, np.where(measured, -1, patches), z_up, seed)
     if open_share < _LEAST_OPEN:
         return None
+    asked = asked._replace(irradiance=_light_of_seen(surface, lit, asked, seen, z_up, seed))
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     sky = _sky(asked, seen, patches, share, used, z_up)
     level = solved(asked, sky)
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.
-    sun = find_sun(surface, asked, asked.irradiance + sky.irradiance(sky.mean), z_up)
-    for _ in range(2):
+    light, sun = asked.irradiance + sky.irradiance(sky.mean), None
+    for _ in range(3):
+        sun = find_sun(surface, asked, light, z_up, sun)
         with_sun = _with_sun(surface, asked, sky, sun, seed)
         found = solved(*with_sun)
         light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
-        sun = find_sun(surface, asked, light, z_up, sun)
+    assert sun is not None
+    strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     error = jackknife(*with_sun, found)
     found = levelled(*with_sun, found)
     sun_error = float(error[-1].max())
-    strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
-    shines = sun_error < _MOST_SUN_ERROR and strength > _LEAST_SUN
+    # What no texel sees keeps what was thought of it before, and errs by nothing.
+    sees = int(np.count_nonzero(with_sun[1].share[-1]))
+    shines = sees >= _LEAST_OF_SEGMENT and sun_error < _MOST_SUN_ERROR and strength > _LEAST_SUN
     if shines:
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
@@ -178,18 +183,10 @@ def light_from_outside(
     )
 
 
-def _asked(
-    surface: TexturedScene,
-    lit: Float,
-    coverage: CoverageMap,
-    seen: Surroundings,
-    z_up: bool,
-    seed: int,
-) -> Asked | None:
-    """Texels of the largest segments that were measured, with some of them that clip; None where
-    there are too few."""
-    texels = surface.texels
-    usable = np.flatnonzero(coverage.observed & texels.interior)
+def _asked(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Asked | None:
+    """Texels of the largest segments that were measured, with some of them that clip, and no light
+    yet; None where there are too few."""
+    usable = np.flatnonzero(coverage.observed & texels.interior & (lit > 0).all(axis=1))
     owner, normal = texels.object_index()[usable], texels.normal[usable]
     axis = np.abs(normal).argmax(axis=1)
     segment = 6 * owner + 2 * axis + (normal[np.arange(len(usable)), axis] > 0)
@@ -207,7 +204,25 @@ def _asked(
     rank = rank[np.argsort(segment[rank], kind="stable")]
     place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
     kept = rank[place < _PER_SEGMENT]
-    index = usable[kept]
+    many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= _LEAST_OF_SEGMENT / 2
+    kept = kept[many]
+    if not len(kept):
+        return None
+    return Asked(
+        texel=usable[kept],
+        segment=np.unique(segment[kept], return_inverse=True)[1].astype(np.int32),
+        owner=owner[kept].astype(np.int32),
+        reflected=np.pi * lit[usable[kept]].astype(np.float64),
+        clipped=~measured[kept],
+        irradiance=np.zeros((len(kept), 3)),
+    )
+
+
+def _light_of_seen(
+    surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
+) -> Double:
+    """S (N, 3), W/m^2, of the texels asked by all that frames measured."""
+    texels, index = surface.texels, asked.texel
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
     irradiance = irradiance_at(
@@ -215,18 +230,7 @@ def _asked(
         environment, texels.position[index], texels.normal[index], independent_tiles(len(index)),
         replace(_SAMPLING, seed=seed), surface.diagonal_m,
     ).mean  # fmt: skip
-    reflected = np.pi * lit[index].astype(np.float64)
-    bright = np.flatnonzero((reflected > 0).all(axis=1))
-    index, kept, irradiance = index[bright], kept[bright], irradiance[bright]
-    reflected = reflected[bright]
-    return Asked(
-        texel=index,
-        segment=np.unique(segment[kept], return_inverse=True)[1].astype(np.int32),
-        owner=owner[kept].astype(np.int32),
-        reflected=reflected,
-        clipped=~measured[kept],
-        irradiance=np.maximum(irradiance, _DARK * np.median(reflected)).astype(np.float64),
-    )
+    return np.maximum(irradiance, _DARK * np.median(asked.reflected)).astype(np.float64)
 
 
 def _patches(clipped: Bool, z_up: bool) -> Int:
@@ -279,7 +283,8 @@ def _sky(
     if not usual.any():
         usual = np.median(asked.reflected, axis=0) / np.pi
     bound = used >= _PATCHES
-    mean = np.tile(np.log(np.maximum(usual, 1e-6 * usual.max() + 1e-30)), (len(used), 1))
+    darkest = max(_DARKEST * float(usual.max()), 1e-30)
+    mean = np.tile(np.log(np.maximum(usual, darkest)), (len(used), 1))
     directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
     centre = np.zeros((len(used), 3))
     for k, patch in enumerate(used):
@@ -288,7 +293,7 @@ def _sky(
         if bound[k]:
             mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _ABOVE_LIMIT[0]
         elif near.any():
-            mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), 1e-30))
+            mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), darkest))
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
     near = np.argwhere(np.triu(centre @ centre.T > np.cos(_BESIDE), 1))
     near = near[~bound[near].any(axis=1)]
@@ -310,7 +315,7 @@ def _with_sun(
     share = sunlit(surface, asked.texel, sun, seed).astype(np.float64)
     cosine = np.maximum(surface.texels.normal[asked.texel] @ sun.direction, 0)
     kept = (share < 0.02 * cosine + 1e-6) | (share > 0.98 * cosine)
-    strength = np.log(np.median(asked.irradiance, axis=0))
+    strength = np.log(np.median(asked.irradiance + sky.irradiance(sky.mean), axis=0))
     sources = Sources(
         share=np.concatenate([sky.share, share[None]])[:, kept],
         mean=np.concatenate([sky.mean, strength[None]]),
@@ -328,5 +333,6 @@ def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double) -> 
     filled = np.tile(_usual_sky(seen), (HEIGHT * WIDTH, 1))
     for patch, value in zip(used, radiance, strict=True):
         filled[patches == patch] = value
+    filled = np.where(seen.coverage.clipped[:, None], np.maximum(filled, seen.radiance), filled)
     known = seen.coverage.measured[:, None]
     return np.where(known, seen.radiance, filled).reshape(HEIGHT, WIDTH, 3).astype(np.float32)

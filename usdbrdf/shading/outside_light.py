@@ -189,11 +189,15 @@ def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
     share = np.median(inferred.sum(axis=1) / (inferred + asked.irradiance).sum(axis=1))
     if share < _MOSTLY_INFERRED:
         return found
+    # What is so much brighter than the rest shines by itself.
+    lamp = (found.log_albedo - found.mean).max(axis=1) > _LAMP * _OF_SEGMENT
+    plain = ~asked.clipped & ~lamp[asked.segment]
+    if not plain.any():
+        return found
     colour = np.log(inferred.mean(axis=0))
     shift = colour.mean() - colour
-    reflected = asked.reflected[~asked.clipped]
-    inferred, known = (
-        light[~asked.clipped] for light in (inferred * np.exp(shift), asked.irradiance)
+    reflected, inferred, known = (
+        light[plain] for light in (asked.reflected, inferred * np.exp(shift), asked.irradiance)
     )
     for factor in np.geomspace(1, _BRIGHTEST, _STEPS):
         over = (reflected > known + factor * inferred).any(axis=1).mean()
@@ -203,7 +207,7 @@ def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
     return found._replace(log_radiance=found.log_radiance + shift)
 
 
-_BRIGHTEST, _STEPS = 4.0, 57
+_BRIGHTEST, _STEPS, _LAMP = 4.0, 57, 3.0
 _BLOCKS = 10
 
 

@@ -56,7 +56,8 @@ def find_sun(
             return np.concatenate(list(pool.map(cost, parts)))
 
     tried = _spread(2 * _DIRECTIONS)
-    tried = tried[tried[:, 2 if z_up else 1] > 0]
+    up = 2 if z_up else 1
+    tried = tried[tried[:, up] > 0]
     if near:
         tried = tried[tried @ near.direction > np.cos(_NEAR)]
     # The way down is rough: a shadow's edge counts when it passes a texel.
@@ -65,6 +66,7 @@ def find_sun(
     for _ in range(_REFINED):
         around = np.stack([_around(direction, reach) for direction in kept])
         cost_around = costs(around.reshape(-1, 3)).reshape(len(kept), -1)
+        cost_around[around[..., up] <= 0] = np.inf
         best = cost_around.argmin(axis=1)
         order = np.argsort(cost_around.min(axis=1), kind="stable")
         kept = around[np.arange(len(kept)), best][order][: max(1, len(kept) // 2)]

@@ -84,19 +84,23 @@ def _seen_in_frame(
 ) -> tuple[Array, Float, Long]:
     """Directions of which one frame shows all valid pixels, (M,) int32, and their mean (M, 3);
     and those of which it shows saturated ones alone, (K,)."""
-    _, towards = camera.rays(camera.pixels())
+    # Four pixels to a direction's side are enough.
+    step = max(1, int(camera.intrinsics[0] * np.pi / HEIGHT / 4))
+    _, towards = camera.rays(camera.pixels(step))
+    valid, clipped = pixels.valid[::step, ::step], pixels.clipped[::step, ::step]
+    shown = pixels.radiance[::step, ::step]
     faces = rays.closest(camera.eye[None].astype(np.float32), towards).face
-    miss = (faces < 0).reshape(pixels.valid.shape)
+    miss = (faces < 0).reshape(valid.shape)
     # A pixel beside the mesh shows some of it.
     alone: Bool = ndimage.binary_erosion(miss, np.ones((3, 3)))
     which = np.flatnonzero(alone)
     place = pixels_of_directions(towards[which], HEIGHT, WIDTH, z_up)
-    count, valid, clipped = (
+    count, num_valid, num_clipped = (
         np.bincount(place, weights, HEIGHT * WIDTH)
-        for weights in (None, pixels.valid.ravel()[which], pixels.clipped.ravel()[which])
+        for weights in (None, valid.ravel()[which], clipped.ravel()[which])
     )
-    whole = np.flatnonzero((count > 0) & (valid == count))
-    shown = np.nan_to_num(pixels.radiance.reshape(-1, 3)[which])
-    sums = [np.bincount(place, shown[:, c], HEIGHT * WIDTH)[whole] for c in range(3)]
+    whole = np.flatnonzero((count > 0) & (num_valid == count))
+    brought = np.nan_to_num(shown.reshape(-1, 3)[which])
+    sums = [np.bincount(place, brought[:, c], HEIGHT * WIDTH)[whole] for c in range(3)]
     mean = (np.stack(sums, axis=-1) / count[whole, None]).astype(np.float32)
-    return whole.astype(np.int32), mean, np.flatnonzero((count > 0) & (clipped == count))
+    return whole.astype(np.int32), mean, np.flatnonzero((count > 0) & (num_clipped == count))

@@ -146,12 +146,12 @@ def with_sun_apart(image: Float, z_up: bool) -> Environment:
         return Environment(image=image, z_up=z_up)
     around = np.median(image[beside], axis=0)
     disc = near & (level > _BRIGHTER * around.mean())
-    over = (image[disc] - around) * weight[disc][:, None]
+    over = np.maximum(image[disc] - around, 0) * weight[disc][:, None]
     if over.sum() <= _LEAST_SHARE * float((image * weight[..., None]).sum()):
         return Environment(image=image, z_up=z_up)
     towards = over.mean(axis=1) @ directions[disc]
     rest = image.copy()
-    rest[disc] = around
+    rest[disc] = np.minimum(image[disc], around)
     half_angle = float(np.sqrt(weight[disc].sum() / np.pi))
     sun = Sun(towards / np.linalg.norm(towards), over.sum(axis=0).astype(np.float64), half_angle)
     return Environment(rest, z_up).under(sun)
