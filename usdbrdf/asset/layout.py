@@ -73,7 +73,7 @@ class Asset:
 
     @property
     def lights_layer(self) -> Path:
-        """The emitters as UsdLux lights: a sublayer of shading.usda that may be muted."""
+        """Emitters, sky and sun as UsdLux lights: a sublayer of shading.usda that may be muted."""
         return self.folder / "layers" / "lights.usda"
 
     @property

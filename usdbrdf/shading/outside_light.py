@@ -51,7 +51,7 @@ class Sources(NamedTuple):
 
 _FREEDOM = calibration.number("outside.student_freedom")
 _INDEPENDENT = calibration.number("outside.independent")
-USUAL_ALBEDO = calibration.pair("outside.albedo")
+_USUAL_ALBEDO = calibration.pair("outside.albedo")
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
 _ALIKE = calibration.number("outside.alike")
@@ -77,7 +77,7 @@ def solved(
         rest = np.log(asked.reflected) - light
         num = int(asked.segment.max()) + 1
         albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
-        start = Solution(sources.mean.copy(), albedo, np.full(3, USUAL_ALBEDO[0]))
+        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]))
     found = start
     # Which channel it is that clips, what does not clip tells first.
     for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
@@ -168,9 +168,9 @@ def _add_priors(
     curvature[segment, segment] += precision_of
     curvature[segment, last] -= precision_of
     curvature[last, segment] -= precision_of
-    curvature[last, last] += precision_of * len(albedo) + USUAL_ALBEDO[1] ** -2
+    curvature[last, last] += precision_of * len(albedo) + _USUAL_ALBEDO[1] ** -2
     gradient[segment] -= precision_of * off
-    gradient[last] += precision_of * off.sum() + (USUAL_ALBEDO[0] - mean) / USUAL_ALBEDO[1] ** 2
+    gradient[last] += precision_of * off.sum() + (_USUAL_ALBEDO[0] - mean) / _USUAL_ALBEDO[1] ** 2
     # Nothing reflects more than it receives.
     over = np.maximum(albedo - np.log(_WHITEST), 0)
     curvature[segment, segment] += (over > 0) * _AS_WHITE**-2

@@ -22,7 +22,6 @@ from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.outside import Outside
-from usdbrdf.shading.outside_light import USUAL_ALBEDO
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment, black_environment
@@ -276,8 +275,8 @@ class Shaded:
             )
         elif escaped > _MOSTLY_OPEN and self.outside and self.outside.is_estimated:
             yield (
-                f"{100 * escaped:.0f} % of the light's directions leave the scan; its level is the "
-                f"one at which the mean albedo is near {math.exp(USUAL_ALBEDO[0]):.2f}. Give the "
+                f"{100 * escaped:.0f} % of the light's directions leave the scan. What no frame "
+                "shows of its light is inferred, its level from albedos that are usual. Give the "
                 "surroundings as --environment to measure it. [shading.open]"
             )
 

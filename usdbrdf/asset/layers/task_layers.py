@@ -3,11 +3,14 @@
 Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``. A lighter wants
 lights: something to dim, to link, to sample well. The measured emission is in the materials, and a
 renderer that honoured both would count every lamp twice. So the default prim has a variant set:
-``emissive``, the default, has no lights; ``usdlux`` has them, and scales the emission of the lamps
-they stand for to nothing. A shot that references the asset chooses by one opinion of its own, which
-neither a muted layer nor invisible lights in the root would allow: mutes are a session's, not a
-file's, and visibility would leave the glowing surfaces on. A layer may still be muted: all of it is
-in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+``emissive``, the default where anything shines, has no lights; ``usdlux`` has them, and scales the
+emission of the lamps they stand for to nothing. A shot that references the asset chooses by one
+opinion of its own, which neither a muted layer nor invisible lights in the root would allow: mutes
+are a session's, not a file's, and visibility would leave the glowing surfaces on. A layer may still
+be muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+
+The light from outside is a DomeLight with its picture, and a DistantLight where there is a sun: in
+``usdlux`` alone, too.
 
 Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
 ``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
