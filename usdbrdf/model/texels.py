@@ -133,6 +133,14 @@ class Texels:
         own = self.of_object(index)
         return np.average(values[own], axis=0, weights=np.maximum(self.area[own], 1e-12))
 
+    def segments(self, index: Long) -> Int:
+        """(N,) int32, equal for texels ``index`` (N,) of one object that face alike: their normals
+        are longest along the same axis."""
+        normal = self.normal[index]
+        axis = np.abs(normal).argmax(axis=1)
+        facing = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
+        return np.asarray(6 * self.object_index()[index] + facing, np.int32)
+
     def object_index(self) -> Int:
         """(T,) int32, the object of each texel."""
         return np.repeat(np.arange(len(self.resolution), dtype=np.int32), np.diff(self.first_texel))

@@ -173,11 +173,7 @@ def estimate_clipped_light(
 def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
     """Measured texels spread over all objects, denser near the lamps, and their segments."""
     usable = np.flatnonzero(measured & texels.interior & (groups.group < 0))
-    owner = texels.object_index()[usable]
-    normal = texels.normal[usable]
-    axis = np.abs(normal).argmax(axis=1)
-    facing = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
-    segment = (6 * owner + facing).astype(np.int32)
+    segment = texels.segments(usable)
     nearness = np.full(len(usable), 1e-6)
     for k in np.flatnonzero(groups.lamp):
         own = groups.group == k
@@ -192,11 +188,30 @@ def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) ->
     numbers = np.argsort(-lit_by_lamps, kind="stable")[:_SEGMENTS]
     numbers = numbers[lit_by_lamps[numbers] > 0]
     each = int(np.clip(_TEXELS // max(len(numbers), 1), _LEAST_OF_SEGMENT, _PER_SEGMENT))
+    kept = np.sort(first_of_segments(rank, segment, numbers, each))
+    return usable[kept], segment[kept]
+
+
+def first_of_segments(rank: Long, segment: Int, numbers: Long, most: int) -> Long:
+    """Of those in ``rank`` (R,), indices into ``segment`` (N,), the first of each of the segments
+    ``numbers``, ``most`` at most; by segment."""
     rank = rank[np.isin(segment[rank], numbers)]
     rank = rank[np.argsort(segment[rank], kind="stable")]
     place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
-    kept = np.sort(rank[place < each])
-    return usable[kept], segment[kept]
+    return rank[place < most]
+
+
+def irradiance_of_texels(
+    surface: TexturedScene, light: Float, outside: Environment, index: Long, seed: int
+) -> Float:
+    """S (N, 3), W/m^2, of a few texels with the radiance ``light`` (T, 3) and what is outside."""
+    texels = surface.texels
+    return sunlight(surface, index, outside.sun, seed) + irradiance_at(
+        surface.rays, surface.texture(light),
+        lights_from_radiance(surface.scene, texels, light), outside,
+        texels.position[index], texels.normal[index], independent_tiles(len(index)),
+        replace(_SAMPLING, seed=seed), surface.diagonal_m,
+    ).mean  # fmt: skip
 
 
 def _evidence(
@@ -210,24 +225,17 @@ def _evidence(
 ) -> Evidence:
     texels = surface.texels
 
-    def traced(light: Float, outside: Environment, seed: int) -> Float:
-        """S (N, 3) at the chosen texels with the radiance ``light`` (T, 3)."""
-        return sunlight(surface, chosen, outside.sun, seed) + irradiance_at(
-            surface.rays, surface.texture(light),
-            lights_from_radiance(surface.scene, texels, light), outside,
-            texels.position[chosen], texels.normal[chosen], independent_tiles(len(chosen)),
-            replace(_SAMPLING, seed=seed), surface.diagonal_m,
-        ).mean  # fmt: skip
-
     lamps = []
     for k in range(len(groups)):
         alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
         light = np.repeat(alone, 3, axis=1).astype(np.float32)
-        lamps.append(traced(light, black_environment(), seed + k + 1))
+        lamps.append(
+            irradiance_of_texels(surface, light, black_environment(), chosen, seed + k + 1)
+        )
     dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
     return Evidence(
         radiance=lit[chosen],
-        irradiance=traced(dark, environment, seed),
+        irradiance=irradiance_of_texels(surface, dark, environment, chosen, seed),
         lamp_irradiance=np.stack(lamps),
         position=texels.position[chosen],
         segment=segment,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.options import Sampling
+from usdbrdf.shading.clipped_light import first_of_segments, irradiance_of_texels
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -31,8 +31,6 @@ from usdbrdf.transport.environment import (
     directions_of_pixels,
     pixels_of_directions,
 )
-from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
-from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.sunlight import sunlit
@@ -41,7 +39,6 @@ from usdbrdf.transport.warps import cosine_rays
 # Texels that are asked, at most and at least on one side of one object (a segment), segments, and
 # the rays by which each of them meets the sky.
 _PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS, _RAYS = 240, 30, 80, 1024
-_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 # Lower and upper elevation of a band of patches, degrees, and their number.
 _BANDS = (
     (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
@@ -150,7 +147,6 @@ def light_from_outside(
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     sky = _sky(asked, seen, patches, share, used, z_up)
-    level = solved(asked, sky)
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.
     light, sun = asked.irradiance + sky.irradiance(sky.mean), None
@@ -170,7 +166,8 @@ def light_from_outside(
     if shines:
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
-        sun, found, error = NO_SUN, levelled(asked, sky, level), jackknife(asked, sky, level)
+        sun, found = NO_SUN, solved(asked, sky)
+        found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
     radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]))
     weight = share[used].mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
@@ -187,9 +184,7 @@ def _asked(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Aske
     """Texels of the largest segments that were measured, with some of them that clip, and no light
     yet; None where there are too few."""
     usable = np.flatnonzero(coverage.observed & texels.interior & (lit > 0).all(axis=1))
-    owner, normal = texels.object_index()[usable], texels.normal[usable]
-    axis = np.abs(normal).argmax(axis=1)
-    segment = 6 * owner + 2 * axis + (normal[np.arange(len(usable)), axis] > 0)
+    segment = texels.segments(usable)
     measured = coverage.measured[usable]
     area = np.bincount(segment, texels.area[usable] * measured)
     enough = np.bincount(segment, measured) >= np.maximum(
@@ -200,10 +195,7 @@ def _asked(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Aske
     if not len(largest):
         return None
     rank = np.random.default_rng(seed ^ _SEED).permutation(len(usable))
-    rank = rank[np.isin(segment[rank], largest)]
-    rank = rank[np.argsort(segment[rank], kind="stable")]
-    place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
-    kept = rank[place < _PER_SEGMENT]
+    kept = first_of_segments(rank, segment, largest, _PER_SEGMENT)
     many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= _LEAST_OF_SEGMENT / 2
     kept = kept[many]
     if not len(kept):
@@ -211,7 +203,7 @@ def _asked(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Aske
     return Asked(
         texel=usable[kept],
         segment=np.unique(segment[kept], return_inverse=True)[1].astype(np.int32),
-        owner=owner[kept].astype(np.int32),
+        owner=texels.object_index()[usable[kept]],
         reflected=np.pi * lit[usable[kept]].astype(np.float64),
         clipped=~measured[kept],
         irradiance=np.zeros((len(kept), 3)),
@@ -222,14 +214,9 @@ def _light_of_seen(
     surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
 ) -> Double:
     """S (N, 3), W/m^2, of the texels asked by all that frames measured."""
-    texels, index = surface.texels, asked.texel
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
-    irradiance = irradiance_at(
-        surface.rays, surface.texture(lit), lights_from_radiance(surface.scene, texels, lit),
-        environment, texels.position[index], texels.normal[index], independent_tiles(len(index)),
-        replace(_SAMPLING, seed=seed), surface.diagonal_m,
-    ).mean  # fmt: skip
+    irradiance = irradiance_of_texels(surface, lit, environment, asked.texel, seed)
     return np.maximum(irradiance, _DARK * np.median(asked.reflected)).astype(np.float64)
 
 

@@ -16,6 +16,7 @@ from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import Sun
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.warps import axes_across
 
 # Directions of the first search; how many of them are followed; how much finer each of the next
 # searches is, of which there are so many; candidates for the sun's irradiance, in units of the
@@ -86,9 +87,8 @@ def _around(direction: Double, reach: float) -> Double:
     """(M, 3) unit directions on a grid within ``reach`` radians of one."""
     steps = np.linspace(-reach, reach, 9)
     x, y = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps))
-    right = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
-    right /= np.linalg.norm(right)
-    near = direction + x * right + y * np.cross(direction, right)
+    right, up = axes_across(direction)
+    near = direction + x * right + y * up
     return np.asarray(near / np.linalg.norm(near, axis=1, keepdims=True))
 
 

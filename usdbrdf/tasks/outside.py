@@ -28,9 +28,7 @@ def outside_of(
     )  # fmt: skip
 
 
-def write_outside(
-    run: TaskRun, asset: Asset, outside: Outside, options: ShadeOptions
-) -> LightFromOutside:
+def write_outside(run: TaskRun, asset: Asset, outside: Outside) -> LightFromOutside:
     """Its pictures, and the record that names them."""
     image, sun = outside.environment.image, outside.environment.sun
     write_exr(run.output(asset.sky), image, half=not needs_float(image))
@@ -38,7 +36,7 @@ def write_outside(
     return LightFromOutside(
         sky=asset.sky,
         confidence=asset.sky_confidence,
-        source="given" if isinstance(options.environment, Path) else "estimated",
+        source="estimated" if outside.is_estimated else "given",
         open_share=outside.open_share,
         sky_error=outside.sky_error,
         sun_irradiance=colour(sun.irradiance),

@@ -57,7 +57,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         shaded = shade_surface(
             run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
         )
-        published = write_outside(run, asset, outside, options) if outside else None
+        published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = _write_maps(writer, shaded)
         layer = run.output(f"layers/{asset.layer('shading').name}")

@@ -9,7 +9,7 @@ from usdbrdf.model.arrays import Double, Float, Long
 from usdbrdf.transport.environment import Sun
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
-from usdbrdf.transport.warps import shifts_of
+from usdbrdf.transport.warps import axes_across, shifts_of
 
 # Rays of a texel: the first, and if some of these are blocked all others; texels at a time, which
 # bounds the memory; random numbers of their own.
@@ -68,10 +68,7 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
 
 def towards_sun(sun: Sun, drawn: Double) -> Float:
     """(R, 3) float32 unit directions to points of the disc, of numbers (R, 2) between 0 and 1."""
-    helper = np.eye(3)[np.abs(sun.direction).argmin()]
-    right = np.cross(helper, sun.direction)
-    right /= np.linalg.norm(right)
-    up = np.cross(sun.direction, right)
+    right, up = axes_across(sun.direction)
     radius, angle = np.tan(sun.half_angle) * np.sqrt(drawn[:, :1]), 2 * np.pi * drawn[:, 1:]
     directions = sun.direction + radius * (np.cos(angle) * right + np.sin(angle) * up)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -72,6 +72,13 @@ def tangent_frame(n: Float) -> tuple[float, float, float, float, float, float]:
     return (1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0], b, sign + n[1] * n[1] * a, -n[1])
 
 
+def axes_across(direction: Double) -> tuple[Double, Double]:
+    """Two unit vectors (3,) that make a right-handed frame with a unit vector (3,)."""
+    right = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
+    right /= np.linalg.norm(right)
+    return right, np.cross(direction, right)
+
+
 @kernel
 def triangle_point(u1: float, u2: float) -> tuple[float, float]:
     """Uniform barycentric (u, v) of a triangle from the unit square (E. Heitz, "A Low-Distortion

@@ -61,10 +61,18 @@ from usdbrdf.asset.layers.looks import (
 )
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
-from usdbrdf.asset.properties import FittedObject, LightFromOutside, ShadedObject, TexturedObject
+from usdbrdf.asset.properties import (
+    Colour,
+    FittedObject,
+    LightFromOutside,
+    ShadedObject,
+    TexturedObject,
+)
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.light import LampShape
+from usdbrdf.model.material import turned_up
+from usdbrdf.transport.warps import axes_across
 
 Types = Sdf.ValueTypeNames
 THUMBNAIL = "previews/lit.png"  # in the asset folder
@@ -142,26 +150,26 @@ def _author_outside(
     author_inputs(dome, Types.Token, **{"texture:format": "latlong"})
     author_inputs(dome, Types.Float, intensity=1.0)
     # A DomeLight's pole is its y axis.
-    turned = np.eye(4)
-    if header.up_axis == "Z":
-        turned[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    _author_pose(dome, np.linalg.inv(world_from_root) @ turned)
-    brightest = max(outside.sun_irradiance)
-    if brightest <= 0:
+    _author_pose(dome, np.linalg.inv(world_from_root) @ turned_up("Y", header.up_axis))
+    if not any(outside.sun_irradiance):
         return
     sun = define(layer, f"{lights}/sun", "DistantLight")
-    author_inputs(sun, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    _author_emission(sun, outside.sun_irradiance, normalize=True)
     author_inputs(sun, Types.Float, angle=math.degrees(2 * outside.sun_half_angle))
-    hue = Gf.Vec3f(*(value / brightest for value in outside.sun_irradiance))
-    author_inputs(sun, Types.Color3f, color=hue)
-    author_inputs(sun, Types.Bool, normalize=True)
     # It shines along its -z.
-    back = np.array(outside.sun_direction, np.float64)
-    right = np.cross(np.eye(3)[np.abs(back).argmin()], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=-1)
+    back, pose = np.array(outside.sun_direction, np.float64), np.eye(4)
+    pose[:3, :3] = np.stack([*axes_across(back), back], axis=-1)
     _author_pose(sun, np.linalg.inv(world_from_root) @ pose)
+
+
+def _author_emission(prim: Sdf.PrimSpec, emission: Colour, *, normalize: bool) -> None:
+    """What a light sends out, intensity * 2^exposure * color: radiance, or, if it is to
+    ``normalize``, a distant light's irradiance."""
+    brightest = max(emission)
+    colour = Gf.Vec3f(*(value / brightest for value in emission))
+    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
+    author_inputs(prim, Types.Color3f, color=colour)
+    author_inputs(prim, Types.Bool, normalize=normalize)
 
 
 def _author_pose(prim: Sdf.PrimSpec, pose: Double) -> None:
@@ -185,11 +193,7 @@ def _author_light(
     prim: Sdf.PrimSpec, shape: LampShape, world_from_root: Double, meters_per_unit: float
 ) -> None:
     """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
-    brightest = max(shape.radiance)
-    colour = Gf.Vec3f(*(value / brightest for value in shape.radiance))
-    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
-    author_inputs(prim, Types.Color3f, color=colour)
-    author_inputs(prim, Types.Bool, normalize=False)
+    _author_emission(prim, shape.radiance, normalize=False)
     width, height = (side / meters_per_unit for side in shape.size)
     if shape.kind == "rectangle":
         author_inputs(prim, Types.Float, width=width, height=height)
