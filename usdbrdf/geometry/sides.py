@@ -15,7 +15,7 @@ import numpy as np
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel
-from usdbrdf.model.arrays import Bool, Double, Int, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, doubled_areas, face_normals_and_angles, welded_ids
 from usdbrdf.transport.rays import RayScene, lift_from_surface
@@ -87,14 +87,28 @@ def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sig
     for camera in cameras:
         small = camera.at_width(min(camera.width, _MOST_ACROSS))
         face, point = visible_faces(rays, small)
-        face, point = face.reshape(-1), point.reshape(-1, 3)
-        way = small.eye - point
-        cosine = (way * normals[face]).sum(axis=1) / np.linalg.norm(way, axis=1)
-        for side, shown in enumerate((cosine > _GRAZING, cosine < -_GRAZING)):
-            number = np.bincount(face[shown & (face >= 0)], minlength=count)
-            pixels[:, side] += number
-            frames[:, side] += number > 0
+        shown = np.zeros_like(pixels)
+        _count_sides(face.reshape(-1), point.reshape(-1, 3), normals, small.eye, shown)
+        pixels += shown
+        frames += shown > 0
     return Sightings(pixels, frames)
+
+
+@kernel
+def _count_sides(face: Int, point: Float, normals: Double, eye: Double, shown: Int) -> None:
+    """Add to ``shown`` (F, 2) the pixels (P,) of which each shows the front or the back of a face,
+    at a point of it, clearly."""
+    for p in range(len(face)):
+        f = face[p]
+        if f < 0:
+            continue
+        towards, square = 0.0, 0.0
+        for c in range(3):
+            way = eye[c] - point[p, c]
+            towards += way * normals[f, c]
+            square += way * way
+        if towards * towards > _GRAZING * _GRAZING * square:
+            shown[f, 0 if towards > 0 else 1] += 1
 
 
 def connected_windings(mesh: ScanMesh) -> tuple[Long, Bool]:

@@ -37,8 +37,9 @@ from usdbrdf.transport.sunlight import sunlit
 from usdbrdf.transport.warps import cosine_rays
 
 # Texels that are asked, at most and at least on one side of one object (a segment), segments, and
-# the rays by which each of them meets the sky.
-_PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS, _RAYS = 240, 30, 80, 1024
+# the rays by which each of them meets the sky: at first, and where it does.
+_PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS = 240, 30, 80
+_FIRST_RAYS, _RAYS = 32, 1024
 # Lower and upper elevation of a band of patches, degrees, and their number.
 _BANDS = (
     (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
@@ -140,9 +141,12 @@ def light_from_outside(
     # What long exposures alone show may be no brighter than the rest.
     limit = seen.radiance.max(axis=1) * clipped
     patches = _patches(limit > limit.max() / 2, z_up)
-    share, open_share = _shares(surface, asked, np.where(measured, -1, patches), z_up, seed)
-    if open_share < _LEAST_OPEN:
-        return None
+    unseen = np.where(measured, -1, patches)
+    # A look around first: of a closed room a few rays tell that it is.
+    for rays in (_FIRST_RAYS, _RAYS):
+        share, open_share = _shares(surface, asked, unseen, z_up, seed, rays)
+        if open_share < _LEAST_OPEN:
+            return None
     asked = asked._replace(irradiance=_light_of_seen(surface, lit, asked, seen, z_up, seed))
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
@@ -239,19 +243,19 @@ _PATCHES = sum(count for _, _, count in _BANDS)
 
 
 def _shares(
-    surface: TexturedScene, asked: Asked, patches: Int, z_up: bool, seed: int
+    surface: TexturedScene, asked: Asked, patches: Int, z_up: bool, seed: int, rays: int
 ) -> tuple[Double, float]:
-    """What each patch (-1: none) of radiance 1 brings to the texels asked, (2 _PATCHES, N), W/m^2;
-    and the share of the light's directions that leave the scan."""
+    """By so many rays from each, what a patch (-1: none) of radiance 1 brings to the texels asked,
+    (2 _PATCHES, N), W/m^2; and the share of the light's directions that leave the scan."""
     texels, count = surface.texels, len(asked.texel)
     normal = texels.normal[asked.texel]
     origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
-    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, _RAYS)
+    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, rays)
     out = np.flatnonzero(surface.rays.closest(origin, towards).face < 0)
     patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
     texel, kept = out % count, patch >= 0
     met = np.bincount(patch[kept] * count + texel[kept], minlength=2 * _PATCHES * count)
-    brought = np.asarray(np.pi / _RAYS * met.reshape(2 * _PATCHES, count), np.float64)
+    brought = np.asarray(np.pi / rays * met.reshape(2 * _PATCHES, count), np.float64)
     return brought, len(out) / len(towards)
 
 

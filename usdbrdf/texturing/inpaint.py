@@ -15,6 +15,8 @@ _NEIGHBOURS = 8
 _NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
+# How much further off than the nearest a texel may lie that is taken for it: half the time.
+_SLACK = 0.25
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
@@ -25,7 +27,7 @@ _MOST_SOURCES = 1 << 18
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
     """Fill ``values`` (T, 3) where ``known`` (T,) is False; known ones are returned unchanged.
 
-    Geometric mean of the 8 nearest known texels of the same object in position and normal. An
+    Geometric mean of 8 of the nearest known texels of the same object in position and normal. An
     object of which nothing is known takes the nearest known texels of the scene; a scene of which
     nothing is known, or only black, becomes zero. Values in another unit give the same fill in that
     unit.
@@ -74,11 +76,11 @@ def _fill(
         )
 
     source = source[:: -(-len(source) // _MOST_SOURCES)]
-    tree = cKDTree(feature(source))
+    tree = cKDTree(feature(source), balanced_tree=False, compact_nodes=False)
     k = min(_NEIGHBOURS, len(source))
     for start in range(0, len(missing), _AT_A_TIME):
         some = missing[start : start + _AT_A_TIME]
-        _, nearest = tree.query(feature(some), k=k, workers=-1)
+        _, nearest = tree.query(feature(some), k=k, eps=_SLACK, workers=-1)
         neighbours = source[nearest.reshape(len(some), k)]
         for values, floor in zip(filled, floors, strict=True):
             if floor > 0:
