@@ -290,6 +290,10 @@ class FitOptions(Options):
     method: Literal["views", "scaled", "paper"] = option("--fit", "views")
     """views: many views per texel, L_d free, and refined with what was found; scaled: one target
     frame, L_d times a free factor; paper: one target frame, the paper's residual"""
+    lobe: Literal["auto", "paper", "microfacet"] = option("--lobe", "auto")
+    """whose lobe the surfaces have: paper: the paper's equations; microfacet: that of renderers,
+    Smith's masking and Fresnel's equations; auto: whichever explains the views (of the methods of
+    one target frame, the paper's)"""
     max_pixels: int = option("--max-pixels N", 1500, (50, 2**31 - 1))
     "fit to at most this many pixels of an object's target frame"
     mapping: Literal["measured", "matched"] = option("--material", "matched")

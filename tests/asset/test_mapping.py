@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf
+from pxr import Sdf, UsdShade
 
 from usdbrdf.asset.preview_lobe import fit_from_preview_surface, preview_surface_from_fit
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.asset.readers.scene import read_fit
-from usdbrdf.transport.renderer_match import shown_lobe
+from usdbrdf.transport.renderer_match import shown_lobe, shown_share_of_metal
 
 CHAIR, LAMP = 0, 2
 
@@ -61,11 +61,12 @@ def test_an_artists_opinion_counts(built):
     psi = float(theirs[chair].f0.flat[0]) / 0.08
     assert float(shown_lobe(0.64, psi).f0) == pytest.approx(shown, rel=1e-4)
     assert psi > float(ours[chair].f0.flat[0]) / 0.08
-    # A metal is none of ours: it stays what it is.
+    # And what they see of a metal.
     metal = surfaces(built, {"metallic": 1.0})[chair]
     assert metal.metallic is not None
     factor = preview_surface_from_fit(0.25, 0.5, "matched").diffuse
-    assert metal.base == pytest.approx(0.25 * factor, rel=1e-3)
+    shown = shown_share_of_metal(0.25)
+    assert metal.base == pytest.approx(0.25 * factor / shown, rel=1e-3)
 
 
 def test_the_mapping_is_recorded_where_there_is_a_lobe(built):
@@ -138,3 +139,38 @@ def test_materialx_is_told_the_same(built):
         assert not stage.GetPrimAtPath(f"{root}/{name}/OpenPBR")
     built.write_layer("material")
     assert not open_measured(built.asset).GetPrimAtPath(f"{root}/{chair}/OpenPBR")
+
+
+@pytest.mark.parametrize("mapping", ["measured", "matched", "microfacet"])
+def test_a_metal_is_told_by_its_colour_alone(built, mapping):
+    f0 = (0.75, 0.5, 0.25)
+    chair, *others = built.fitted
+    built.fitted = (replace(chair, kind="conductor", f0=f0, psi=1.0, f0_error=0.01), *others)
+    write(built, mapping)
+    assert read_fit(open_measured(built.asset), chair.prim_path).psi_of_channels == pytest.approx(
+        tuple(value / 0.08 for value in f0)
+    )
+    stage = open_measured(built.asset)
+    material = UsdShade.Material.Get(stage, f"/{built.asset.name}/mtl/{chair.identifier}")
+    surface = material.ComputeSurfaceSource()[0]
+    colour = surface.GetInput("diffuseColor")
+    assert not colour.HasConnectedSource()  # the texture beneath is taken off
+    share = shown_share_of_metal(0.25) if mapping == "matched" else 1.0
+    assert tuple(colour.Get()) == pytest.approx(tuple(share * value for value in f0), rel=1e-5)
+    assert surface.GetInput("metallic").Get() == 1
+    # And read back it is the metal that was fitted, by the equations that it was fitted with.
+    rendered = surfaces(built)[chair.identifier]
+    np.testing.assert_allclose(rendered.f0.reshape(-1, 3)[0], f0, rtol=1e-4)
+    assert not rendered.diffuse.any()
+    assert rendered.lobe == (mapping == "microfacet")
+
+
+def test_the_lobe_of_renderers_needs_another_factor_only(built):
+    write(built, "microfacet", lobe="microfacet")
+    chair = built.fitted[CHAIR]
+    told = preview_surface_from_fit(chair.phi, chair.psi, "microfacet")
+    assert ((told.ior - 1) / (told.ior + 1)) ** 2 == pytest.approx(0.08 * chair.psi)
+    assert 1 < told.diffuse < 1.1
+    rendered = surfaces(built)[chair.identifier]
+    np.testing.assert_allclose(rendered.f0, 0.08 * chair.psi, rtol=1e-4)
+    np.testing.assert_allclose(rendered.diffuse, 0.25, rtol=1e-3)

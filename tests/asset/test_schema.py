@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -130,8 +130,13 @@ def test_every_attribute_is_known_and_documented(name):
 
 
 def test_what_is_declared_is_authored_and_the_reverse(built):
-    """Names, types and variability. The lamp of the small asset is an estimated one."""
+    """Names, types and variability. The lamp of the small asset is an estimated one; one of its
+    objects is made a metal."""
     verify()
+    first, *others = built.fitted
+    metal = replace(first, kind="conductor", f0=(0.5, 0.25, 0.125), f0_error=0.03125)
+    built.fitted = (metal, *others)
+    built.write_layer("material")
     built.outside = sky_of(built.asset)
     built.write_layer("shading")
     authored = {}

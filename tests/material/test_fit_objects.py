@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_info
 
 from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
+from usdbrdf.transport.brdf import PAPER
 
 
 class _Run:
@@ -36,7 +37,7 @@ def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.M
     before = _threads_of_blas()
     assert len(before)
     monkeypatch.setattr(fit_objects, "fit_object", _fit_that_tells_the_threads)
-    lit, run = SimpleNamespace(scene=SimpleNamespace(objects=range(4))), _Run()
+    lit, run = SimpleNamespace(scene=SimpleNamespace(objects=range(4)), lobe=PAPER), _Run()
     found = fit_objects.fitted_objects(run, lit, None, None, fit_objects.FitOptions())  # type: ignore[arg-type]
     assert found[1].cost == -1  # taken from an interrupted run
     assert sorted(run.saved) == ["object-0", "object-2", "object-3"]

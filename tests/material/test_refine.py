@@ -77,7 +77,11 @@ def _atlas(asset: Asset) -> AssetMaps:
 def _lobes(atlas: AssetMaps) -> Lobes:
     rows = [LOBE.get(item.label, (1.0, 0.0)) for item in atlas.scene.objects]
     phi, psi = np.array(rows, np.float32).T
-    return Lobes(phi=phi, psi=psi)
+    return _dielectric(phi, psi)
+
+
+def _dielectric(phi: Float, psi: Float) -> Lobes:
+    return Lobes(phi=phi, psi=np.repeat(psi[:, None], 3, axis=1), conducts=np.zeros(len(phi), bool))
 
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
@@ -291,7 +295,7 @@ def test_lamps_do_not_light_twice(room: Room, tmp_path: Path, monkeypatch):
         return by_name(atlas, aov, channels) * (2 if aov == "emission" else 1)
 
     monkeypatch.setattr(AssetMaps, "map_where_present", brighter)
-    lobes = Lobes(phi=np.ones(5, np.float32), psi=np.zeros(5, np.float32))
+    lobes = _dielectric(np.ones(5, np.float32), np.zeros(5, np.float32))
     atlas = AssetMaps(open_measured(room.glossy))
     emission = atlas.map_where_present("emission", 3)
     diffuse = np.where(emission > 0, emission, atlas.map("lit"))

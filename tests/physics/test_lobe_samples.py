@@ -188,10 +188,12 @@ def test_sums_in_single_precision_are_those_of_the_lobe(phi: float):
     w[:, 2], wo[:, 2] = np.abs(w[:, 2]), np.abs(wo[:, 2])
     w, wo = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (w, wo))
     half = np.array([half_vector(n, a, b) for a, b in zip(w, wo, strict=True)], np.float32)
+    base = grazing(half[:, 1:].astype(np.float64)).astype(np.float32)
     samples = LobeSamples(
         cos_in=w[:, 2:].astype(np.float32),
         sin2_half=half[:, :1].copy(),
-        grazing=grazing(half[:, 1:].astype(np.float64)).astype(np.float32),
+        base=base,
+        rise=1 - base,
         weighted=np.ones((500, 1, 3), np.float32),
         cos_out=wo[:, 2].astype(np.float32),
     )

@@ -197,7 +197,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
     observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
-    found, used = fit_views(lit, observed, smoothing, cameras.__getitem__, SPHERE, 0)
+    found, _, used = fit_views(lit, observed, smoothing, cameras.__getitem__, SPHERE, 0)
     assert found is not None
     assert used > 500
     assert found.phi == pytest.approx(phi, abs=0.04)

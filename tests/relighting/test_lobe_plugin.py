@@ -10,6 +10,7 @@ import pytest
 from tests.physics.brdf import f_nd
 from usdbrdf.relighting import lobe_plugin
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
+from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, reflectance
 
 _CASES = [(0.05, 0.9, 0.1), (0.3, 0.5, 0.4), (0.9, 0.1, 0.7)]
 
@@ -48,6 +49,30 @@ def test_value(mi: Any, phi: float, psi: float, rho: float) -> None:
     normal = np.array([0.0, 0, 1])
     expected = (rho / np.pi + f_nd(normal, wo, wi[None], phi, psi)) * np.maximum(wo[:, 2], 0)
     assert found == pytest.approx(expected, rel=2e-3, abs=1e-4)
+
+
+def test_value_of_the_lobe_of_renderers(mi: Any) -> None:
+    # That of Mitsuba's own rough conductor, but for Fresnel's term: with one that is 1.
+    import drjit as dr
+
+    rng = np.random.default_rng(1)
+    wi = np.array([0.6, 0.0, 0.8])
+    wo = rng.normal(size=(5000, 3)) * 0.2 + wi * [-1, 1, 1]
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(wo))
+    si.wi = mi.Vector3f(wi)
+    half = wo + wi
+    cosine = (half / np.linalg.norm(half, axis=1, keepdims=True)) @ wi
+    theirs = {
+        "type": "roughconductor", "distribution": "ggx", "material": "none", "sample_visible": True,
+        "alpha": 0.3,
+    }  # fmt: skip
+    other = np.array(mi.load_dict(theirs).eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
+    for kind in (DIELECTRIC, CONDUCTOR):
+        bsdf = mi.load_dict(_plugin(0.3, 0.5, 0.0) | {"lobe": kind})
+        found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
+        base, rise = reflectance(cosine, kind)
+        assert found == pytest.approx(other * (base + 0.04 * rise), rel=2e-3, abs=1e-5)
 
 
 @pytest.mark.parametrize(("phi", "psi", "rho"), _CASES[1:])

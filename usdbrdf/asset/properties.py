@@ -18,6 +18,7 @@ from pxr import Plug, Usd
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Array, Float
+from usdbrdf.transport.brdf import F0_OF_PSI
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
 # away, not when one is added.
@@ -299,7 +300,8 @@ class FittedObject(MeasuredObject):
     phi: Annotated[float, Fact(FIT, "phi", "float", 0.5, """Roughness parameter: alpha of the GGX
         distribution is max(0.001, phi); 0 to 1, without unit.""", low=0, high=1)]
     psi: Annotated[float, Fact(FIT, "psi", "float", 0.5, """Specular parameter: the reflectance at
-        normal incidence is F0 = 0.08 psi; 0 to 1, without unit.""", low=0, high=1)]
+        normal incidence is F0 = 0.08 psi; 0 to 1, without unit. Of a conductor 1, which says that
+        F0 is above all dielectrics': it is usdBrdf:fit:f0.""", low=0, high=1)]
     phi_error: Annotated[float, Fact(FIT, "phiError", "float", 0.0, """Standard deviation of phi,
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
@@ -317,6 +319,18 @@ class FittedObject(MeasuredObject):
         _CONFIDENCE.format("phi"), tokens=_CONFIDENCES)] = "none"
     psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none",
         _CONFIDENCE.format("psi"), tokens=_CONFIDENCES)] = "none"
+    lobe: Annotated[str, Fact(FIT, "lobe", "token", "paper", """Equations that phi and psi are
+        numbers of. paper: masking of width ((phi + 1) / 2)^2 and Schlick's Fresnel term;
+        microfacet: Smith's masking of alpha, and Fresnel's equations. All objects of an asset have
+        the same.""", tokens=("paper", "microfacet"))] = "paper"
+    kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
+        under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel.""",
+        tokens=("dielectric", "conductor"))] = "dielectric"
+    f0: Annotated[Colour, Fact(FIT, "f0", "color3f", (0, 0, 0), """Reflectance of a conductor at
+        normal incidence, per channel; 0 to 1, without unit.""", low=0, high=1,
+        when=lambda fitted: fitted.is_metal)] = (0.0, 0.0, 0.0)
+    f0_error: Annotated[float, Fact(FIT, "f0Error", "float", 0.0, """Standard deviation of a
+        conductor's F0, root mean square over the channels; without unit.""", low=0)] = math.nan
     cost: Annotated[float, Fact(FIT, "cost", "float", 0.0, """Loss of the fit at its minimum: of
         method views per degree of freedom, in units of the errors' variance; of scaled the mean
         over the pixels used, relative to their squared radiance; of paper that in squared units of
@@ -340,7 +354,9 @@ class FittedObject(MeasuredObject):
     mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
         derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
         psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that
-        renderers show what the fitted lobe reflects.""", tokens=("measured", "matched"),
+        renderers show what the fitted lobe reflects. microfacet: F0 = 0.08 psi, for the lobe is
+        that of renderers, with a factor on the diffuse colour for what they take away from it.""",
+        tokens=("measured", "matched", "microfacet"),
         when=lambda fitted: fitted.is_known)] = "measured"
     mean_color: Colour = (0.0, 0.0, 0.0)  # area-weighted base colour, linear
 
@@ -356,11 +372,23 @@ class FittedObject(MeasuredObject):
         return math.isfinite(self.phi) and math.isfinite(self.psi)
 
     @property
+    def is_metal(self) -> bool:
+        return self.kind == "conductor"
+
+    @property
+    def psi_of_channels(self) -> Colour:
+        """F0 / 0.08 of the lobe as it was found: of a metal more than 1, and not grey."""
+        red, green, blue = self.f0 if self.is_metal else (F0_OF_PSI * self.psi,) * 3
+        return red / F0_OF_PSI, green / F0_OF_PSI, blue / F0_OF_PSI
+
+    @property
     def summary(self) -> dict[str, Any]:
         """What a summary says of the object, JSON."""
         names = ("phi", "psi", "phi_error", "psi_error", "psi_upper", "phi_confidence",
-                 "psi_confidence", "status", "evidence", "target_frame")
+                 "psi_confidence", "status", "evidence", "target_frame", "kind")
         row = {name: getattr(self, name) for name in names}
+        if self.is_metal:
+            row |= {"f0": [round(value, 4) for value in self.f0], "f0_error": self.f0_error}
         row |= {name: round(value, 4) if math.isfinite(value) else None
                 for name, value in row.items() if isinstance(value, float)}
         return row | {"evidence": row["evidence"] or 0.0}

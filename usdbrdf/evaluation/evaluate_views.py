@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.preview_lobe import MICROFACET
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
@@ -34,6 +35,7 @@ from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions, Surroundings
+from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
@@ -207,7 +209,7 @@ def _write_pictures(folder: Path, view: _Scored, errors: dict[str, Float]) -> No
 @dataclass(frozen=True, kw_only=True)
 class ViewedAsset:
     """What is seen: the scene with its light; L_d, and L_d without specular light, on the surface;
-    the lobe of each object, (num_objects,), NaN for none."""
+    the lobe of each object, phi (num_objects,) and psi (num_objects, 3), NaN for none."""
 
     lit: LitScene
     measured: SurfaceTexture
@@ -228,14 +230,15 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
             f"{asset.folder}: its objects have no roughness and specular yet. Run `usdbrdf fit` "
             "first. [asset.incomplete]"
         )
-    lit = atlas.lit_scene(atlas.environment(environment))
+    kind = DIELECTRIC if any(fit.lobe == MICROFACET for fit in fits) else PAPER
+    lit = replace(atlas.lit_scene(atlas.environment(environment)), lobe=kind)
     diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,
         measured=lit.radiance.showing(atlas.texels, atlas.map("lit")),
         diffuse=lit.radiance.showing(atlas.texels, diffuse),
         phi=np.array([fit.phi for fit in fits], np.float32),
-        psi=np.array([fit.psi for fit in fits], np.float32),
+        psi=np.array([fit.psi_of_channels for fit in fits], np.float32),
     )
 
 
@@ -288,7 +291,7 @@ def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int)
     values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
     values[:, 6], values[:, 7] = hit, lamp
     owner = seen.lit.owner(points.face)
-    known = np.isfinite(seen.phi) & np.isfinite(seen.psi)
+    known = np.isfinite(seen.phi) & np.isfinite(seen.psi).all(axis=1)
     reflects = np.flatnonzero(hit & ~lamp & known[owner])
     owner = owner[reflects]
     values[reflects, 3:6] += lobe_radiance(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels, FrameReader, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
@@ -24,16 +25,19 @@ from usdbrdf.material.fit_target import (
 from usdbrdf.material.fit_views import MIXTURE, fit_views
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
+    SOME_EVIDENCE,
     LobeEstimate,
     Verdict,
     usual_lobe,
     verdict_on_frame,
+    verdict_on_metal,
     verdict_on_views,
 )
-from usdbrdf.model.arrays import Array, Bool, Int
+from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
+from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_radiance import Mixture
 
@@ -62,6 +66,8 @@ class ObjectFit(NamedTuple):
     unresolved    share of the highlight that the pixels do not resolve
     cost          at the minimum; evidence: 1 - cost / cost without a lobe
     phi_median, psi_median, psi_upper  of what remains likely, see ``LobeEstimate``
+    metal_phi, red, green, blue, metal_phi_error, f0_error, clearer  of the metal that explains the
+                  samples better, see ``Conductor``
     num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
     """
 
@@ -75,6 +81,13 @@ class ObjectFit(NamedTuple):
     phi_median: float = math.nan
     psi_median: float = math.nan
     psi_upper: float = math.nan
+    metal_phi: float = math.nan
+    red: float = math.nan
+    green: float = math.nan
+    blue: float = math.nan
+    metal_phi_error: float = math.nan
+    f0_error: float = math.nan
+    clearer: float = math.nan
     num_samples: int = 0
     target: int = -1
 
@@ -129,12 +142,58 @@ def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
     return View(radiance=radiance, valid=pixels.valid, camera=frames.camera(i))
 
 
+# Of the share that no lobe explains, summed over objects: what the two kinds must differ by.
+_PAPER_CLEARER = calibration.number("fit.paper_clearer")
+
+
+def fitted_by_likelier_lobe(
+    run: TaskRun,
+    lit: LitScene,
+    reader: FrameReader,
+    survey: Survey,
+    options: FitOptions,
+    irradiance: Float | None = None,
+) -> tuple[LitScene, list[ObjectFit]]:
+    """The scene with the kind of lobe that its surfaces have, and ``fitted_objects`` with that.
+
+    Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
+    the model of facets, unless the paper's explains the views of all objects clearly better.
+    """
+    asked = options.lobe if options.method == "views" else "paper"
+    found = {
+        kind: fitted_objects(run, replace(lit, lobe=kind), reader, survey, options, irradiance)
+        for name, kind in (("paper", PAPER), ("microfacet", DIELECTRIC))
+        if asked in (name, "auto")
+    }
+    if asked == "auto":
+        clearer = sum(map(_paper_explains_more, *found.values()))
+        kind = PAPER if clearer > _PAPER_CLEARER else DIELECTRIC
+    else:
+        (kind,) = found
+    return replace(lit, lobe=kind), found[kind]
+
+
+def _paper_explains_more(paper: ObjectFit, other: ObjectFit) -> float:
+    """By how much the logarithm of what is left unexplained is less; 0 where nothing shows."""
+    evidence = paper.evidence, other.evidence
+    if not max(evidence) > SOME_EVIDENCE:
+        return 0.0
+    left, right = (max(1 - min(one, 1.0), 1e-3) for one in evidence)
+    return math.log(right / left)
+
+
 def fitted_objects(
-    run: TaskRun, lit: LitScene, reader: FrameReader, survey: Survey, options: FitOptions
+    run: TaskRun,
+    lit: LitScene,
+    reader: FrameReader,
+    survey: Survey,
+    options: FitOptions,
+    irradiance: Float | None = None,
 ) -> list[ObjectFit]:
     """``fit_object`` of every object, going on where an interrupted run was."""
     numbers = range(len(lit.scene.objects))
-    stored = {i: run.checkpoint_if(f"object-{i}") for i in numbers}
+    name = "object" if lit.lobe == PAPER else "microfacet"
+    stored = {i: run.checkpoint_if(f"{name}-{i}") for i in numbers}
     done = {i: ObjectFit.from_arrays(found) for i, found in stored.items() if found is not None}
     with (
         # With all cores for each object's small matrices BLAS's threads only wait for each other.
@@ -142,14 +201,14 @@ def fitted_objects(
         ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
     ):
         jobs = {
-            pool.submit(fit_object, lit, reader, survey, i, options): i
+            pool.submit(fit_object, lit, reader, survey, i, options, irradiance): i
             for i in numbers
             if i not in done
         }
         try:
             for job in progress(as_completed(jobs), total=len(jobs), label="fit", unit="objects"):
                 i, found = jobs[job], job.result()
-                run.save(f"object-{i}", found.arrays())
+                run.save(f"{name}-{i}", found.arrays())
                 done[i] = found
         finally:
             for job in jobs:
@@ -163,18 +222,29 @@ def fit_object(
     survey: Survey,
     index: int,
     options: FitOptions,
+    irradiance: Float | None = None,
     mixture: Mixture = MIXTURE,
 ) -> ObjectFit:
-    """The lobe of one object by the chosen method; mixture: see fit_views."""
+    """The lobe of one object by the chosen method; irradiance, mixture: see fit_views."""
     target = int(survey.target[index])
     if options.method == "views":
         own = survey.observations.of_texels(lit.texels.of_object(index))
-        lobe, used = fit_views(
-            lit, own, survey.smoothing, reader.frames.camera, index, options.seed, mixture
-        )
+        lobe, metal, used = fit_views(
+            lit, own, survey.smoothing, reader.frames.camera, index, options.seed, irradiance,
+            mixture,
+        )  # fmt: skip
         if lobe is None:
             return ObjectFit(num_samples=used, target=target)
-        return ObjectFit(*lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper, used, target)
+        found = ObjectFit(
+            *lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper,
+            num_samples=used, target=target,
+        )  # fmt: skip
+        if not metal:
+            return found
+        return found._replace(
+            metal_phi=metal.phi, red=metal.f0[0], green=metal.f0[1], blue=metal.f0[2],
+            metal_phi_error=metal.phi_error, f0_error=metal.f0_error, clearer=metal.clearer,
+        )  # fmt: skip
     faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
     third = np.full(len(faces), 1 / 3, np.float32)
     shines = lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5
@@ -182,13 +252,13 @@ def fit_object(
         return ObjectFit(target=target)
     view = _view(reader.frames, target, reader.read(target))
     residual: Residual = "paper" if options.method == "paper" else "scaled"
-    found, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
-    if found is None:
+    of_frame, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
+    if of_frame is None:
         return ObjectFit(num_samples=used, target=target)
     # As if all roughnesses that fit were equally likely; of psi the frame alone tells none.
-    error = (found.phi_high - found.phi_low) / math.sqrt(12)
+    error = (of_frame.phi_high - of_frame.phi_low) / math.sqrt(12)
     return ObjectFit(
-        found.phi, found.psi, error, math.nan, 0.0, found.cost, found.evidence,
+        of_frame.phi, of_frame.psi, error, math.nan, 0.0, of_frame.cost, of_frame.evidence,
         num_samples=used, target=target,
     )  # fmt: skip
 
@@ -200,6 +270,9 @@ def judged(found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bo
             found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
             found.evidence, (0.0, 0.0), found.phi_median, found.psi_median, found.psi_upper,
         )  # fmt: skip
+        if math.isfinite(found.clearer):
+            f0 = found.red, found.green, found.blue
+            return verdict_on_metal(found.metal_phi, f0, found.metal_phi_error, found.f0_error)
         verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
     else:
         keep, phi = options.method == "paper", (found.phi, found.phi_error)

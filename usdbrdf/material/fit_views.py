@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 
 import numpy as np
 
 from usdbrdf import calibration
+from usdbrdf.material.conductor import Conductor, conductor_of
 from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
 from usdbrdf.material.observations import Observations
-from usdbrdf.material.verdict import LobeEstimate
+from usdbrdf.material.verdict import SOME_EVIDENCE, LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
+from usdbrdf.transport.brdf import CONDUCTOR, PAPER
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
@@ -45,21 +48,24 @@ def fit_views(
     camera_of: Callable[[int], Camera],
     index: int,
     seed: int,
+    irradiance: Float | None = None,
     mixture: Mixture = MIXTURE,
-) -> tuple[LobeEstimate | None, int]:
-    """Fit object ``index`` to its observations: (fit, number of samples), fit None if too few.
+) -> tuple[LobeEstimate | None, Conductor | None, int]:
+    """Fit object ``index`` to its observations: (fit, the metal that explains them better, number
+    of samples); fit None if too few, metal None if it is none.
 
     smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
     themselves are not needed.
+    irradiance (T, 3): S, W/m^2; without it no metal is looked for.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
     fifteen times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
-        return None, 0
+        return None, None, 0
     observed, footprints = _footprints(lit, observed, camera_of, index)
     if len(observed.texel) < MIN_OBSERVATIONS:
-        return None, len(observed.texel)
+        return None, None, len(observed.texel)
     position, points = lit.texels.position[observed.texel], footprints[0]
     # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
     # or, of a square's mean, that along its rim.
@@ -90,7 +96,19 @@ def fit_views(
             candidates.append(Candidate(first, second, third, blur, likely))
         return fit_lobe(samples, candidates, repeats)
 
-    return repeated_where_noisy(fitted, seed), len(samples.texel)
+    found, metal = repeated_where_noisy(fitted, seed), None
+    bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE
+    if irradiance is not None and bright:
+        of_metal = lit if lit.lobe == PAPER else replace(lit, lobe=CONDUCTOR)
+        one, other = (
+            lobe_basis(
+                of_metal, footprints[0], len(samples.texel), own_seed, mixture, samples.texel
+            )
+            for own_seed in range(3 * seed, 3 * seed + 2)
+        )
+        of_samples = irradiance[observed.texel]
+        metal = conductor_of(samples.radiance, samples.texel, of_samples, (one, other), found)
+    return found, metal, len(samples.texel)
 
 
 def _footprints(

@@ -38,6 +38,7 @@ from usdbrdf.texturing.passes import (
     smallest_groups,
 )
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
+from usdbrdf.transport.brdf import F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at
@@ -56,10 +57,15 @@ _SEED = 0x5EED
 
 @dataclass(frozen=True)
 class Lobes:
-    """phi, psi (num_objects,) float32: one lobe per object."""
+    """One lobe per object: phi (num_objects,), psi (num_objects, 3) float32; conducts
+    (num_objects,): it is a metal's, and there is no diffuse part."""
 
     phi: Float
     psi: Float
+    conducts: Bool
+
+    def take(self, index: Int) -> Lobes:
+        return Lobes(self.phi[index], self.psi[index], self.conducts[index])
 
 
 def refined_irradiance(
@@ -138,7 +144,7 @@ class LightBefore(Protocol):
 @dataclass(frozen=True, kw_only=True)
 class Refined:
     """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
-    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two."""
+    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal."""
 
     diffuse: Float
     irradiance: Float
@@ -170,6 +176,9 @@ def refined_light(
     # What clips in every frame is at least as bright as that.
     clipped = before.coverage.clipped[:, None]
     diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
+    owner = texels.object_index()
+    metal = lobes.conducts[owner] & ~emissive
+    diffuse[metal] = 0
     filled = ~(observed | emissive)[:, None]
 
     def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
@@ -182,6 +191,7 @@ def refined_light(
     traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
     irradiance = refined_irradiance(run, lit, traced, change, lobes, lightmap_filter, seed)
     base_color, diffuse = reflected(diffuse, irradiance)
+    base_color[metal] = F0_OF_PSI * lobes.psi[owner[metal]]
     return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
 
 
@@ -220,7 +230,7 @@ def _means_without_lobes(
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
             texel, camera = some.texel[taken], frames.camera(some.frame)
-            of_texel = Lobes(lobes.phi[owner[texel]], lobes.psi[owner[texel]])
+            of_texel = lobes.take(owner[texel])
             own_seed = seed + len(frames) + some.frame
             specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
             unit, covered = level[texel], footprints(texels, texel, camera)

@@ -12,6 +12,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Double
+from usdbrdf.transport.brdf import F0_OF_PSI
 
 _PSI_GRID = np.linspace(0, 1, 201)
 # What an estimate says of the posterior beside its least cost.
@@ -168,6 +169,7 @@ MIN_EVIDENCE = calibration.number("verdict.min_evidence")
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
+_MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
@@ -178,7 +180,7 @@ class Verdict:
     """phi, psi and their standard deviations (NaN: not known); status "measured", "prior",
     "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper: what psi exceeds
     with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown instead of what
-    was found (NaN: that itself)."""
+    was found (NaN: that itself); kind "dielectric" or "conductor"; f0 of that, and its error."""
 
     phi: float
     psi: float
@@ -190,6 +192,9 @@ class Verdict:
     psi_upper: float = math.nan
     shown_phi: float = math.nan
     shown_psi: float = math.nan
+    kind: str = "dielectric"
+    f0: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    f0_error: float = math.nan
 
 
 def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
@@ -218,6 +223,21 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
     upper = max(lobe.psi_upper, psi)
     return Verdict(phi, psi, float(phi_error), float(psi_error), status, *sure, psi_upper=upper)
+
+
+def verdict_on_metal(
+    phi: float, f0: tuple[float, float, float], phi_error: float, f0_error: float
+) -> Verdict:
+    """On a metal that explains many views better than any dielectric."""
+    phi_sure = "high" if phi_error <= MAX_PHI_ERROR else "low"
+    f0_sure = "high" if f0_error <= _MAX_F0_ERROR else "low"
+    measured = (phi_sure, f0_sure) == ("high", "high")
+    # psi is at the bound of all dielectrics.
+    psi_error = float(min(f0_error / F0_OF_PSI, NOTHING_KNOWN))
+    return Verdict(
+        phi, 1.0, phi_error, psi_error, "measured" if measured else "prior", phi_sure, f0_sure,
+        psi_upper=1.0, kind="conductor", f0=f0, f0_error=f0_error,
+    )  # fmt: skip
 
 
 def verdict_on_frame(

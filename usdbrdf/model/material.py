@@ -25,6 +25,7 @@ class Material:
     wrap       what the maps are beyond uv of 0 to 1: "clamp", "repeat" or "mirror"
     base, metallic   (H, W, 3) and (H, W, 1) float32, of what diffuse and f0 of a metal were mixed;
                None where there is no metal
+    lobe       the kind of specular lobe (``transport.brdf``): 0 the paper's, 1 a dielectric's
     """
 
     diffuse: Float
@@ -34,6 +35,7 @@ class Material:
     wrap: str = "clamp"
     base: Float | None = None
     metallic: Float | None = None
+    lobe: int = 0
 
     @property
     def emits(self) -> bool:

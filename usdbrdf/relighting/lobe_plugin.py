@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from usdbrdf.transport.brdf import MIN_ALPHA, distribution, fresnel, masking, masking_width
+from usdbrdf.transport.brdf import (
+    MIN_ALPHA,
+    PAPER,
+    distribution,
+    fresnel,
+    masking,
+    masking_width,
+    reflectance,
+)
 
 NAME = "usdbrdf_lobe"
 _registered: set[str] = set()
@@ -14,8 +22,8 @@ def register(mi: Any) -> None:
     """Make the plugin ``usdbrdf_lobe`` known to the variant that is set.
 
     It takes the textures ``diffuse`` and ``f0`` (colours) and ``phi``, the roughness parameter of
-    the lobe: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h), with the terms of ``brdf``. The back
-    is black. B. Haefner et al. 2021, eq. 2 to 6.
+    the lobe, and the number ``lobe``, its kind: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h),
+    with the terms of ``brdf``. The back is black. B. Haefner et al. 2021, eq. 2 to 6.
     """
     if mi.variant() in _registered:
         return
@@ -28,6 +36,7 @@ def register(mi: Any) -> None:
             self.diffuse = props.get_texture("diffuse")
             self.f0 = props.get_texture("f0")
             self.phi = props.get_texture("phi")
+            self.kind = int(props.get("lobe", PAPER))
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             matte = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components = [glossy, matte]
@@ -49,9 +58,10 @@ def register(mi: Any) -> None:
             h = dr.normalize(si.wi + wo)
             cos_h, wo_h = mi.Frame3f.cos_theta(h), dr.clip(dr.dot(wo, h), 0, 1)
             d = distribution(mi.Frame3f.sin_theta_2(h), dr.maximum(phi, MIN_ALPHA))
-            y = masking_width(phi)
+            y = masking_width(phi) if self.kind == PAPER else dr.maximum(phi, MIN_ALPHA)
+            base, rise = reflectance(wo_h, self.kind, dr.safe_sqrt)
             g = masking(cos_i, y, dr.safe_sqrt) * masking(cos_o, y, dr.safe_sqrt)
-            value = (diffuse / dr.pi + g * d * fresnel(f0, wo_h)) * cos_o
+            value = (diffuse / dr.pi + g * d * (base + f0 * rise)) * cos_o
             share = self._glossy_share(si, diffuse, f0)
             lobe = d * cos_h / (4 * dr.maximum(wo_h, 1e-8))
             density = share * lobe + (1 - share) * cos_o / dr.pi

@@ -16,6 +16,7 @@ from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight
 from usdbrdf.model.material import Surface
 from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.relighting import lobe_plugin
+from usdbrdf.transport.brdf import CONDUCTOR
 from usdbrdf.transport.renderer_match import matching_factor
 
 # Older ones abort the process while they compile Mitsuba's kernels.
@@ -126,6 +127,7 @@ def _fitted_lobe(mi: Any, surface: Surface) -> dict[str, Any]:
         "diffuse": _reflectance(mi, surface, "vertex_colour", material.diffuse),
         "f0": _reflectance(mi, surface, "vertex_f0", material.f0),
         "phi": _texture(mi, material.roughness**2, material.wrap, "number"),
+        "lobe": CONDUCTOR if material.lobe and material.metallic is not None else material.lobe,
     }
 
 

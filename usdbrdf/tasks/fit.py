@@ -12,15 +12,17 @@ from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
+from usdbrdf.asset.preview_lobe import MICROFACET
 from usdbrdf.asset.properties import FittedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import fitted_objects, judged, survey_frames
+from usdbrdf.material.fit_objects import fitted_by_likelier_lobe, judged, survey_frames
 from usdbrdf.material.refine import Lobes, frame_reader, refined_light
 from usdbrdf.options import FitOptions, kind_of_light
 from usdbrdf.tasks.task import Task
+from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
 from usdbrdf.transport.lit_scene import LitScene
 
@@ -52,7 +54,9 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         usable = maps.coverage.measured & ~maps.emissive
         reader = frame_reader(lit, maps.frames, options.memory)
         survey = survey_frames(run, lit, usable, reader, options)
-        found = fitted_objects(run, lit, reader, survey, options)
+        lit, found = fitted_by_likelier_lobe(run, lit, reader, survey, options, maps.irradiance)
+        microfacet = lit.lobe != PAPER
+        mapping = MICROFACET if microfacet and options.mapping == "matched" else options.mapping
         objects = [
             FittedObject(
                 prim_path=obj.prim_path,
@@ -62,7 +66,8 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
                 target_frame=own.target if math.isfinite(own.phi) else -1,
                 num_pixels=own.num_samples,
                 method=options.method,
-                mapping=options.mapping,
+                mapping=mapping,
+                lobe=MICROFACET if microfacet else "paper",
                 **vars(judged(own, obj, options, maps.is_observed(i))),
             )
             for i, (obj, own) in enumerate(zip(maps.scene.objects, found, strict=True))
@@ -90,8 +95,11 @@ def _refined(
     options: FitOptions,
 ) -> list[FittedObject]:
     """The objects with maps of L_d, S and base colour that are free of their specular light."""
-    numbers = [item.phi for item in objects], [item.psi for item in objects]
-    lobes = Lobes(*np.array(numbers, np.float32))
+    lobes = Lobes(
+        phi=np.array([item.phi for item in objects], np.float32),
+        psi=np.array([item.psi_of_channels for item in objects], np.float32),
+        conducts=np.array([item.is_metal for item in objects], np.bool_),
+    )
     refined = refined_light(
         run, lit, reader, maps, lobes, lightmap_filter, options.memory, options.seed
     )

@@ -10,6 +10,10 @@ equations.
 G1 already contains the microfacet denominator: G = G_smith / (4 n.w n.wo). F is affine in psi, so
 f_nd(phi, psi) = base(phi) + psi * slope(phi); psi = 0 still leaves the grazing part, ``base``.
 
+Measured in practice are other surfaces than the paper's. DIELECTRIC is the lobe of renderers: the
+same D, Smith's masking of the same alpha (y = alpha), and Fresnel's equations, made affine in psi
+through F0 of 0.02 and 0.06. CONDUCTOR has that masking, and the paper's F with F0 of each channel.
+
 The formulas are plain operators: they take numbers, NumPy's arrays and Dr.Jit's, and may be called
 from compiled functions, in whose precision they are computed.
 """
@@ -25,6 +29,7 @@ from numba.extending import register_jitable
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double
 
+PAPER, DIELECTRIC, CONDUCTOR = 0, 1, 2  # kinds of lobes
 F0_OF_PSI = 0.08
 MIN_ALPHA = 0.001
 F = TypeVar("F", bound=Callable[..., Any])
@@ -73,6 +78,30 @@ def grazing(cos_wh: Any) -> Any:
 
 
 @formula
+def dielectric_fresnel(ior: Any, cosine: Any, sqrt: Any = np.sqrt) -> Any:
+    """Fresnel's reflectance of unpolarised light against air, for a cosine in [0, 1]."""
+    g = sqrt(ior * ior - 1.0 + cosine * cosine)
+    s, p = (g - cosine) / (g + cosine), cosine * (g + cosine) - 1.0
+    ratio = p / (cosine * (g - cosine) + 1.0)
+    return 0.5 * s * s * (1.0 + ratio * ratio)
+
+
+_LOW_F0, _HIGH_F0 = 0.02, 0.06
+_LOW_IOR, _HIGH_IOR = ((1 + f0**0.5) / (1 - f0**0.5) for f0 in (_LOW_F0, _HIGH_F0))
+
+
+@formula
+def reflectance(cos_wh: Any, kind: int, sqrt: Any = np.sqrt) -> Any:
+    """(base, rise) of F = base + F0 rise at a cosine in [0, 1], by the kind of lobe."""
+    if kind == DIELECTRIC:
+        low = dielectric_fresnel(_LOW_IOR, cos_wh, sqrt)
+        rise = (dielectric_fresnel(_HIGH_IOR, cos_wh, sqrt) - low) / (_HIGH_F0 - _LOW_F0)
+        return low - _LOW_F0 * rise, rise
+    x = grazing(cos_wh)
+    return x, 1.0 - x
+
+
+@formula
 def fresnel(f0: Any, cos_wh: Any) -> Any:
     """F of a cosine in [0, 1]."""
     return f0 + (1.0 - f0) * grazing(cos_wh)
@@ -81,6 +110,14 @@ def fresnel(f0: Any, cos_wh: Any) -> Any:
 @kernel
 def alpha_of_phi(phi: float) -> float:
     """Width of the normal distribution: max(0.001, phi)."""
+    return max(MIN_ALPHA, phi)
+
+
+@kernel
+def width_of_masking(phi: float, kind: int) -> float:
+    """y of G1, by the kind of lobe."""
+    if kind == PAPER:
+        return float(masking_width(phi))
     return max(MIN_ALPHA, phi)
 
 

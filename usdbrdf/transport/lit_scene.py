@@ -15,6 +15,7 @@ from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
+from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.rays import Hits, RayScene
@@ -68,12 +69,14 @@ class SurfacePoints(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LitScene(TexturedScene):
-    """With its light: L_d as texture and as lights, the emission mask, and the surroundings."""
+    """With its light: L_d as texture and as lights, the emission mask, and the surroundings; and
+    the kind of lobe (``brdf``) that its surfaces have."""
 
     radiance: SurfaceTexture
     lights: Lights
     emission: SurfaceTexture
     environment: Environment
+    lobe: int = PAPER
 
     def emits(self, place: SurfacePoints | Hits) -> Bool:
         """(R,): is there an emitter?"""

@@ -9,6 +9,7 @@ their weights, and sums for roughnesses, as compiled loops.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple, TypeAlias
 
@@ -18,17 +19,20 @@ from numba import prange
 from usdbrdf.kernel import kernel, loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
 from usdbrdf.transport.brdf import (
+    CONDUCTOR,
+    DIELECTRIC,
     F0_OF_PSI,
     MIN_ALPHA,
+    PAPER,
     alpha_of_phi,
     clamped,
-    grazing,
     half_vector,
     masking,
-    masking_width,
+    reflectance,
     reflected_density,
     sample_half_vector,
     stretched,
+    width_of_masking,
 )
 from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.lights import DENSITY, LightGroups, facing, picked, way_to
@@ -94,14 +98,15 @@ class LobeSamples(NamedTuple):
 
     cos_in     (R, K) float32, n.w (0 where the sample brings nothing)
     sin2_half  (R, K) float32, sin^2 of the angle between n and h
-    grazing    (R, K) float32, (1 - w.h)^5
+    base, rise (R, K) float32, of F = base + F0 rise
     weighted   (R, K, 3) float32, L cos / (K density of the whole mixture)
     cos_out    (R,) float32, n.wo
     """
 
     cos_in: Float
     sin2_half: Float
-    grazing: Float
+    base: Float
+    rise: Float
     weighted: Float
     cos_out: Float
 
@@ -200,12 +205,13 @@ def weigh(
     mixture: Mixture,
     groups: LightGroups,
     environment: Environment,
+    kind: int,
     samples: LobeSamples,
 ) -> None:
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
     first surfaces along the (R, K) directions."""
     for r in prange(len(samples.cos_out)):
-        _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
+        _weigh_point(aimed, r, hits, mixture, groups, environment, kind, samples)
 
 
 @kernel
@@ -216,6 +222,7 @@ def _weigh_point(
     mixture: Mixture,
     groups: LightGroups,
     environment: Environment,
+    kind: int,
     samples: LobeSamples,
 ) -> None:
     n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
@@ -240,7 +247,7 @@ def _weigh_point(
             density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
         samples.cos_in[r, k] = cosine
         samples.sin2_half[r, k] = s2
-        samples.grazing[r, k] = grazing(clamped(cos_wh))
+        samples.base[r, k], samples.rise[r, k] = reflectance(clamped(cos_wh), kind)
         for c in range(3):
             value = weighted[k, c]
             if of_sun:  # which only this sample looks for: its irradiance is L over the density
@@ -252,28 +259,28 @@ def _weigh_point(
 
 
 @parallel_kernel
-def integrate(samples: LobeSamples, phis: Float, base: Float, slope: Float) -> None:
-    """base, slope (G, 3, Q) += light times G D x, 0.08 G D (1 - x), summed over samples, means of
-    each group of consecutive points, with the group's roughnesses phis (G, Q)."""
+def integrate(samples: LobeSamples, phis: Float, kind: int, base: Float, slope: Float) -> None:
+    """base, slope (G, 3, Q) += light times G D F of psi = 0, and of what psi adds, summed over
+    samples, means of each group of consecutive points, with the group's roughnesses phis (G, Q)."""
     group = len(samples.cos_out) // len(phis)
     for g in prange(len(phis)):
         for r in range(g * group, (g + 1) * group):
             if samples.cos_out[r] > 0:
-                _add_point(samples, r, phis[g], 1.0 / group, base[g], slope[g])
+                _add_point(samples, r, phis[g], kind, 1.0 / group, base[g], slope[g])
 
 
 @loop
 def _add_point(
-    samples: LobeSamples, r: int, phis: Float, share: float, base: Float, slope: Float
+    samples: LobeSamples, r: int, phis: Float, kind: int, share: float, base: Float, slope: Float
 ) -> None:
     """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
     side by side, as vector instructions want it."""
-    cos_in, sin2_half, graze = samples.cos_in[r], samples.sin2_half[r], samples.grazing[r]
-    weighted, cos_out = samples.weighted[r], samples.cos_out[r]
+    cos_in, sin2_half, weighted = samples.cos_in[r], samples.sin2_half[r], samples.weighted[r]
+    of_base, of_rise, cos_out = samples.base[r], samples.rise[r], samples.cos_out[r]
     one, count = np.float32(1), len(phis)
     alpha2, y2, scale = np.empty_like(phis), np.empty_like(phis), np.empty_like(phis)
     for q in range(count):
-        y = masking_width(phis[q])
+        y = np.float32(width_of_masking(phis[q], kind))
         alpha2[q], y2[q] = alpha_of_phi(phis[q]) ** 2, y * y
         scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
     dg = np.empty_like(phis)
@@ -287,12 +294,12 @@ def _add_point(
             below = stretched(s2, c2, alpha2[q])
             dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
         for c in range(3):
-            of_base = graze[k] * weighted[k, c]
-            of_slope = np.float32(F0_OF_PSI) * (weighted[k, c] - of_base)
+            light = of_base[k] * weighted[k, c]
             for q in range(count):
-                base[c, q] += dg[q] * of_base
+                base[c, q] += dg[q] * light
+            light = np.float32(F0_OF_PSI) * of_rise[k] * weighted[k, c]
             for q in range(count):
-                slope[c, q] += dg[q] * of_slope
+                slope[c, q] += dg[q] * light
 
 
 def trace_lobe_samples(
@@ -335,12 +342,12 @@ def trace_lobe_samples(
         numbers = np.repeat(draws.number, group) * group + np.arange(count) % group
         aimed.direction[:, -1] = towards_sun(sun, shifts_of(numbers, 2, seed ^ _SUN_SEED))
     hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
-    cos_in, sin2_half, graze = np.zeros((3, count, total), np.float32)
+    cos_in, sin2_half, base, rise = np.zeros((4, count, total), np.float32)
     arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
     cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)
-    samples = LobeSamples(cos_in, sin2_half, graze, arriving, cos_out)
+    samples = LobeSamples(cos_in, sin2_half, base, rise, arriving, cos_out)
     hits = Hits._make(values.reshape(count, total) for values in hits)
-    weigh(aimed, hits, mixture, groups, lit.environment, samples)
+    weigh(aimed, hits, mixture, groups, lit.environment, lit.lobe, samples)
     return samples
 
 
@@ -365,18 +372,18 @@ def lobe_basis(
         # As many as vector instructions take at once.
         padded = np.zeros(-(-len(phis) // _LANES) * _LANES, np.float32)
         padded[: len(phis)] = phis
-        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)))
+        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)), lit.lobe)
         return base[..., : len(phis)], slope[..., : len(phis)]
 
     return basis
 
 
-def non_diffuse(samples: LobeSamples, phis: Float) -> tuple[Float, Float]:
+def non_diffuse(samples: LobeSamples, phis: Float, kind: int = PAPER) -> tuple[Float, Float]:
     """I_nd = base + psi * slope, (G, 3, Q) float32 each, means over each of G groups of consecutive
-    points, for its roughnesses phis (G, Q)."""
+    points, for its roughnesses phis (G, Q); kind of lobe, which the samples are of."""
     base = np.zeros((len(phis), 3, phis.shape[1]), np.float32)
     slope = np.zeros_like(base)
-    integrate(samples, phis, base, slope)
+    integrate(samples, phis, kind, base, slope)
     return base, slope
 
 
@@ -389,22 +396,35 @@ def lobe_radiance(
     seed: int,
     stream: Long | None = None,
 ) -> Float:
-    """I_nd (R, 3) at surface points with lobes phi, psi (R,), from ``rays`` rays each.
+    """I_nd (R, 3) at surface points with lobes phi (R,) and psi (R,), or (R, 3) where channels
+    differ, from ``rays`` rays each.
 
-    Of the rays, 5/8 follow the point's own lobe and the rest go to the lights, both weighted by the
-    balance heuristic. All ``points`` must lie on the surface. Every point draws its own random
-    numbers, from ``seed`` and its number in ``stream`` (R,), else its place in the array.
+    A psi above 1 is a metal's. Of the rays, 5/8 follow the point's own lobe and the rest go to the
+    lights, both weighted by the balance heuristic. All ``points`` must lie on the surface. Every
+    point draws its own random numbers, from ``seed`` and its number in ``stream`` (R,), else its
+    place in the array.
     """
     mixture = Mixture(per_lobe=rays - 3 * rays // 8, lights=3 * rays // 8, cosine=0)
     alphas = np.maximum(phi, MIN_ALPHA).astype(np.float64)[:, None]
+    psi = psi if psi.ndim == 2 else psi[:, None]
     result = np.zeros((len(phi), 3), np.float32)
+    stream = np.arange(len(phi)) if stream is None else stream
+    metal = (psi > 1).any(axis=1)
+    if lit.lobe == DIELECTRIC and metal.any():
+        for kind, own in ((DIELECTRIC, ~metal), (CONDUCTOR, metal)):
+            which = np.flatnonzero(own)
+            result[which] = lobe_radiance(
+                replace(lit, lobe=kind), points.take(which), phi[which], psi[which], rays, seed,
+                stream[which],
+            )  # fmt: skip
+        return result
     step = max(1, _RAYS_AT_ONCE // rays)
     for start in range(0, len(phi), step):
         part = np.arange(start, min(start + step, len(phi)))
-        numbers = part if stream is None else stream[part]
+        numbers = stream[part]
         samples = trace_lobe_samples(lit, points.take(part), mixture, seed, numbers, alphas[part])
-        base, slope = non_diffuse(samples, phi[part, None].astype(np.float32))
-        result[part] = base[..., 0] + psi[part, None] * slope[..., 0]
+        base, slope = non_diffuse(samples, phi[part, None].astype(np.float32), lit.lobe)
+        result[part] = base[..., 0] + psi[part] * slope[..., 0]
     return result
 
 
@@ -422,7 +442,8 @@ def specular_irradiance(
 ) -> Float:
     """S_nd (N, 3), W/m^2, at N surface points with normals (N, 3), world; unbiased.
 
-    phi, psi      (num_objects,) the lobe of each object; what emits reflects nothing
+    phi, psi      (num_objects,) the lobe of each object, psi (num_objects, 3) where channels
+                  differ; what emits reflects nothing
     identity      (N,) numbers of the points, of which their random numbers follow
     rays          cosine-distributed rays per point, and ``rays_of_lobe`` from where each ends
     """

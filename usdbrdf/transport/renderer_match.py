@@ -28,12 +28,16 @@ import numpy.typing as npt
 
 from usdbrdf.model.arrays import Double
 from usdbrdf.transport.brdf import (
+    DIELECTRIC,
     F0_OF_PSI,
     MIN_ALPHA,
+    PAPER,
     distribution,
     fresnel,
     masking,
     masking_width,
+    reflectance,
+    width_of_masking,
 )
 
 # Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
@@ -61,6 +65,31 @@ def shown_lobe(phi: npt.ArrayLike, psi: npt.ArrayLike) -> Shown:
     table = _table()
     f0 = F0_OF_PSI * np.asarray(psi, np.float64)
     return Shown(*(_bilinear(values, np.asarray(phi, np.float64), f0) for values in table))
+
+
+@cache
+def _kept_beside_microfacets() -> Double:
+    """(phi, F0) of the tables: the factor on the diffuse colour for a lobe that is the renderers'
+    own, of which they take what it reflects away from the diffuse term."""
+    rows = []
+    for phi in _PHI.tolist():
+        fitted = fitted_albedo(phi, _F0, kind=DIELECTRIC).mean(axis=0)
+        lobe, kept = (part.mean(axis=0) for part in cycles_albedo(phi, _F0))
+        rows.append((_TYPICAL + fitted - lobe) / (_TYPICAL * kept))
+    return np.array(rows)
+
+
+def kept_beside_microfacets(phi: float, f0: float) -> float:
+    """That factor for one lobe; beyond the table its end holds."""
+    table = _kept_beside_microfacets()
+    return float(_bilinear(table, np.asarray(phi, np.float64), np.asarray(f0, np.float64)))
+
+
+def shown_share_of_metal(phi: float) -> float:
+    """What of a conductor's F0, with alpha = max(0.001, phi), renderers must be given: that of the
+    table's largest F0, beyond which hardly anything but the masking differs."""
+    end = _bilinear(_table().f0, np.asarray(phi, np.float64), np.asarray(_F0[-1]))
+    return float(end / _F0[-1])
 
 
 def measured_lobe(phi: float, shown_f0: float) -> tuple[float, float]:
@@ -123,12 +152,15 @@ def view_cosines() -> Double:
     return np.asarray(np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS))
 
 
-def fitted_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Double:
-    """(V, N) directional albedo of the fitted lobe for reflectances F0 (N,)."""
+def fitted_albedo(
+    phi: float, f0: Double, cosines: Double | None = None, *, kind: int = PAPER
+) -> Double:
+    """(V, N) directional albedo of a fitted kind of lobe for reflectances F0 (N,)."""
     lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
-    y = masking_width(phi)
+    y = width_of_masking(phi, kind)
     g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
-    return np.asarray(_over_cosines(lobe, g) @ fresnel(f0, _WH[:, None]))
+    base, rise = reflectance(_WH[:, None], kind)
+    return np.asarray(_over_cosines(lobe, g) @ (base + f0 * rise))
 
 
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from usdbrdf.asset.preview_lobe import preview_surface_from_fit
+from usdbrdf.asset.preview_lobe import MICROFACET, preview_surface_from_fit
 from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
@@ -20,7 +20,7 @@ _BLACK = Gf.Vec3f(0.0)
 _TOLERANCE = 1e-4
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
-_MAPPINGS = (_MEASURED, "matched")
+_MAPPINGS = (_MEASURED, "matched", MICROFACET)
 _SHOWN = ("usdBrdf:fit:shownPhi", "usdBrdf:fit:shownPsi")
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
 
@@ -104,9 +104,9 @@ def show_record(site: Site) -> bool:
 @rule(Severity.ERROR, show_record)
 def lobe_matches_fit(scene: AssetStage) -> Iterator[Fault]:
     """Roughness, ior and the factor on the colour of an object's material are those that its
-    recorded phi and psi stand for under the recorded mapping. Where they differ, the file
-    contradicts itself: somebody edited the record, which changes no picture, or a layer of ours.
-    What an artist's layer says about the material is not judged.
+    recorded phi and psi stand for under the recorded mapping; of a metal the roughness is. Where
+    they differ, the file contradicts itself: somebody edited the record, which changes no picture,
+    or a layer of ours. What an artist's layer says about the material is not judged.
 
     To change how a surface looks author roughness and ior of its material; leave the record of the
     measurement as it is."""
@@ -130,11 +130,12 @@ def _contradictions(scene: AssetStage, item: Usd.Prim) -> Iterator[tuple[Usd.Att
     if not (0 <= phi <= 1 and 0 <= psi <= 1):
         return
     wanted = preview_surface_from_fit(phi, psi, _mapping(item))
-    diffuse = surface.GetInput("diffuseColor")
+    metal = authored(item, "usdBrdf:fit:kind") == "conductor"
+    diffuse = None if metal else surface.GetInput("diffuseColor")
     sources = diffuse.GetConnectedSources()[0] if diffuse else []
     scale = UsdShade.Shader(sources[0].source.GetPrim()).GetInput("scale") if sources else None
     roughness, ior = (surface.GetInput(name) for name in ("roughness", "ior"))
-    numbers = [(roughness, wanted.roughness), (ior, wanted.ior)]
+    numbers = [(roughness, wanted.roughness), *([] if metal else [(ior, wanted.ior)])]
     shown = [(x.GetAttr(), value) for x, value in numbers if x and not x.HasConnectedSource()]
     if scale:
         shown.append((scale.GetAttr(), wanted.diffuse))

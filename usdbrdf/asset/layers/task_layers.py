@@ -60,7 +60,7 @@ from usdbrdf.asset.layers.looks import (
     surface,
 )
 from usdbrdf.asset.layout import path_in_layer
-from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit
+from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit, shown_metal
 from usdbrdf.asset.properties import (
     Colour,
     FittedObject,
@@ -327,11 +327,14 @@ def write_material_layer(
             shown = preview_surface_from_fit(*item.shown, item.mapping)
             lobe(layer, material, shown.roughness, shown.ior)
             shader = over(layer, f"{material}/{SURFACE}")
-            author_inputs(shader, Types.Float, metallic=0.0)
+            author_inputs(shader, Types.Float, metallic=float(item.is_metal))
             author_inputs(shader, Types.Int, useSpecularWorkflow=0)
-        texture = _author_colour(layer, material, item, shown.diffuse, shading)
+        if item.is_metal:
+            texture = _author_metal(layer, material, item)
+        else:
+            texture = _author_colour(layer, material, item, shown.diffuse, shading)
         if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
-            networks[material] = (shown, texture)
+            networks[material] = (item, shown, texture)
     looks = aov_looks(layer, scopes, objects)
     for parameter, look in enumerate(("roughness", "specular")):
         greys = [(i.shown[parameter],) * 3 if i.is_known else None for i in objects]
@@ -340,8 +343,8 @@ def write_material_layer(
     if materialx:
         layer.subLayerPaths = [f"./{asset.materialx_layer.name}"]
         beneath = draft.new_layer()
-        for material, (shown, texture) in networks.items():
-            _author_network(beneath, material, shown, texture)
+        for material, (item, shown, texture) in networks.items():
+            _author_network(beneath, material, item, shown, texture)
         export(beneath, materialx, folder=asset.materialx_layer.parent)
     export(layer, path, folder=asset.layer("material").parent)
 
@@ -366,19 +369,34 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _author_network(layer: Sdf.Layer, material: str, shown: PreviewLobe, file: str) -> None:
+def _author_metal(layer: Sdf.Layer, material: str, item: FittedObject) -> str:
+    """One reflectance in the place of a texture; returns that there is none."""
+    colour = shown_metal(item.phi, item.f0, item.mapping)
+    shader = over(layer, f"{material}/{SURFACE}")
+    author_inputs(shader, Types.Color3f, diffuseColor=Gf.Vec3f(*colour))
+    # An empty list that is explicit takes off the connection of the layer beneath.
+    spec = layer.GetAttributeAtPath(f"{shader.path}.inputs:diffuseColor")
+    spec.connectionPathList.ClearEditsAndMakeExplicit()
+    return ""
+
+
+def _author_network(
+    layer: Sdf.Layer, material: str, item: FittedObject, shown: PreviewLobe, file: str
+) -> None:
     """OpenPBR with what UsdPreviewSurface is told; ``file`` is the texture of its diffuse colour as
-    layers spell its path, "" is black."""
+    layers spell its path, "" is black, or a metal's own reflectance."""
     surface = f"{material}/OpenPBR"
     connect(over(layer, material), "outputs:mtlx:surface", Types.Token, f"{surface}.outputs:out")
     prim = node(layer, surface, "ND_open_pbr_surface_surfaceshader", "out", Types.Token)
     author_inputs(
         prim, Types.Float,
-        base_weight=1.0, base_diffuse_roughness=0.0, base_metalness=0.0, specular_weight=1.0,
+        base_weight=1.0, base_diffuse_roughness=0.0,
+        base_metalness=float(item.is_metal), specular_weight=1.0,
         specular_roughness=shown.roughness, specular_ior=shown.ior,
     )  # fmt: skip
     if not file:
-        author_inputs(prim, Types.Color3f, base_color=(0.0, 0.0, 0.0))
+        colour = shown_metal(item.phi, item.f0, item.mapping)  # black of what is no metal
+        author_inputs(prim, Types.Color3f, base_color=Gf.Vec3f(*colour))
         return
     st, image, scaled = (f"{material}/Mtlx{name}" for name in ("St", "BaseColor", "Scaled"))
     prim_st = node(layer, st, "ND_geompropvalue_vector2", "out", Types.Float2)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.preview_lobe import fit_from_preview_surface
+from usdbrdf.asset.preview_lobe import MICROFACET, fit_from_preview_surface
 from usdbrdf.asset.readers.scene import (
     asset_file,
     authored,
@@ -27,6 +27,8 @@ from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.material import Material, Surface, constant_map, preview_material
 from usdbrdf.model.mesh import Triangulation
+from usdbrdf.transport.brdf import DIELECTRIC, PAPER
+from usdbrdf.transport.renderer_match import shown_share_of_metal
 
 # The fallbacks of UsdPreviewSurface, which also stand for a mesh without any material.
 _FALLBACKS: dict[str, tuple[float, ...]] = {
@@ -64,9 +66,10 @@ class _MaterialReader:
         """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks
         of UsdPreviewSurface with the mesh's display colour.
 
-        mapping  "matched" if the surface was told what renderers need to show a fitted lobe: what
-                 comes back is the lobe that was meant. A map of roughness counts by its mean.
-                 Metals and the specular workflow are never ours: those stay as they are
+        mapping  "matched" or "microfacet" if the surface was told what renderers need to show a
+                 fitted lobe: what comes back is the lobe that was meant. A map of roughness counts
+                 by its mean.
+                 Half metals and the specular workflow are never ours: those stay as they are
         """
         shader = bound.ComputeSurfaceSource()[0] if bound else None
         path = bound.GetPath() if bound else ""
@@ -80,9 +83,14 @@ class _MaterialReader:
         }
         if known["opacity"].min() < 1:
             self.warn(f"<{path}>: opacity is not rendered; the surface is taken as opaque.")
-        ior, never_ours = float(known["ior"].flat[0]), ("metallic", "useSpecularWorkflow")
-        if mapping == "matched" and not any(known[name].any() for name in never_ours):
-            fitted = fit_from_preview_surface(float(known["roughness"].mean()), ior)
+        ior, roughness = float(known["ior"].flat[0]), float(known["roughness"].mean())
+        fitted_by = ("matched", MICROFACET)
+        ours = mapping in fitted_by and not known["useSpecularWorkflow"].any()
+        if ours and mapping == "matched" and (known["metallic"] == 1).all():
+            share = shown_share_of_metal(roughness**2)
+            known["diffuseColor"] = np.minimum(known["diffuseColor"] / np.float32(share), 1)
+        elif ours and not known["metallic"].any():
+            fitted = fit_from_preview_surface(roughness, ior, mapping)
             known["diffuseColor"] = np.asarray(known["diffuseColor"] / fitted.diffuse, np.float32)
             ior = fitted.ior
         material = preview_material(
@@ -93,7 +101,8 @@ class _MaterialReader:
             ior=ior,
             specular=known["specularColor"] if known["useSpecularWorkflow"].flat[0] else None,
         )
-        return replace(material, wrap=self.wrap or "clamp")
+        lobe = DIELECTRIC if mapping == MICROFACET else PAPER
+        return replace(material, wrap=self.wrap or "clamp", lobe=lobe)
 
     def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""

@@ -1,0 +1,113 @@
+"""Metals are told from dielectrics by what explains the samples better."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from usdbrdf.material import fit_objects
+from usdbrdf.material.conductor import conductor_of
+from usdbrdf.material.fit_objects import ObjectFit, fitted_by_likelier_lobe, judged
+from usdbrdf.material.verdict import LobeEstimate
+from usdbrdf.model.scene import SceneObject
+from usdbrdf.options import FitOptions
+from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI, PAPER
+from usdbrdf.transport.lit_scene import LitScene
+
+TEXELS, VIEWS, PHI = 60, 10, 0.1
+TEXEL = np.repeat(np.arange(TEXELS), VIEWS)
+F0 = np.array([0.95, 0.75, 0.35])
+
+
+def _incident(seed: int) -> np.ndarray:
+    """(P, 3): what a mirror would show, a few lamps among dim walls."""
+    rng = np.random.default_rng(seed)
+    dim = rng.uniform(0.2, 0.6, (len(TEXEL), 1)) * [1.0, 0.9, 0.8]
+    return np.where(rng.random((len(TEXEL), 1)) < 0.2, 8.0, 1.0) * dim
+
+
+def _basis(seed: int):
+    """(base, slope) of roughnesses: sharp where phi is small, evened out where it is large."""
+    light, noise = _incident(1), np.random.default_rng(seed)
+
+    def basis(phis: Any) -> tuple[np.ndarray, np.ndarray]:
+        blur = np.exp(-np.abs(np.log(np.maximum(np.asarray(phis), 1e-3) / PHI)))
+        seen = light[..., None] * blur + light.mean() * (1 - blur)
+        seen = seen * (1 + 0.03 * noise.standard_normal(seen.shape))
+        return (0.01 * seen).astype(np.float32), (F0_OF_PSI * seen).astype(np.float32)
+
+    return basis
+
+
+def _found(radiance: np.ndarray, psi: float):
+    noisy = radiance * (1 + 0.02 * np.random.default_rng(9).standard_normal(radiance.shape))
+    dielectric = LobeEstimate(PHI, psi, 0.02, 0.1, 0.0, 1.0, 0.9)
+    irradiance = np.full((len(TEXEL), 3), 1.5, np.float32)
+    bases = _basis(2), _basis(3)
+    return conductor_of(noisy.astype(np.float32), TEXEL, irradiance, bases, dielectric)
+
+
+def test_a_metal_is_found_with_its_colour():
+    metal = _found((0.01 + F0) * _incident(1), 1.0)
+    assert metal is not None
+    assert metal.phi == PHI
+    np.testing.assert_allclose(metal.f0, F0, atol=0.03)
+    assert metal.clearer > 0.5
+    assert metal.f0_error < 0.05
+
+
+@pytest.mark.parametrize("texture", [0.0, 0.4])
+def test_a_dielectric_is_none(texture: float):
+    # psi = 0.9 under a diffuse part, plain or patterned.
+    pattern = 1 + texture * np.random.default_rng(4).uniform(-1, 1, TEXELS)[TEXEL][:, None]
+    diffuse = 0.5 * pattern * 1.5 / np.pi * np.array([1.0, 0.9, 0.7])
+    assert _found(diffuse + (0.01 + F0_OF_PSI * 0.9) * _incident(1), 0.9) is None
+
+
+def test_a_black_dielectric_is_none():
+    # All that it shows is its lobe, as of a metal; but no metal reflects so little.
+    assert _found((0.01 + F0_OF_PSI * 0.6) * _incident(1), 0.6) is None
+
+
+def _object() -> SceneObject:
+    return SceneObject(
+        prim_path="/a/b", identifier="b", label="b", class_name="", first_face=0, num_faces=1
+    )
+
+
+def test_a_metal_is_published_as_one():
+    found = ObjectFit(
+        0.1, 1.0, 0.01, 0.05, 0.0, 1.0, 0.9, 0.1, 1.0, 1.0, 0.12, 0.9, 0.7, 0.3, 0.01, 0.02, 0.4,
+        500, 3,
+    )  # fmt: skip
+    verdict = judged(found, _object(), FitOptions(), True)
+    assert (verdict.kind, verdict.status, verdict.phi) == ("conductor", "measured", 0.12)
+    assert verdict.f0 == (0.9, 0.7, 0.3)
+    assert judged(found._replace(f0_error=0.2), _object(), FitOptions(), True).status == "prior"
+    plain = judged(found._replace(clearer=math.nan), _object(), FitOptions(), True)
+    assert plain.kind == "dielectric"
+
+
+@pytest.mark.parametrize(("paper", "other", "chosen"), [
+    (0.9, 0.6, PAPER),
+    (0.6, 0.9, DIELECTRIC),
+    (0.71, 0.7, DIELECTRIC),  # hardly clearer: the lobe of renderers
+    (0.04, 0.0, DIELECTRIC),  # nothing shows
+])  # fmt: skip
+def test_the_scene_has_the_lobe_that_explains_its_views(
+    monkeypatch: pytest.MonkeyPatch, paper: float, other: float, chosen: int
+):
+    def fitted(run: Any, lit: LitScene, *_: Any) -> list[ObjectFit]:
+        return [ObjectFit(evidence=paper if lit.lobe == PAPER else other), ObjectFit()]
+
+    monkeypatch.setattr(fit_objects, "fitted_objects", fitted)
+    names = ("scene", "texels", "rays", "radiance", "lights", "emission", "environment")
+    lit = LitScene(**dict.fromkeys(names))  # type: ignore[arg-type]
+    scene, found = fitted_by_likelier_lobe(None, lit, None, None, FitOptions())  # type: ignore[arg-type]
+    assert scene.lobe == chosen
+    assert found[0].evidence == (paper if chosen == PAPER else other)
+    asked = fitted_by_likelier_lobe(None, lit, None, None, FitOptions(lobe="paper"))  # type: ignore[arg-type]
+    assert asked[0].lobe == PAPER

@@ -1,0 +1,128 @@
+"""Metals: a lobe without a diffuse part, with a reflectance of its own in each channel, against the
+dielectric that explains the same samples.
+
+A conductor's radiance is base + F0 slope / 0.08 in each channel, whatever the texel; a dielectric's
+is a diffuse part that is free of each texel, or one albedo of the object times S, and a lobe of F0
+up to 0.08. The likelihood of the samples under each, errors relative to what the texel shows and of
+one unknown size, decides; free diffuse parts are paid for, being integrated over all that the texel
+could be (H. Jeffreys, "Theory of Probability", 1961).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.material.verdict import LobeEstimate
+from usdbrdf.model.arrays import Double, Float, Long
+from usdbrdf.transport.brdf import F0_OF_PSI
+from usdbrdf.transport.lobe_radiance import Basis
+
+_PHIS = calibration.numbers("conductor.roughnesses")
+_LEAST_F0 = calibration.number("conductor.least_f0")
+_CLEARER = calibration.number("conductor.clearer")
+_LEAST_ERROR = calibration.number("conductor.least_error")
+# Of a sample, relative: what is further off is no more against a model than this.
+_FURTHEST = calibration.number("conductor.furthest")
+
+
+class Conductor(NamedTuple):
+    """phi; f0 (3,), reflectance at normal incidence; their standard deviations phi_error, f0_error;
+    clearer: by how much the logarithm of the errors is less than any dielectric's."""
+
+    phi: float
+    f0: tuple[float, float, float]
+    phi_error: float
+    f0_error: float
+    clearer: float
+
+
+def conductor_of(
+    radiance: Float,
+    texel: Long,
+    irradiance: Float,
+    bases: tuple[Basis, Basis],
+    dielectric: LobeEstimate,
+) -> Conductor | None:
+    """The metal that explains P samples clearly better than the best dielectric; None without one.
+
+    radiance    (P, 3) of the samples; texel (P,) counted from 0 without gaps
+    irradiance  (P, 3), W/m^2, S at the sample's texel
+    bases       twice roughnesses -> (base, slope), (P, 3, K), with independent noise
+    """
+    count = int(texel.max()) + 1
+    views = np.bincount(texel, minlength=count)
+    mean = np.bincount(texel, radiance.mean(axis=1), count) / views
+    level = np.maximum(mean, 1e-3 * mean.mean())[texel][:, None]
+    seen = radiance / level
+    lobes = [_relative(basis(_PHIS), level) for basis in bases]
+    errors, reflectances = np.zeros(len(_PHIS)), np.zeros((len(_PHIS), 3))
+    for k in range(len(_PHIS)):
+        (base, slope), (other_base, other_slope) = ((b[..., k], s[..., k]) for b, s in lobes)
+        f0 = _least_squares(seen, (base, other_base), (slope, other_slope))
+        reflectances[k] = f0
+        errors[k] = _size(seen - base - f0 * slope, seen - other_base - f0 * other_slope)
+    best = int(errors.argmin())
+    f0 = reflectances[best]
+    if f0.mean() < _LEAST_F0:
+        return None
+    found = [_relative(basis([dielectric.phi]), level) for basis in bases]
+    psi = dielectric.psi * F0_OF_PSI
+    rests = [seen - (base + psi * slope)[..., 0] for base, slope in found]
+    diffuse = irradiance / level
+    albedo = np.clip((rests[0] * diffuse).sum(axis=0) / (diffuse**2).sum(axis=0), 0, 1)
+    uniform = _size(*(rest - albedo * diffuse for rest in rests))
+    # Each texel's own mean takes its share of the errors with it, and had a range of 1 before.
+    means = [_without_means(rest, texel, views) for rest in rests]
+    own = _size(*means) * math.sqrt(len(texel) / max(len(texel) - count, 1))
+    paid = -count / len(texel) * math.log(own * math.sqrt(2 * math.pi * count / len(texel)))
+    textured = math.log(own) + max(paid, 0.0)
+    clearer = min(math.log(uniform), textured) - math.log(float(errors[best]))
+    if clearer < _CLEARER:
+        return None
+    likely = np.exp(-0.5 * count * (np.log(errors / errors[best])))
+    likely *= np.gradient(np.array(_PHIS))
+    likely /= likely.sum()
+    phi = float(likely @ np.array(_PHIS))
+    phi_error = math.sqrt(float(likely @ (np.array(_PHIS) - phi) ** 2))
+    return Conductor(
+        phi=float(_PHIS[best]),
+        f0=(float(f0[0]), float(f0[1]), float(f0[2])),
+        phi_error=max(phi_error, 0.05 * _PHIS[best]),
+        f0_error=float(np.sqrt((likely @ (reflectances - f0) ** 2).mean())),
+        clearer=clearer,
+    )
+
+
+def _relative(lobe: tuple[Float, Float], level: Float) -> tuple[Double, Double]:
+    """base, and the slope by F0, in units of what texels show."""
+    base, slope = (part / level[..., None] for part in lobe)
+    return base.astype(np.float64), slope.astype(np.float64) / F0_OF_PSI
+
+
+def _least_squares(
+    seen: Double, base: tuple[Double, Double], slope: tuple[Double, Double]
+) -> Double:
+    """F0 (3,) in [0, 1], from products of what has independent noise; samples that are far off are
+    cut back to what they may be."""
+    f0 = np.full(3, 0.5)
+    for _ in range(8):
+        model = (base[0] + base[1] + f0 * (slope[0] + slope[1])) / 2
+        clipped = np.clip(seen, model - _FURTHEST / 2, model + _FURTHEST / 2)
+        crossed = ((clipped - base[0]) * slope[1] + (clipped - base[1]) * slope[0]).sum(axis=0) / 2
+        f0 = np.clip(crossed / np.maximum((slope[0] * slope[1]).sum(axis=0), 1e-12), 0, 1)
+    return np.asarray(f0)
+
+
+def _without_means(values: Double, texel: Long, views: Long) -> Double:
+    sums = np.stack([np.bincount(texel, channel, len(views)) for channel in values.T], axis=-1)
+    return np.asarray(values - (sums / views[:, None])[texel])
+
+
+def _size(first: Double, second: Double) -> float:
+    """Root mean square of what a model leaves, from two predictions with independent noise."""
+    cut = [np.clip(rest, -_FURTHEST, _FURTHEST) for rest in (first, second)]
+    return max(math.sqrt(max(float((cut[0] * cut[1]).mean()), 0.0)), _LEAST_ERROR)
