@@ -134,7 +134,7 @@ def light_from_outside(
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
     light leaves it. seen: what the frames show of it."""
-    asked = _asked(surface.texels, lit, coverage, seed)
+    asked = asked_texels(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
     measured, clipped = seen.coverage.measured, seen.coverage.clipped
@@ -184,7 +184,7 @@ def light_from_outside(
     )
 
 
-def _asked(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Asked | None:
+def asked_texels(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Asked | None:
     """Texels of the largest segments that were measured, with some of them that clip, and no light
     yet; None where there are too few."""
     usable = np.flatnonzero(coverage.observed & texels.interior & (lit > 0).all(axis=1))

@@ -17,11 +17,12 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Float
+from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.outside import Outside
+from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment, black_environment
@@ -55,12 +56,15 @@ def find_emitters(
     seen: Bool,
     clipped: Bool,
     unknown_lamp: float = 0.0,
+    unseen_lamps: Int | None = None,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
     seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound.
     unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that. S is
     then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
+    unseen_lamps: numbers of the objects that shine though no frame shows them; of these
+    ``lower_bound`` is True
     """
     light = radiance.mean(axis=1)
     shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
@@ -81,6 +85,10 @@ def find_emitters(
             emissive[own] = True
         else:
             emissive[own] = _connected(texels, i, shines[own] & known[own])
+        if unseen_lamps is not None and i in unseen_lamps:
+            is_lamp[i], lower_bound[i], emissive[own] = True, True, True
+            mean[i] = radiance[own].mean(axis=0)
+            continue
         weight = area * emissive[own]
         exact = weight * seen[own]
         # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
@@ -207,6 +215,7 @@ class Shaded:
     """What is known of all texels.
 
     light           L_d (T, 3) with the estimated radiance of lamps that clipped
+    unseen          lamps that no frame shows
     traced          S as it was traced
     relative_error  (T,) float32 of that
     irradiance      (T, 3) float32, W/m^2: S as it is used; ``traced.mean`` itself if not filtered
@@ -218,6 +227,7 @@ class Shaded:
     """
 
     light: ClippedLight
+    unseen: UnseenLamps
     traced: Irradiance
     relative_error: Float
     irradiance: Float
@@ -233,15 +243,18 @@ class Shaded:
         return np.where(self.emitters.emissive[:, None], self.light.lit, np.float32(0))
 
     def radiance_status(self, index: int) -> str:
-        """How the radiance of what shines on an object is known: "measured"; where it clipped in
-        every frame "estimated" from the light that it casts, or "lowerBound"."""
+        """How the radiance of what shines on an object is known: "measured"; where no frame
+        shows it, or all clip, "estimated" from the light that it casts, or "lowerBound"."""
         if not self.emitters.lower_bound[index]:
             return "measured"
-        return "lowerBound" if math.isnan(self.light.error_of_object(index)) else "estimated"
+        return "lowerBound" if math.isnan(self.radiance_error(index)) else "estimated"
 
     def radiance_error(self, index: int) -> float:
         """Relative standard error of an object's estimated radiance, else NaN."""
-        return self.light.error_of_object(index) if self.emitters.lower_bound[index] else math.nan
+        if not self.emitters.lower_bound[index]:
+            return math.nan
+        error = self.unseen.error_of(index)
+        return self.light.error_of_object(index) if math.isnan(error) else error
 
     def doubts(self, identifiers: Sequence[str]) -> Iterator[str]:
         """Sentences about what a person should look at; identifiers: of the objects."""
@@ -256,8 +269,9 @@ class Shaded:
                 )
             elif status == "estimated":
                 radiance = ", ".join(f"{value:.3g}" for value in self.emitters.radiance[i])
+                how = "no frame shows it" if i in self.unseen.object else "saturated in every frame"
                 yield (
-                    f"{identifier}: saturated in every frame; from the light that it casts its "
+                    f"{identifier}: {how}; from the light that it casts its "
                     f"radiance is {radiance}, +-{100 * self.radiance_error(i):.0f} %. Capture a "
                     "shorter exposure to measure it. [shading.estimated]"
                 )
@@ -312,6 +326,13 @@ def shade_surface(
     outside  the light from outside; None for none
     """
     environment = outside.environment if outside else black_environment()
+    # In the light of what it may be that no frame shows; not both that and an open scan's.
+    unseen = (
+        UnseenLamps.none()
+        if outside
+        else estimate_unseen_lamps(run, surface, lit, coverage, sampling.seed)
+    )
+    lit = unseen.with_light(surface.texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed)
     filtered = lightmap_filter == OIDN
     if filtered:
@@ -320,12 +341,12 @@ def shade_surface(
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
     may_shine, dimmest = light.may_shine(coverage.clipped), light.least_of_lamps()
-    emitters = find_emitters(texels, light.lit, irradiance, seen, may_shine, dimmest)
+    emitters = find_emitters(texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object)
     albedo, over = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
     return Shaded(
         light=light, traced=traced, relative_error=relative, irradiance=irradiance,
-        emitters=emitters, albedo=albedo, unexplained=over, outside=outside,
+        unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over, outside=outside,
         over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),
     )  # fmt: skip

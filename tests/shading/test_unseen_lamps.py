@@ -1,0 +1,92 @@
+"""A lamp above all pictures, from the light that it casts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import Sampling, box, quad, world_of
+from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading.shaded import find_emitters
+from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
+from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lit_scene import TexturedScene
+
+RADIANCE = np.array([20.0, 16.0, 11.0])
+LAMP, SHELF = 5, 6
+
+
+@pytest.fixture(scope="module")
+def hall():
+    """A room of 6 x 5 x 4 m with two blocks; a panel under the ceiling, and a shelf beside it."""
+    return world_of([
+        quad((0, 0, 0), (6, 0, 0), (0, 5, 0), (60, 50)),
+        quad((0, 5, 0), (6, 0, 0), (0, 0, 4), (48, 32)),
+        quad((0, 0, 0), (0, 5, 0), (0, 0, 4), (40, 32)),
+        quad((6, 0, 0), (0, 0, 4), (0, 5, 0), (32, 40)),
+        quad((0, 0, 0), (0, 0, 4), (6, 0, 0), (32, 48)),
+        quad((2, 2, 3.95), (0, 1.2, 0), (1.2, 0, 0), (8, 8)),
+        quad((4.5, 3.5, 3.0), (0, 1.2, 0), (1.2, 0, 0), (8, 8)),
+        quad((0, 0, 4), (0, 5, 0), (6, 0, 0), (30, 36)),
+        *box((1, 1, 0.01), (2, 2, 1.2), (20, 20)),
+        *box((3.5, 2.5, 0.01), (4.5, 3.5, 2.0), (20, 20)),
+    ])  # fmt: skip
+
+
+def _photographed(hall, radiance: np.ndarray, index: int):
+    """The surface, L_d with an object that shines, light going to and fro four times, and what is
+    seen: all but panel and shelf, whose L_d is filled in with what is usual."""
+    surface, texels = TexturedScene(hall.scene, hall.texels, hall.rays), hall.texels
+    random, owner = np.random.default_rng(3), texels.object_index()
+    albedo = random.uniform(0.2, 0.7, (len(texels.resolution), 3))[owner]
+    albedo = albedo * np.exp(0.15 * random.standard_normal((len(texels), 1)))
+    lit = np.zeros((len(texels), 3), np.float32)
+    for _ in range(4):
+        lit[owner == index] = radiance
+        arriving = irradiance_at(
+            surface.rays, surface.texture(lit), lights_from_radiance(hall.scene, texels, lit),
+            black_environment(), texels.position, texels.normal, independent_tiles(len(texels)),
+            Sampling(standard_error=0.03, max_rays=256), surface.diagonal_m,
+        ).mean  # fmt: skip
+        lit = (albedo / np.pi * arriving).astype(np.float32)
+    lit[owner == index] = radiance
+    unseen = np.isin(owner, (LAMP, SHELF))
+    shown = lit.copy()
+    shown[unseen] = np.median(lit[~unseen], axis=0)
+    if index not in (LAMP, SHELF):
+        shown = np.where(unseen[:, None], shown, lit)
+    return surface, shown, CoverageMap.of(~unseen, np.zeros(len(texels), np.bool_))
+
+
+def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    found = lamps_that_explain(surface, lit, coverage, 0)
+    assert found.object.tolist() == [LAMP]
+    np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.2)
+    assert found.error[0] < 0.2
+    # It shines as a whole, and with an error that is said.
+    with_it = found.with_light(surface.texels, lit)
+    own = surface.texels.of_object(LAMP)
+    np.testing.assert_array_equal(with_it[own], np.tile(found.radiance[0], (64, 1)))
+    rest = np.arange(len(lit))[own.stop :]
+    np.testing.assert_array_equal(with_it[rest], lit[rest])
+    emitters = find_emitters(
+        surface.texels, with_it, np.full_like(lit, 100), coverage.measured, coverage.clipped,
+        unseen_lamps=found.object,
+    )  # fmt: skip
+    assert np.flatnonzero(emitters.is_lamp).tolist() == [LAMP]
+    assert emitters.lower_bound[LAMP]
+    np.testing.assert_allclose(emitters.radiance[LAMP], found.radiance[0], rtol=1e-5)
+    assert found.error_of(LAMP) == pytest.approx(float(found.error[0]))
+    assert np.isnan(found.error_of(SHELF))
+
+
+def test_what_only_reflects_is_none(hall):
+    # The lamp is a wall that frames show.
+    surface, lit, coverage = _photographed(hall, RADIANCE / 4, 1)
+    found = lamps_that_explain(surface, lit, coverage, 0)
+    assert not len(found.object)
+    assert found.with_light(surface.texels, lit) is lit
+    assert not len(UnseenLamps.none().error)

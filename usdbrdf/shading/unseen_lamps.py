@@ -1,0 +1,176 @@
+"""Lamps that no frame shows, from the light that they cast: a ceiling light above all pictures.
+
+Objects of which frames show nothing are sources of unknown strength. As for light from outside,
+what texels reflect tells it: pi L_d = albedo (S_seen + sum_k g_k B_k), by least squares on the
+logarithms with one albedo for each facing of an object. What comes out much brighter than anything
+that only reflects could be where it is shines by itself; the others keep what was filled in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.job.progress import say
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.shading.clipped_light import irradiance_of_texels
+from usdbrdf.shading.outside import asked_texels
+from usdbrdf.shading.outside_light import Asked, Sources, jackknife, solved
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.warps import cosine_rays
+
+_UNSEEN = calibration.number("unseen.most_seen")
+_LEAST_SHARE = calibration.number("unseen.least_share")
+_BRIGHTER = calibration.number("unseen.brighter")
+_LEAST_PART = calibration.number("unseen.least_part")
+_DEVIATION = calibration.number("unseen.deviation")
+_MOST_ERROR = calibration.number("unseen.most_error")
+# Rays from each texel that is asked, objects that may shine, and those whose light is traced.
+_RAYS, _CANDIDATES, _TRACED = 256, 32, 8
+_SEED = 0x1A3
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnseenLamps:
+    """K objects that shine though no frame shows them: object (K,) int32, radiance (K, 3) float32
+    W/(m^2 sr), and its relative standard error (K,)."""
+
+    object: Int
+    radiance: Float
+    error: Float
+
+    @classmethod
+    def none(cls) -> UnseenLamps:
+        return cls(
+            object=np.zeros(0, np.int32),
+            radiance=np.zeros((0, 3), np.float32),
+            error=np.zeros(0, np.float32),
+        )
+
+    def error_of(self, index: int) -> float:
+        """Of one object; NaN where it is none of them."""
+        own = np.flatnonzero(self.object == index)
+        return float(self.error[own[0]]) if len(own) else float("nan")
+
+    def with_light(self, texels: Texels, lit: Float) -> Float:
+        """``lit`` (T, 3) with these lamps in it."""
+        if not len(self.object):
+            return lit
+        lit = lit.copy()
+        for index, radiance in zip(self.object, self.radiance, strict=True):
+            lit[texels.of_object(int(index))] = radiance
+        return lit
+
+
+def estimate_unseen_lamps(
+    run: TaskRun, surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int
+) -> UnseenLamps:
+    """Of a closed scan with the radiance ``lit`` (T, 3)."""
+
+    def compute() -> dict[str, Array]:
+        return dict(vars(lamps_that_explain(surface, lit, coverage, seed)))
+
+    found = UnseenLamps(**run.checkpoint("unseen", compute))
+    if len(found.object):
+        say(f"shade: {len(found.object)} lamps that no frame shows, by the light that they cast")
+    return found
+
+
+def lamps_that_explain(
+    surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int
+) -> UnseenLamps:
+    """The unseen objects that must shine for plain surfaces to be plain."""
+    texels = surface.texels
+    owner = texels.object_index()
+    area = np.bincount(owner, texels.area)
+    seen = np.bincount(owner, texels.area * coverage.observed) / np.maximum(area, 1e-12)
+    asked = asked_texels(texels, lit, coverage, seed)
+    if asked is None or not (seen < _UNSEEN).any():
+        return UnseenLamps.none()
+    share = _shares(surface, asked, seen < _UNSEEN, seed)
+    brings = share.mean(axis=1)
+    candidates = np.argsort(-brings, kind="stable")[:_CANDIDATES]
+    candidates = candidates[brings[candidates] > _LEAST_SHARE * np.pi]
+    if not len(candidates):
+        return UnseenLamps.none()
+    # Few rays meet a lamp, and errors of what it brings draw its strength to nothing: they only
+    # say which of the objects may be one.
+    found, _, near, part = _strengths(surface, lit, asked, share[candidates], candidates, seed)
+    likely = np.where(np.pi * found.mean(axis=1) > near, part, 0)
+    likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
+    candidates = candidates[likeliest[likely[likeliest] > _LEAST_PART / 4]]
+    traced = {int(k): _brought(surface, asked, int(k), seed) for k in candidates}
+    while len(candidates):
+        shares = np.stack([traced[int(k)] for k in candidates])
+        found, error, near, part = _strengths(surface, lit, asked, shares, candidates, seed)
+        # Clearly brighter than what only reflects: even with as much light as the texels that see
+        # it receive.
+        brightness = np.log(np.pi * found.mean(axis=1) / near)
+        lamp = (brightness > np.log(_BRIGHTER)) & (part > _LEAST_PART)
+        if lamp.all():  # none of the others blurs what these are any more
+            lamp = (brightness > 2 * error) & (error < _MOST_ERROR)
+        if lamp.all():
+            order = np.argsort(candidates)
+            return UnseenLamps(
+                object=candidates[order].astype(np.int32),
+                radiance=found[order].astype(np.float32),
+                error=error[order].astype(np.float32),
+            )
+        candidates = candidates[lamp]
+    return UnseenLamps.none()
+
+
+def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> Double:
+    """(num_objects, N) W/m^2: what each unseen object of radiance 1 brings to the texels asked."""
+    texels, count = surface.texels, len(asked.texel)
+    normal = texels.normal[asked.texel]
+    origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
+    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, _RAYS)
+    face = surface.rays.closest(np.tile(origin, (_RAYS, 1)), towards).face
+    met = np.where(face >= 0, surface.scene.face_object[np.maximum(face, 0)], -1)
+    kept = (met >= 0) & unseen[met]
+    place = met[kept].astype(np.int64) * count + np.arange(len(met))[kept] % count
+    number = np.bincount(place, minlength=len(unseen) * count)
+    return np.asarray(np.pi / _RAYS * number.reshape(len(unseen), count), np.float64)
+
+
+def _brought(surface: TexturedScene, asked: Asked, index: int, seed: int) -> Double:
+    """(N,) W/m^2: what an object of radiance 1 brings, by rays that are sent to it."""
+    alone = surface.texels.object_index() == index
+    light = np.repeat(alone[:, None].astype(np.float32), 3, axis=1)
+    found = irradiance_of_texels(surface, light, black_environment(), asked.texel, seed + index)
+    return np.asarray(found[:, 0], np.float64)
+
+
+def _strengths(
+    surface: TexturedScene, lit: Float, asked: Asked, share: Double, candidates: Long, seed: int
+) -> tuple[Double, Double, Double, Double]:
+    """Radiance (K, 3) of the candidates, its relative error (K,), S (K,) of the texels that they
+    light, each as much as it does, and what part of all light is theirs, (K,)."""
+    of_candidates = np.isin(surface.texels.object_index(), candidates)
+    dark = np.where(of_candidates[:, None], np.float32(0), lit)
+    known = irradiance_of_texels(surface, dark, black_environment(), asked.texel, seed)
+    floor = 1e-4 * np.median(asked.reflected)
+    asked = asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
+    usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
+    count = len(candidates)
+    sources = Sources(
+        share=share,
+        mean=np.tile(usual, (count, 1)),
+        deviation=np.full(count, _DEVIATION),
+        bound=np.zeros(count, np.bool_),
+        pairs=np.zeros((0, 2), np.int64),
+    )
+    found = solved(asked, sources)
+    error = jackknife(asked, sources, found).max(axis=1)
+    light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
+    radiance = np.exp(found.log_radiance)
+    part = (sources.share * radiance.mean(axis=1)[:, None] / light).mean(axis=1)
+    near = (sources.share @ light) / np.maximum(sources.share.sum(axis=1), 1e-12)
+    return radiance, np.asarray(error), np.asarray(near), np.asarray(part)
