@@ -308,6 +308,14 @@ class FitOptions(Options):
     memory: float | None = _memory()
     seed: int = _seed()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lobe == "microfacet" and self.method != "views":
+            raise UsageError(
+                f"--lobe microfacet: --fit {self.method} is the paper's; leave one of both out. "
+                "[usage.option]"
+            )
+
 
 class ConvertOptions(Options):
     """The options of all four tasks."""

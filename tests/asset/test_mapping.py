@@ -11,6 +11,7 @@ from usdbrdf.asset.preview_lobe import fit_from_preview_surface, preview_surface
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.asset.readers.scene import read_fit
+from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.renderer_match import shown_lobe, shown_share_of_metal
 
 CHAIR, LAMP = 0, 2
@@ -174,3 +175,12 @@ def test_the_lobe_of_renderers_needs_another_factor_only(built):
     rendered = surfaces(built)[chair.identifier]
     np.testing.assert_allclose(rendered.f0, 0.08 * chair.psi, rtol=1e-4)
     np.testing.assert_allclose(rendered.diffuse, 0.25, rtol=1e-3)
+
+
+@pytest.mark.parametrize("mapping", ["measured", "microfacet"])
+def test_relight_takes_the_lobe_that_was_fitted(built, mapping):
+    write(built, mapping, lobe="microfacet")
+    chair = built.fitted[CHAIR].identifier
+    assert surfaces(built)[chair].lobe == DIELECTRIC
+    write(built, "measured", lobe="paper")
+    assert surfaces(built)[chair].lobe == PAPER

@@ -236,7 +236,7 @@ class ShadedObject(MeasuredObject):
         str,
         Fact(EMITTER, "radianceStatus", "token", "measured", """How the radiance is known: measured
             in photographs; estimated from the light that the emitter casts, as it was clipped in
-            every photograph; lowerBound where that light does not tell.""",
+            every photograph, or shown by none; lowerBound where that light does not tell.""",
             tokens=("measured", "estimated", "lowerBound")),
         # All that versions have authored which knew no estimates.
         Fact(EMITTER, "lowerBound", "bool", False, """True where the emitter was clipped in every

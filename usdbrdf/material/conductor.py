@@ -24,6 +24,7 @@ from usdbrdf.transport.lobe_radiance import Basis
 _PHIS = calibration.numbers("conductor.roughnesses")
 _LEAST_F0 = calibration.number("conductor.least_f0")
 _CLEARER = calibration.number("conductor.clearer")
+_MODEL_ERROR = calibration.number("conductor.model_error")
 _LEAST_ERROR = calibration.number("conductor.least_error")
 # Of a sample, relative: what is further off is no more against a model than this.
 _FURTHEST = calibration.number("conductor.furthest")
@@ -91,8 +92,11 @@ def conductor_of(
     return Conductor(
         phi=float(_PHIS[best]),
         f0=(float(f0[0]), float(f0[1]), float(f0[2])),
-        phi_error=max(phi_error, 0.05 * _PHIS[best]),
-        f0_error=float(np.sqrt((likely @ (reflectances - f0) ** 2).mean())),
+        # The grid's step and what the model lacks are errors too.
+        phi_error=math.hypot(phi_error, float(np.gradient(np.array(_PHIS))[best]) / 2),
+        f0_error=math.hypot(
+            math.sqrt(float((likely @ (reflectances - f0) ** 2).mean())), _MODEL_ERROR
+        ),
         clearer=clearer,
     )
 

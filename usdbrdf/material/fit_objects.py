@@ -62,7 +62,7 @@ class Survey:
 class ObjectFit(NamedTuple):
     """What the frames say of one object's lobe; NaN where it could not be fitted.
 
-    phi, psi, phi_error, psi_error  the paper's parameters and their standard deviations
+    phi, psi, phi_error, psi_error  parameters of the lobe and their standard deviations
     unresolved    share of the highlight that the pixels do not resolve
     cost          at the minimum; evidence: 1 - cost / cost without a lobe
     phi_median, psi_median, psi_upper  of what remains likely, see ``LobeEstimate``

@@ -183,7 +183,7 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
         emission=material.emission,
         ior=ior,
     )
-    material = replace(mixed, wrap=material.wrap)
+    material = replace(mixed, wrap=material.wrap, lobe=material.lobe)
     colour = surface.corner_colour
     if colour is None or not metallic.any():
         return replace(surface, material=material, corner_f0=None)

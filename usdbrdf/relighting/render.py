@@ -137,7 +137,10 @@ def _two_of_mitsuba(mi: Any, surface: Surface) -> dict[str, Any]:
     diffuse = _reflectance(mi, surface, "vertex_colour", material.diffuse, matte)
     grey = float(np.clip(material.f0.reshape(-1, 3).mean(axis=0).mean(), 1e-6, 0.98))
     eta = (1 + math.sqrt(grey)) / (1 - math.sqrt(grey))
-    glossy = matching_factor(float(material.roughness.mean()) ** 2, grey) / grey / _GLOSSY_SHARE
+    # The lobe of renderers is Mitsuba's already.
+    phi = float(material.roughness.mean()) ** 2
+    matching = 1.0 if material.lobe else matching_factor(phi, grey)
+    glossy = matching / grey / _GLOSSY_SHARE
     conductor = {
         "type": "roughconductor",
         "distribution": "ggx",

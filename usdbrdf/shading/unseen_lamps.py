@@ -30,6 +30,7 @@ _LEAST_SHARE = calibration.number("unseen.least_share")
 _BRIGHTER = calibration.number("unseen.brighter")
 _LEAST_PART = calibration.number("unseen.least_part")
 _DEVIATION = calibration.number("unseen.deviation")
+_MOST_OPEN = calibration.number("unseen.most_open")
 _MOST_ERROR = calibration.number("unseen.most_error")
 # Rays from each texel that is asked, objects that may shine, and those whose light is traced.
 _RAYS, _CANDIDATES, _TRACED = 256, 32, 8
@@ -88,12 +89,17 @@ def lamps_that_explain(
     """The unseen objects that must shine for plain surfaces to be plain."""
     texels = surface.texels
     owner = texels.object_index()
-    area = np.bincount(owner, texels.area)
-    seen = np.bincount(owner, texels.area * coverage.observed) / np.maximum(area, 1e-12)
+    area, observed = (
+        np.bincount(owner, weights, len(texels.resolution))
+        for weights in (texels.area, texels.area * coverage.observed)
+    )
+    seen = observed / np.maximum(area, 1e-12)
     asked = asked_texels(texels, lit, coverage, seed)
     if asked is None or not (seen < _UNSEEN).any():
         return UnseenLamps.none()
-    share = _shares(surface, asked, seen < _UNSEEN, seed)
+    share, open_share = _shares(surface, asked, seen < _UNSEEN, seed)
+    if open_share > _MOST_OPEN:
+        return UnseenLamps.none()
     brings = share.mean(axis=1)
     candidates = np.argsort(-brings, kind="stable")[:_CANDIDATES]
     candidates = candidates[brings[candidates] > _LEAST_SHARE * np.pi]
@@ -126,8 +132,9 @@ def lamps_that_explain(
     return UnseenLamps.none()
 
 
-def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> Double:
-    """(num_objects, N) W/m^2: what each unseen object of radiance 1 brings to the texels asked."""
+def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tuple[Double, float]:
+    """(num_objects, N) W/m^2: what each unseen object of radiance 1 brings to the texels asked; and
+    the share of the light's directions that leave the scan."""
     texels, count = surface.texels, len(asked.texel)
     normal = texels.normal[asked.texel]
     origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
@@ -137,7 +144,8 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> Do
     kept = (met >= 0) & unseen[met]
     place = met[kept].astype(np.int64) * count + np.arange(len(met))[kept] % count
     number = np.bincount(place, minlength=len(unseen) * count)
-    return np.asarray(np.pi / _RAYS * number.reshape(len(unseen), count), np.float64)
+    brought = np.asarray(np.pi / _RAYS * number.reshape(len(unseen), count), np.float64)
+    return brought, float((face < 0).mean())
 
 
 def _brought(surface: TexturedScene, asked: Asked, index: int, seed: int) -> Double:

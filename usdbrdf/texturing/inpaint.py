@@ -15,7 +15,7 @@ _NEIGHBOURS = 8
 _NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
-# How much further off than the nearest a texel may lie that is taken for it: half the time.
+# How much further off than the nearest a texel may lie that is taken for it, which halves the time.
 _SLACK = 0.25
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18

@@ -27,7 +27,7 @@ from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.material import Material, Surface, constant_map, preview_material
 from usdbrdf.model.mesh import Triangulation
-from usdbrdf.transport.brdf import DIELECTRIC, PAPER
+from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.renderer_match import shown_share_of_metal
 
 # The fallbacks of UsdPreviewSurface, which also stand for a mesh without any material.
@@ -62,13 +62,14 @@ class _MaterialReader:
     uv_from_st: Float | None = None  # (3, 3) of column vectors, a UsdTransform2d; None: identity
     wrap: str = ""
 
-    def material(self, bound: UsdShade.Material, mapping: str) -> Material:
+    def material(self, bound: UsdShade.Material, mapping: str, lobe: str = "") -> Material:
         """The material as bound; without one, or without a UsdPreviewSurface in it, the fallbacks
         of UsdPreviewSurface with the mesh's display colour.
 
         mapping  "matched" or "microfacet" if the surface was told what renderers need to show a
                  fitted lobe: what comes back is the lobe that was meant. A map of roughness counts
                  by its mean.
+        lobe     whose equations the fitted numbers are of, "microfacet" or the paper's
                  Half metals and the specular workflow are never ours: those stay as they are
         """
         shader = bound.ComputeSurfaceSource()[0] if bound else None
@@ -101,8 +102,10 @@ class _MaterialReader:
             ior=ior,
             specular=known["specularColor"] if known["useSpecularWorkflow"].flat[0] else None,
         )
-        lobe = DIELECTRIC if mapping == MICROFACET else PAPER
-        return replace(material, wrap=self.wrap or "clamp", lobe=lobe)
+        kind = DIELECTRIC if MICROFACET in (mapping, lobe) else PAPER
+        if kind == DIELECTRIC and known["useSpecularWorkflow"].any():
+            kind = CONDUCTOR  # any reflectance, which Fresnel's equations of a dielectric have not
+        return replace(material, wrap=self.wrap or "clamp", lobe=kind)
 
     def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""
@@ -228,9 +231,9 @@ def surfaces_from_stage(
     surfaces: list[Surface] = []
     left_out: list[Usd.Prim] = []
     prims = list(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
-    # What a fit recorded of the materials that its objects are bound to.
+    # What a fit recorded of the materials that its objects are bound to: mapping and lobe.
     mappings = {
-        str(bound.GetPath()): str(mapping)
+        str(bound.GetPath()): (str(mapping), str(authored(prim, "usdBrdf:fit:lobe") or ""))
         for prim in prims
         if (mapping := authored(prim, "usdBrdf:fit:mapping")) is not None
         if (bound := UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0])
@@ -272,7 +275,7 @@ def _surfaces_of_mesh(
     mesh: UsdGeom.Mesh,
     world_from_local: Double,
     time: Usd.TimeCode,
-    mappings: Mapping[str, str],
+    mappings: Mapping[str, tuple[str, str]],
     warn: Callable[[str], None],
 ) -> list[Surface]:
     points = np.asarray(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
@@ -295,8 +298,8 @@ def _surfaces_of_mesh(
     surfaces = []
     for faces, bound in _faces_by_material(mesh, fans, time):
         reader = _MaterialReader(time=time, warn=warn)
-        mapping = mappings.get(str(bound.GetPath()), "") if bound else ""
-        material = reader.material(bound, mapping)
+        mapping, lobe = mappings.get(str(bound.GetPath()), ("", "")) if bound else ("", "")
+        material = reader.material(bound, mapping, lobe)
         colour = _primvar(mesh, reader.colour_primvar, 3, fans, time)
         if colour is not None:
             material = replace(material, diffuse=constant_map(1.0), base=None, metallic=None)
