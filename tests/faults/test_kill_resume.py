@@ -208,13 +208,13 @@ def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resum
     tiles = calls["irradiance_at"]
     assert tiles > 6
     shutil.rmtree(asset)
-    # The first checkpoint is the light from outside.
-    assert resumed("shade", "checkpoint:4") == {"irradiance_at": tiles - 3}
+    # The first checkpoints are the light from outside, and of lamps that no frame shows.
+    assert resumed("shade", "checkpoint:5") == {"irradiance_at": tiles - 3}
 
 
 def test_fitting_fits_only_the_objects_that_are_missing(resumed):
-    # The first checkpoint are the target frames.
-    assert resumed("fit", "checkpoint:3") == {"fit_object": 5 - 2}
+    # The first checkpoint are the target frames; every object is fitted with two kinds of lobes.
+    assert resumed("fit", "checkpoint:3") == {"fit_object": 2 * 5 - 2}
 
 
 def test_a_step_that_was_being_published_is_not_computed_again(resumed):

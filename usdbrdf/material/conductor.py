@@ -4,8 +4,8 @@ dielectric that explains the same samples.
 A conductor's radiance is base + F0 slope / 0.08 in each channel, whatever the texel; a dielectric's
 is a diffuse part that is free of each texel, or one albedo of the object times S, and a lobe of F0
 up to 0.08. The likelihood of the samples under each, errors relative to what the texel shows and of
-one unknown size, decides; free diffuse parts are paid for, being integrated over all that the texel
-could be (H. Jeffreys, "Theory of Probability", 1961).
+one unknown size, decides; free diffuse parts are paid for, being integrated over all that they are
+likely to be (H. Jeffreys, "Theory of Probability", 1961).
 """
 
 from __future__ import annotations
@@ -76,10 +76,12 @@ def conductor_of(
     diffuse = irradiance / level
     albedo = np.clip((rests[0] * diffuse).sum(axis=0) / (diffuse**2).sum(axis=0), 0, 1)
     uniform = _size(*(rest - albedo * diffuse for rest in rests))
-    # Each texel's own mean takes its share of the errors with it, and had a range of 1 before.
+    # Each texel's own mean takes its share of the errors with it, and was before about as far from
+    # the one albedo as that model is off.
     means = [_without_means(rest, texel, views) for rest in rests]
-    own = _size(*means) * math.sqrt(len(texel) / max(len(texel) - count, 1))
-    paid = -count / len(texel) * math.log(own * math.sqrt(2 * math.pi * count / len(texel)))
+    share = count / len(texel)
+    own = _size(*means) / math.sqrt(max(1 - share, share))
+    paid = share * math.log(max(uniform, own) / (own * math.sqrt(2 * math.pi * share)))
     textured = math.log(own) + max(paid, 0.0)
     clearer = min(math.log(uniform), textured) - math.log(float(errors[best]))
     if clearer < _CLEARER:
