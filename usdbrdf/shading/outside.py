@@ -242,16 +242,24 @@ def _patches(clipped: Bool, z_up: bool) -> Int:
 _PATCHES = sum(count for _, _, count in _BANDS)
 
 
+def looked_around(surface: TexturedScene, index: Long, seed: int, rays: int) -> tuple[Float, Int]:
+    """Cosine-distributed directions (rays N, 3) from texels (N,), one of each after the other, and
+    the face that each meets, -1 for none."""
+    texels = surface.texels
+    normal = texels.normal[index]
+    origin = lift_from_surface(texels.position[index], normal, surface.diagonal_m)
+    towards = cosine_rays(normal, index, seed, rays)
+    return towards, surface.rays.closest(origin, towards).face
+
+
 def _shares(
     surface: TexturedScene, asked: Asked, patches: Int, z_up: bool, seed: int, rays: int
 ) -> tuple[Double, float]:
     """By so many rays from each, what a patch (-1: none) of radiance 1 brings to the texels asked,
     (2 _PATCHES, N), W/m^2; and the share of the light's directions that leave the scan."""
-    texels, count = surface.texels, len(asked.texel)
-    normal = texels.normal[asked.texel]
-    origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
-    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, rays)
-    out = np.flatnonzero(surface.rays.closest(origin, towards).face < 0)
+    count = len(asked.texel)
+    towards, face = looked_around(surface, asked.texel, seed ^ _SEED, rays)
+    out = np.flatnonzero(face < 0)
     patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
     texel, kept = out % count, patch >= 0
     met = np.bincount(patch[kept] * count + texel[kept], minlength=2 * _PATCHES * count)

@@ -18,12 +18,10 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.clipped_light import irradiance_of_texels
-from usdbrdf.shading.outside import asked_texels
+from usdbrdf.shading.outside import asked_texels, looked_around
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, solved
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
-from usdbrdf.transport.rays import lift_from_surface
-from usdbrdf.transport.warps import cosine_rays
 
 _UNSEEN = calibration.number("unseen.most_seen")
 _LEAST_SHARE = calibration.number("unseen.least_share")
@@ -135,11 +133,8 @@ def lamps_that_explain(
 def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tuple[Double, float]:
     """(num_objects, N) W/m^2: what each unseen object of radiance 1 brings to the texels asked; and
     the share of the light's directions that leave the scan."""
-    texels, count = surface.texels, len(asked.texel)
-    normal = texels.normal[asked.texel]
-    origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
-    towards = cosine_rays(normal, asked.texel, seed ^ _SEED, _RAYS)
-    face = surface.rays.closest(np.tile(origin, (_RAYS, 1)), towards).face
+    count = len(asked.texel)
+    _, face = looked_around(surface, asked.texel, seed ^ _SEED, _RAYS)
     met = np.where(face >= 0, surface.scene.face_object[np.maximum(face, 0)], -1)
     kept = (met >= 0) & unseen[met]
     place = met[kept].astype(np.int64) * count + np.arange(len(met))[kept] % count
