@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from usdbrdf.options import IngestOptions
 
 
-MODULES = {"transforms": "usdbrdf.capture.transforms", "scanner-app": "usdbrdf.capture.scanner_app"}
+MODULES = {
+    "transforms": "usdbrdf.capture.formats.transforms",
+    "scanner-app": "usdbrdf.capture.formats.scanner_app",
+}
 DESCRIPTIONS = {
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',

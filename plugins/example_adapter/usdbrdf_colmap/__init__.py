@@ -14,13 +14,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
+from usdbrdf.capture.formats.transforms import path_in_capture
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Scan

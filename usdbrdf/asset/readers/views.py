@@ -25,8 +25,8 @@ from usdbrdf.capture.checks import (
     refuse_rays_that_miss,
     rigid_records,
 )
+from usdbrdf.capture.formats.transforms import frame_records
 from usdbrdf.capture.parts import frames_at
-from usdbrdf.capture.transforms import frame_records
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn

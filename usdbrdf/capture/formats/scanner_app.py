@@ -18,13 +18,13 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
+from usdbrdf.capture.formats.transforms import path_in_capture
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.capture.transforms import path_in_capture
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import image_size
