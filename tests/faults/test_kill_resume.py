@@ -213,8 +213,8 @@ def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resum
 
 
 def test_fitting_fits_only_the_objects_that_are_missing(resumed):
-    # The first checkpoint are the target frames; every object is fitted with two kinds of lobes.
-    assert resumed("fit", "checkpoint:3") == {"fit_object": 2 * 5 - 2}
+    # The first checkpoint are the target frames; then a first look at each of 5 objects.
+    assert resumed("fit", "checkpoint:8") == {"fit_object": 5 - 2}
 
 
 def test_a_step_that_was_being_published_is_not_computed_again(resumed):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from usdbrdf.material import fit_objects
+from usdbrdf.material import fit_views
 from usdbrdf.material.conductor import conductor_of
-from usdbrdf.material.fit_objects import ObjectFit, fitted_by_likelier_lobe, judged
+from usdbrdf.material.fit_objects import FirstLook, ObjectFit, fitted_by_likelier_lobe, judged
+from usdbrdf.material.fit_views import SampledObject
 from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
@@ -91,23 +93,57 @@ def test_a_metal_is_published_as_one():
     assert plain.kind == "dielectric"
 
 
+class _Run:
+    """One object that shows a lobe, and one with too few samples."""
+
+    def __init__(self, paper: float, other: float) -> None:
+        self.evidence = {PAPER: paper, DIELECTRIC: other}
+
+    def checkpoint_if(self, name: str) -> dict[str, np.ndarray] | None:
+        shows = {kind: _lobe(evidence) for kind, evidence in self.evidence.items()}
+        return (
+            FirstLook(shows if name.endswith("0") else {}, 40).arrays() if "look" in name else None
+        )
+
+    def save(self, name: str, found: dict[str, np.ndarray]) -> None:
+        assert name.startswith("object")
+
+
+def _lobe(evidence: float) -> LobeEstimate:
+    return LobeEstimate(0.1, 0.5, 0.02, 0.06, 0.01, 1.0, evidence, (0.001, 0.002), 0.12, 0.45, 0.6)
+
+
 @pytest.mark.parametrize(("paper", "other", "chosen"), [
     (0.9, 0.6, PAPER),
     (0.6, 0.9, DIELECTRIC),
     (0.71, 0.7, DIELECTRIC),  # hardly clearer: the lobe of renderers
-    (0.04, 0.0, DIELECTRIC),  # nothing shows
 ])  # fmt: skip
-def test_the_scene_has_the_lobe_that_explains_its_views(
-    monkeypatch: pytest.MonkeyPatch, paper: float, other: float, chosen: int
-):
-    def fitted(run: Any, lit: LitScene, *_: Any) -> list[ObjectFit]:
-        return [ObjectFit(evidence=paper if lit.lobe == PAPER else other), ObjectFit()]
+def test_the_scene_has_the_lobe_that_explains_its_views(paper: float, other: float, chosen: int):
+    names = ("texels", "rays", "radiance", "lights", "emission", "environment")
+    lit = LitScene(scene=SimpleNamespace(objects=range(2)), **dict.fromkeys(names))  # type: ignore[arg-type]
+    survey, run = SimpleNamespace(target=np.array([3, -1])), _Run(paper, other)
 
-    monkeypatch.setattr(fit_objects, "fitted_objects", fitted)
-    names = ("scene", "texels", "rays", "radiance", "lights", "emission", "environment")
-    lit = LitScene(**dict.fromkeys(names))  # type: ignore[arg-type]
-    scene, found = fitted_by_likelier_lobe(None, lit, None, None, FitOptions())  # type: ignore[arg-type]
+    def fitted(options: FitOptions) -> tuple[LitScene, list[ObjectFit]]:
+        return fitted_by_likelier_lobe(run, lit, None, survey, options)  # type: ignore[arg-type]
+
+    scene, found = fitted(FitOptions())
     assert scene.lobe == chosen
     assert found[0].evidence == (paper if chosen == PAPER else other)
-    asked = fitted_by_likelier_lobe(None, lit, None, None, FitOptions(lobe="paper"))  # type: ignore[arg-type]
-    assert asked[0].lobe == PAPER
+    assert found[0][:2] == (0.1, 0.5)
+    assert found[0][7:10] == (0.12, 0.45, 0.6)
+    assert (found[0].target, found[0].num_samples) == (3, 40)
+    assert np.isnan(found[1].phi)
+    assert fitted(FitOptions(lobe="paper"))[0].lobe == PAPER
+
+
+def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.MonkeyPatch):
+    tried = []
+
+    def fit_lobe(samples: Any, candidates: Any, repeats: int) -> LobeEstimate:
+        tried.append(repeats)
+        return _lobe(0.05)
+
+    monkeypatch.setattr(fit_views, "fit_lobe", fit_lobe)
+    sampled = SampledObject(*[None] * 2, [], [], None)  # type: ignore[arg-type]
+    assert list(fit_views.fit_kinds(None, sampled, [PAPER, DIELECTRIC], 0)) == [PAPER]  # type: ignore[arg-type]
+    assert tried == [1]

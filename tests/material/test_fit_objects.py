@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_info
 
 from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
-from usdbrdf.transport.brdf import PAPER
+from usdbrdf.transport.lit_scene import LitScene
 
 
 class _Run:
@@ -37,8 +37,10 @@ def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.M
     before = _threads_of_blas()
     assert len(before)
     monkeypatch.setattr(fit_objects, "fit_object", _fit_that_tells_the_threads)
-    lit, run = SimpleNamespace(scene=SimpleNamespace(objects=range(4)), lobe=PAPER), _Run()
-    found = fit_objects.fitted_objects(run, lit, None, None, fit_objects.FitOptions())  # type: ignore[arg-type]
+    names = ("texels", "rays", "radiance", "lights", "emission", "environment")
+    lit = LitScene(scene=SimpleNamespace(objects=range(4)), **dict.fromkeys(names))  # type: ignore[arg-type]
+    run, options = _Run(), fit_objects.FitOptions(method="paper")
+    _, found = fit_objects.fitted_by_likelier_lobe(run, lit, None, None, options)  # type: ignore[arg-type]
     assert found[1].cost == -1  # taken from an interrupted run
     assert sorted(run.saved) == ["object-0", "object-2", "object-3"]
     for i in (0, 2, 3):

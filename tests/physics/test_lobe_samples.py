@@ -11,7 +11,7 @@ import pytest
 from tests.physics.brdf import directional_albedo
 from tests.physics.chi2 import assert_same_mean
 from tests.physics.surfaces import World, box, quad, room, world_of
-from usdbrdf.transport.brdf import grazing, half_vector, lobe
+from usdbrdf.transport.brdf import half_vector, lobe
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import SurfacePoints
@@ -188,12 +188,10 @@ def test_sums_in_single_precision_are_those_of_the_lobe(phi: float):
     w[:, 2], wo[:, 2] = np.abs(w[:, 2]), np.abs(wo[:, 2])
     w, wo = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (w, wo))
     half = np.array([half_vector(n, a, b) for a, b in zip(w, wo, strict=True)], np.float32)
-    base = grazing(half[:, 1:].astype(np.float64)).astype(np.float32)
     samples = LobeSamples(
         cos_in=w[:, 2:].astype(np.float32),
         sin2_half=half[:, :1].copy(),
-        base=base,
-        rise=1 - base,
+        cos_half=half[:, 1:].copy(),
         weighted=np.ones((500, 1, 3), np.float32),
         cos_out=wo[:, 2].astype(np.float32),
     )

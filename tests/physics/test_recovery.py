@@ -15,7 +15,7 @@ from tests.physics.brdf import f_nd
 from tests.physics.surfaces import World, box, room, sphere, world_of
 from tests.scenes import camera_at, look_at
 from usdbrdf.material.fit_target import fit_target_frame
-from usdbrdf.material.fit_views import fit_views
+from usdbrdf.material.fit_views import fit_views, sampled_object
 from usdbrdf.material.observations import Follower
 from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import LitScene, View
@@ -197,9 +197,10 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         follower.add(view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
     observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
-    found, _, used = fit_views(lit, observed, smoothing, cameras.__getitem__, SPHERE, 0)
-    assert found is not None
+    sampled, used = sampled_object(lit, observed, smoothing, cameras.__getitem__, SPHERE)
+    assert sampled is not None
     assert used > 500
+    found, _ = fit_views(lit, lambda: sampled, 0)
     assert found.phi == pytest.approx(phi, abs=0.04)
     assert found.psi == pytest.approx(psi, abs=0.1)
     assert found.evidence > 0.5

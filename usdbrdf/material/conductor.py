@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf import calibration
+from usdbrdf.material.fit_lobe import OfPhis
 from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.model.arrays import Double, Float, Long
 from usdbrdf.transport.brdf import F0_OF_PSI
-from usdbrdf.transport.lobe_radiance import Basis
 
 _PHIS = calibration.numbers("conductor.roughnesses")
 _LEAST_F0 = calibration.number("conductor.least_f0")
@@ -45,7 +45,7 @@ def conductor_of(
     radiance: Float,
     texel: Long,
     irradiance: Float,
-    bases: tuple[Basis, Basis],
+    bases: tuple[OfPhis, OfPhis],
     dielectric: LobeEstimate,
 ) -> Conductor | None:
     """The metal that explains P samples clearly better than the best dielectric; None without one.

@@ -22,9 +22,9 @@ from usdbrdf.material.verdict import (
 )
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Double, Float
-from usdbrdf.transport.lobe_radiance import Basis
 
 Pair = tuple[Float, Float]
+OfPhis = Callable[[Sequence[float]], Pair]
 # Where what the rays do is more than this share of the samples' errors, the fit is the mean of so
 # many with rays of their own.
 _NOISY = calibration.number("fit.noisy_rays")
@@ -66,15 +66,21 @@ def error_of_rays(
     return float(by_phi), float(by_psi)
 
 
-def repeated_where_noisy(fit: Callable[[int, int], LobeEstimate], seed: int) -> LobeEstimate:
-    """``fit(seed, repeats)`` gets its rays from its seed. One fit, or, where their noise matters to
-    what it tells, the mean of several; these have seeds that no other ``seed`` brings about."""
-    first = (_REPEATS + 1) * seed
-    one = fit(first, 1)
-    noisy = np.any(np.array(one.of_rays) > _NOISY * np.array([one.phi_error, one.psi_error]))
-    if not noisy or one.evidence < SOME_EVIDENCE:
-        return mean_of_repeats([one])
-    return mean_of_repeats([fit(first + k, _REPEATS) for k in range(1, _REPEATS + 1)])
+def first_seed(seed: int) -> int:
+    """Of the fit that tells whether others are needed; no other ``seed`` brings it about."""
+    return (_REPEATS + 1) * seed
+
+
+def repeated_where_noisy(
+    first: LobeEstimate, fit: Callable[[int, int], LobeEstimate], seed: int
+) -> LobeEstimate:
+    """The first fit, whose rays followed from ``first_seed(seed)``, or, where their noise matters
+    to what it tells, the mean of several ``fit(seed, repeats)`` with rays of their own."""
+    noisy = np.any(np.array(first.of_rays) > _NOISY * np.array([first.phi_error, first.psi_error]))
+    if not noisy or first.evidence < SOME_EVIDENCE:
+        return mean_of_repeats([first])
+    seeds = range(first_seed(seed) + 1, first_seed(seed + 1))
+    return mean_of_repeats([fit(own_seed, _REPEATS) for own_seed in seeds])
 
 
 def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
@@ -121,9 +127,9 @@ class Candidate(NamedTuple):
     weights are the third's.
     """
 
-    first: Basis
-    second: Basis
-    third: Basis
+    first: OfPhis
+    second: OfPhis
+    third: OfPhis
     blur: float
     likely: float = 1.0
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +17,16 @@ from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels, FrameReader, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
+from usdbrdf.material.fit_lobe import first_seed
 from usdbrdf.material.fit_target import (
     Residual,
     choose_target_frames,
     count_frame,
     fit_target_frame,
 )
-from usdbrdf.material.fit_views import MIXTURE, fit_views
+from usdbrdf.material.fit_views import MIXTURE, SampledObject, fit_kinds, fit_views, sampled_object
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
-    SOME_EVIDENCE,
     LobeEstimate,
     Verdict,
     usual_lobe,
@@ -142,6 +143,32 @@ def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
     return View(radiance=radiance, valid=pixels.valid, camera=frames.camera(i))
 
 
+class FirstLook(NamedTuple):
+    """Of one object: a fit per kind of lobe that was asked, none where it has too few samples, and
+    how many it has."""
+
+    lobes: dict[int, LobeEstimate]
+    num_samples: int
+
+    def arrays(self) -> dict[str, Array]:
+        """As checkpoints hold it."""
+        flat = {_NAMES[kind]: [*one[:7], *one[7], *one[8:]] for kind, one in self.lobes.items()}
+        return {"num_samples": np.array(self.num_samples)} | {
+            k: np.array(v) for k, v in flat.items()
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> FirstLook:
+        """The inverse of ``arrays``."""
+        lobes = {}
+        for kind, name in _NAMES.items():
+            if name in arrays:
+                one = arrays[name].tolist()
+                lobes[kind] = LobeEstimate._make([*one[:7], (one[7], one[8]), *one[9:]])
+        return cls(lobes, int(arrays["num_samples"]))
+
+
+_NAMES = {PAPER: "paper", DIELECTRIC: "microfacet"}
 # Of the share that no lobe explains, summed over objects: what the two kinds must differ by.
 _PAPER_CLEARER = calibration.number("fit.paper_clearer")
 
@@ -154,66 +181,85 @@ def fitted_by_likelier_lobe(
     options: FitOptions,
     irradiance: Float | None = None,
 ) -> tuple[LitScene, list[ObjectFit]]:
-    """The scene with the kind of lobe that its surfaces have, and ``fitted_objects`` with that.
+    """The scene with the kind of lobe that its surfaces have, and ``fit_object`` of every object
+    with that.
 
     Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
     the model of facets, unless the paper's explains the views of all objects clearly better.
     """
-    asked = options.lobe if options.method == "views" else "paper"
-    found = {
-        kind: fitted_objects(run, replace(lit, lobe=kind), reader, survey, options, irradiance)
-        for name, kind in (("paper", PAPER), ("microfacet", DIELECTRIC))
-        if asked in (name, "auto")
-    }
-    if asked == "auto":
-        clearer = sum(map(_paper_explains_more, *found.values()))
-        kind = PAPER if clearer > _PAPER_CLEARER else DIELECTRIC
-    else:
-        (kind,) = found
-    return replace(lit, lobe=kind), found[kind]
+    count = len(lit.scene.objects)
+    looks: list[FirstLook | None] = [None] * count
+    kinds = [PAPER]
+    if options.method == "views":
+        kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
+        looks = list(first_looks(run, lit, reader, survey, kinds, options.seed))
+    clearer = sum(_paper_explains_more(look.lobes) for look in looks if look)
+    paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
+    lit = replace(lit, lobe=PAPER if paper else DIELECTRIC)
+
+    def work(i: int) -> dict[str, Array]:
+        return fit_object(lit, reader, survey, i, options, irradiance, looks[i]).arrays()
+
+    found = _of_each_object(run, "object", count, work, label="fit")
+    return lit, [ObjectFit.from_arrays(one).rounded() for one in found]
 
 
-def _paper_explains_more(paper: ObjectFit, other: ObjectFit) -> float:
-    """By how much the logarithm of what is left unexplained is less; 0 where nothing shows."""
-    evidence = paper.evidence, other.evidence
-    if not max(evidence) > SOME_EVIDENCE:
-        return 0.0
-    left, right = (max(1 - min(one, 1.0), 1e-3) for one in evidence)
-    return math.log(right / left)
-
-
-def fitted_objects(
+def first_looks(
     run: TaskRun,
     lit: LitScene,
     reader: FrameReader,
     survey: Survey,
-    options: FitOptions,
-    irradiance: Float | None = None,
-) -> list[ObjectFit]:
-    """``fit_object`` of every object, going on where an interrupted run was."""
-    numbers = range(len(lit.scene.objects))
-    name = "object" if lit.lobe == PAPER else "microfacet"
-    stored = {i: run.checkpoint_if(f"{name}-{i}") for i in numbers}
-    done = {i: ObjectFit.from_arrays(found) for i, found in stored.items() if found is not None}
+    kinds: Sequence[int],
+    seed: int,
+) -> list[FirstLook]:
+    """Every object fitted once with the first kind of lobe, and where that shows with the others,
+    whose rays are the same."""
+
+    def work(i: int) -> dict[str, Array]:
+        sampled, number = _sampled(lit, reader, survey, i, MIXTURE)
+        lobes = fit_kinds(lit, sampled, kinds, first_seed(seed)) if sampled else {}
+        return FirstLook(lobes, number).arrays()
+
+    found = _of_each_object(run, "look", len(lit.scene.objects), work, label="fit: first look")
+    return [FirstLook.from_arrays(one) for one in found]
+
+
+def _paper_explains_more(lobes: Mapping[int, LobeEstimate]) -> float:
+    """By how much the logarithm of what is left unexplained is less; 0 where nothing shows."""
+    if len(lobes) < len(_NAMES):
+        return 0.0
+    left, right = (max(1 - min(lobes[kind].evidence, 1.0), 1e-3) for kind in _NAMES)
+    return math.log(right / left)
+
+
+def _of_each_object(
+    run: TaskRun, name: str, count: int, work: Callable[[int], dict[str, Array]], label: str
+) -> list[dict[str, Array]]:
+    """``work`` of all objects, going on where an interrupted run was."""
+    stored = {i: run.checkpoint_if(f"{name}-{i}") for i in range(count)}
+    done = {i: found for i, found in stored.items() if found is not None}
     with (
         # With all cores for each object's small matrices BLAS's threads only wait for each other.
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
     ):
-        jobs = {
-            pool.submit(fit_object, lit, reader, survey, i, options, irradiance): i
-            for i in numbers
-            if i not in done
-        }
+        jobs = {pool.submit(work, i): i for i in range(count) if i not in done}
         try:
-            for job in progress(as_completed(jobs), total=len(jobs), label="fit", unit="objects"):
+            for job in progress(as_completed(jobs), total=len(jobs), label=label, unit="objects"):
                 i, found = jobs[job], job.result()
-                run.save(f"{name}-{i}", found.arrays())
+                run.save(f"{name}-{i}", found)
                 done[i] = found
         finally:
             for job in jobs:
                 job.cancel()
-    return [done[i].rounded() for i in numbers]
+    return [done[i] for i in range(count)]
+
+
+def _sampled(
+    lit: LitScene, reader: FrameReader, survey: Survey, index: int, mixture: Mixture
+) -> tuple[SampledObject | None, int]:
+    own = survey.observations.of_texels(lit.texels.of_object(index))
+    return sampled_object(lit, own, survey.smoothing, reader.frames.camera, index, mixture)
 
 
 def fit_object(
@@ -223,28 +269,44 @@ def fit_object(
     index: int,
     options: FitOptions,
     irradiance: Float | None = None,
+    look: FirstLook | None = None,
     mixture: Mixture = MIXTURE,
 ) -> ObjectFit:
-    """The lobe of one object by the chosen method; irradiance, mixture: see fit_views."""
+    """The lobe of one object by the chosen method, of the scene's kind.
+
+    irradiance: see fit_views. look: what has been fitted already. mixture: see sampled_object.
+    """
     target = int(survey.target[index])
-    if options.method == "views":
-        own = survey.observations.of_texels(lit.texels.of_object(index))
-        lobe, metal, used = fit_views(
-            lit, own, survey.smoothing, reader.frames.camera, index, options.seed, irradiance,
-            mixture,
-        )  # fmt: skip
-        if lobe is None:
-            return ObjectFit(num_samples=used, target=target)
-        found = ObjectFit(
-            *lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper,
-            num_samples=used, target=target,
-        )  # fmt: skip
-        if not metal:
-            return found
-        return found._replace(
-            metal_phi=metal.phi, red=metal.f0[0], green=metal.f0[1], blue=metal.f0[2],
-            metal_phi_error=metal.phi_error, f0_error=metal.f0_error, clearer=metal.clearer,
-        )  # fmt: skip
+    if options.method != "views":
+        return _fit_of_frame(lit, reader, target, index, options)
+    prepared = cache(lambda: _sampled(lit, reader, survey, index, mixture))
+    used = look.num_samples if look else prepared()[1]
+    if not (look.lobes if look else prepared()[0]):
+        return ObjectFit(num_samples=used, target=target)
+
+    def sampled() -> SampledObject:
+        found, _ = prepared()
+        assert found is not None
+        return found
+
+    first = look.lobes.get(lit.lobe) if look else None
+    lobe, metal = fit_views(lit, sampled, options.seed, first, irradiance)
+    found = ObjectFit(
+        *lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper,
+        num_samples=used, target=target,
+    )  # fmt: skip
+    if not metal:
+        return found
+    return found._replace(
+        metal_phi=metal.phi, red=metal.f0[0], green=metal.f0[1], blue=metal.f0[2],
+        metal_phi_error=metal.phi_error, f0_error=metal.f0_error, clearer=metal.clearer,
+    )  # fmt: skip
+
+
+def _fit_of_frame(
+    lit: LitScene, reader: FrameReader, target: int, index: int, options: FitOptions
+) -> ObjectFit:
+    """The paper's: from the target frame alone."""
     faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
     third = np.full(len(faces), 1 / 3, np.float32)
     shines = lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5

@@ -13,6 +13,7 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
+from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
@@ -217,7 +218,7 @@ def fit_target_frame(
     of_phis = lobe_basis(lit, points, len(chosen), seed)
 
     def basis(phi: float) -> tuple[Float, Float]:
-        base, slope = of_phis([phi])
+        base, slope = of_phis(PAPER, [phi])
         return base[..., 0], slope[..., 0]
 
     diffuse = lit.radiance.at(points.face, points.u, points.v)

@@ -8,15 +8,15 @@ holds the specular light that is seen from everywhere, then enters as incident l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.material.conductor import Conductor, conductor_of
-from usdbrdf.material.fit_lobe import Candidate, fit_lobe, repeated_where_noisy
+from usdbrdf.material.fit_lobe import Candidate, first_seed, fit_lobe, repeated_where_noisy
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.verdict import SOME_EVIDENCE, LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
@@ -25,7 +25,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
 from usdbrdf.transport.brdf import CONDUCTOR, PAPER
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
-from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
+from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
 
 _FOOTPRINT = calibration.number("fit.footprint")
 _OTHER_WIDTHS_PX = calibration.numbers("fit.wider_footprints")
@@ -41,31 +41,50 @@ _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 
-def fit_views(
+class SampledObject(NamedTuple):
+    """What the fits of one object are made of.
+
+    observed    samples whose footprint lies on the object as a whole
+    samples     the same, with their errors
+    footprints  surface points of each sample, for the usual width and, on curved objects, others
+    likely      of each of the footprints, before the samples are asked
+    mixture     the rays of each point
+    """
+
+    observed: Observations
+    samples: ViewSamples
+    footprints: list[SurfacePoints]
+    likely: list[float]
+    mixture: Mixture
+
+    def basis(self, lit: LitScene, points: SurfacePoints, seed: int) -> Basis:
+        """Views of a texel share their random numbers: what they have in common then cancels in
+        their differences, which are all that is fitted."""
+        stream = self.samples.texel
+        return lobe_basis(lit, points, len(stream), seed, self.mixture, stream)
+
+
+def sampled_object(
     lit: LitScene,
     observed: Observations,
     smoothing: float,
     camera_of: Callable[[int], Camera],
     index: int,
-    seed: int,
-    irradiance: Float | None = None,
     mixture: Mixture = MIXTURE,
-) -> tuple[LobeEstimate | None, Conductor | None, int]:
-    """Fit object ``index`` to its observations: (fit, the metal that explains them better, number
-    of samples); fit None if too few, metal None if it is none.
+) -> tuple[SampledObject | None, int]:
+    """Object ``index`` as its observations show it, and the number of samples; None if too few.
 
     smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
     themselves are not needed.
-    irradiance (T, 3): S, W/m^2; without it no metal is looked for.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
     fifteen times; curved objects have more.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
-        return None, None, 0
+        return None, 0
     observed, footprints = _footprints(lit, observed, camera_of, index)
     if len(observed.texel) < MIN_OBSERVATIONS:
-        return None, None, len(observed.texel)
+        return None, len(observed.texel)
     position, points = lit.texels.position[observed.texel], footprints[0]
     # Views cut a pattern differently: its contrast within the footprint is an error of the sample,
     # or, of a square's mean, that along its rim.
@@ -82,33 +101,66 @@ def fit_views(
     if len(footprints) > 1:
         times = _TIMES_FOR_CURVED
         mixture = mixture._replace(per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
+    widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX)[: len(footprints)]
+    likely = [_likely(width, smoothing) for width in widths]
+    return SampledObject(observed, samples, footprints, likely, mixture), len(observed.texel)
+
+
+def fit_kinds(
+    lit: LitScene, sampled: SampledObject, kinds: Sequence[int], seed: int, repeats: int = 1
+) -> dict[int, LobeEstimate]:
+    """The lobe of the first kind, and where that shows, those of the others from the same rays."""
+    bases = [
+        [sampled.basis(lit, points, number) for number in range(3 * seed, 3 * seed + 3)]
+        for points in sampled.footprints
+    ]
+    blurs = [_deviation_of_normal(points) for points in sampled.footprints]
+    found: dict[int, LobeEstimate] = {}
+    for kind in kinds:
+        of_kind = [[partial(basis, kind) for basis in three] for three in bases]
+        candidates = [
+            Candidate(first, second, third, blur, likely)
+            for (first, second, third), blur, likely in zip(
+                of_kind, blurs, sampled.likely, strict=True
+            )
+        ]
+        found[kind] = fit_lobe(sampled.samples, candidates, repeats)
+        if not found[kind].evidence > SOME_EVIDENCE:
+            break
+    return found
+
+
+def fit_views(
+    lit: LitScene,
+    sampled: Callable[[], SampledObject],
+    seed: int,
+    first: LobeEstimate | None = None,
+    irradiance: Float | None = None,
+) -> tuple[LobeEstimate, Conductor | None]:
+    """The lobe of the scene's kind, and the metal that explains the samples better, if one does.
+
+    sampled: asked for where something is left to be traced. first: the fit with the rays of
+    ``first_seed(seed)``, if there is one. irradiance (T, 3): S, W/m^2; without it no metal is
+    looked for.
+    """
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
-        candidates = []
-        for points, width in zip(footprints, (_FOOTPRINT, *_OTHER_WIDTHS_PX), strict=False):
-            # Views of a texel share their random numbers: what they have in common then cancels in
-            # their differences, which are all that is fitted.
-            first, second, third = (
-                lobe_basis(lit, points, len(samples.texel), seed_of_basis, mixture, samples.texel)
-                for seed_of_basis in range(3 * own_seed, 3 * own_seed + 3)
-            )
-            blur, likely = _deviation_of_normal(points), _likely(width, smoothing)
-            candidates.append(Candidate(first, second, third, blur, likely))
-        return fit_lobe(samples, candidates, repeats)
+        return fit_kinds(lit, sampled(), [lit.lobe], own_seed, repeats)[lit.lobe]
 
-    found, metal = repeated_where_noisy(fitted, seed), None
+    found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
     bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE
-    if irradiance is not None and bright:
-        of_metal = lit if lit.lobe == PAPER else replace(lit, lobe=CONDUCTOR)
-        one, other = (
-            lobe_basis(
-                of_metal, footprints[0], len(samples.texel), own_seed, mixture, samples.texel
-            )
-            for own_seed in range(3 * seed, 3 * seed + 2)
-        )
-        of_samples = irradiance[observed.texel]
-        metal = conductor_of(samples.radiance, samples.texel, of_samples, (one, other), found)
-    return found, metal, len(samples.texel)
+    if irradiance is None or not bright:
+        return found, None
+    observed, samples, footprints = sampled()[:3]
+    kind = PAPER if lit.lobe == PAPER else CONDUCTOR
+    one, other = (
+        partial(sampled().basis(lit, footprints[0], own_seed), kind)
+        for own_seed in range(3 * seed, 3 * seed + 2)
+    )
+    metal = conductor_of(
+        samples.radiance, samples.texel, irradiance[observed.texel], (one, other), found
+    )
+    return found, metal
 
 
 def _footprints(

@@ -51,7 +51,7 @@ from usdbrdf.transport.warps import (
 
 Three: TypeAlias = tuple[float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float]
-Basis: TypeAlias = Callable[[Sequence[float]], tuple[Float, Float]]
+Basis: TypeAlias = Callable[[int, Sequence[float]], tuple[Float, Float]]
 # Widths that the lobes' samples are drawn with, for any roughness.
 LOBE_ALPHAS = np.array([0.002, 0.01, 0.05, 0.15, 0.4])
 # Roughnesses that vector instructions take at once, and rays of points that are traced at once:
@@ -98,15 +98,14 @@ class LobeSamples(NamedTuple):
 
     cos_in     (R, K) float32, n.w (0 where the sample brings nothing)
     sin2_half  (R, K) float32, sin^2 of the angle between n and h
-    base, rise (R, K) float32, of F = base + F0 rise
+    cos_half   (R, K) float32, w.h, which Fresnel's term follows from
     weighted   (R, K, 3) float32, L cos / (K density of the whole mixture)
     cos_out    (R,) float32, n.wo
     """
 
     cos_in: Float
     sin2_half: Float
-    base: Float
-    rise: Float
+    cos_half: Float
     weighted: Float
     cos_out: Float
 
@@ -205,13 +204,12 @@ def weigh(
     mixture: Mixture,
     groups: LightGroups,
     environment: Environment,
-    kind: int,
     samples: LobeSamples,
 ) -> None:
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
     first surfaces along the (R, K) directions."""
     for r in prange(len(samples.cos_out)):
-        _weigh_point(aimed, r, hits, mixture, groups, environment, kind, samples)
+        _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
 
 
 @kernel
@@ -222,7 +220,6 @@ def _weigh_point(
     mixture: Mixture,
     groups: LightGroups,
     environment: Environment,
-    kind: int,
     samples: LobeSamples,
 ) -> None:
     n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
@@ -247,7 +244,7 @@ def _weigh_point(
             density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
         samples.cos_in[r, k] = cosine
         samples.sin2_half[r, k] = s2
-        samples.base[r, k], samples.rise[r, k] = reflectance(clamped(cos_wh), kind)
+        samples.cos_half[r, k] = clamped(cos_wh)
         for c in range(3):
             value = weighted[k, c]
             if of_sun:  # which only this sample looks for: its irradiance is L over the density
@@ -276,7 +273,7 @@ def _add_point(
     """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
     side by side, as vector instructions want it."""
     cos_in, sin2_half, weighted = samples.cos_in[r], samples.sin2_half[r], samples.weighted[r]
-    of_base, of_rise, cos_out = samples.base[r], samples.rise[r], samples.cos_out[r]
+    cos_half, cos_out = samples.cos_half[r], samples.cos_out[r]
     one, count = np.float32(1), len(phis)
     alpha2, y2, scale = np.empty_like(phis), np.empty_like(phis), np.empty_like(phis)
     for q in range(count):
@@ -293,11 +290,12 @@ def _add_point(
         for q in range(count):
             below = stretched(s2, c2, alpha2[q])
             dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
+        of_base, of_rise = reflectance(cos_half[k], kind)
         for c in range(3):
-            light = of_base[k] * weighted[k, c]
+            light = np.float32(of_base * weighted[k, c])
             for q in range(count):
                 base[c, q] += dg[q] * light
-            light = np.float32(F0_OF_PSI) * of_rise[k] * weighted[k, c]
+            light = np.float32(F0_OF_PSI * of_rise * weighted[k, c])
             for q in range(count):
                 slope[c, q] += dg[q] * light
 
@@ -342,12 +340,12 @@ def trace_lobe_samples(
         numbers = np.repeat(draws.number, group) * group + np.arange(count) % group
         aimed.direction[:, -1] = towards_sun(sun, shifts_of(numbers, 2, seed ^ _SUN_SEED))
     hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
-    cos_in, sin2_half, base, rise = np.zeros((4, count, total), np.float32)
+    cos_in, sin2_half, cos_half = np.zeros((3, count, total), np.float32)
     arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
     cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)
-    samples = LobeSamples(cos_in, sin2_half, base, rise, arriving, cos_out)
+    samples = LobeSamples(cos_in, sin2_half, cos_half, arriving, cos_out)
     hits = Hits._make(values.reshape(count, total) for values in hits)
-    weigh(aimed, hits, mixture, groups, lit.environment, lit.lobe, samples)
+    weigh(aimed, hits, mixture, groups, lit.environment, samples)
     return samples
 
 
@@ -359,20 +357,20 @@ def lobe_basis(
     mixture: Mixture = MIXTURE,
     stream: Long | None = None,
 ) -> Basis:
-    """Roughnesses (Q,) -> (base, slope) of I_nd = base + psi * slope, (num_groups, 3, Q) each: the
-    mean over equally many consecutive ``points`` per group. Rays are traced once, when they
-    are first needed."""
+    """Kind of lobe, roughnesses (Q,) -> (base, slope) of I_nd = base + psi * slope,
+    (num_groups, 3, Q) each: the mean over equally many consecutive ``points`` per group. Rays are
+    traced once, when they are first needed."""
 
     @cache
     def samples() -> LobeSamples:
         group = len(points.face) // max(num_groups, 1)
         return trace_lobe_samples(lit, points, mixture, seed, stream, group=group)
 
-    def basis(phis: Sequence[float]) -> tuple[Float, Float]:
+    def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
         # As many as vector instructions take at once.
         padded = np.zeros(-(-len(phis) // _LANES) * _LANES, np.float32)
         padded[: len(phis)] = phis
-        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)), lit.lobe)
+        base, slope = non_diffuse(samples(), np.tile(padded, (num_groups, 1)), kind)
         return base[..., : len(phis)], slope[..., : len(phis)]
 
     return basis
@@ -380,7 +378,7 @@ def lobe_basis(
 
 def non_diffuse(samples: LobeSamples, phis: Float, kind: int = PAPER) -> tuple[Float, Float]:
     """I_nd = base + psi * slope, (G, 3, Q) float32 each, means over each of G groups of consecutive
-    points, for its roughnesses phis (G, Q); kind of lobe, which the samples are of."""
+    points, for its roughnesses phis (G, Q), with lobes of a kind."""
     base = np.zeros((len(phis), 3, phis.shape[1]), np.float32)
     slope = np.zeros_like(base)
     integrate(samples, phis, kind, base, slope)
