@@ -16,9 +16,9 @@ from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Double
+from usdbrdf.model.arrays import Double, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
 
 
@@ -70,6 +70,7 @@ _CURES = {
     "capture.saturated": "Add shorter exposures, or correct saturation_radiance.",
     "capture.black": "Remove the black frames, or correct noise_floor_radiance.",
     "capture.duplicate": "Remove the repeated frames.",
+    "capture.inside": "Check that mesh and poses share frame and unit, and the axes of the poses.",
 }
 
 
@@ -150,6 +151,7 @@ LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
 _MIN_HIT_SHARE = 0.2
+_MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -398,10 +400,40 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
     )
 
 
+def drop_cameras_inside(
+    frames: Frames, mesh: ScanMesh, seen: Int, names: Sequence[str], findings: Findings
+) -> list[int]:
+    """Indices of the frames that show surfaces from the side from which others show them; those
+    that look at their backs from inside are noted in ``findings`` by their ``names``.
+
+    seen  (F, 2): how many frames see the front and the back of each face
+    """
+    scene = RayScene(mesh.points, mesh.triangles)
+    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
+    alone = 2 * seen < seen[:, ::-1]  # on this side, compared with the other
+    usable: list[int] = []
+    for i in range(len(frames)):
+        origins, towards = frames.camera(i).rays(_probes() * frames.resolution[i])
+        face = scene.closest(origins, towards).face
+        back = (towards * normals[face]).sum(axis=1) > 0
+        behind = float(((face >= 0) & alone[face, back.astype(np.int64)]).mean())
+        if behind > _MAX_BEHIND:
+            said = f"{behind:.0%} of its rays hit surfaces from behind, as others see them"
+            findings.drop(names[i], f"{said} (limit {_MAX_BEHIND:.0%})", "capture.inside")
+        else:
+            usable.append(i)
+    return usable
+
+
+def _probes() -> Double:
+    """(P, 2) places in an image, in parts of its sides, at which it is probed with rays."""
+    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
     count = min(len(frames), _PROBED_FRAMES)
-    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    grid = _probes()
     hits = 0
     for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
         camera = frames.camera(i)

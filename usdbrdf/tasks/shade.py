@@ -76,9 +76,11 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
-        for doubt in shaded.doubts(identifiers := [item.identifier for item in objects]):
+        doubts = list(shaded.doubts(identifiers := [item.identifier for item in objects]))
+        for doubt in doubts:
             warn(doubt)
-        summary = {**shaded.summary(identifiers), "denoise": lightmap_filter}
+        found = shaded.summary(identifiers)
+        summary = {**found, "denoise": lightmap_filter, "warnings": doubts}
         return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work)

@@ -54,7 +54,8 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
         side = 1000 * float(np.median(sides))
         say(f"texture: {len(surface.texels):,} texels of {side:.3g} mm, {len(frames)} frames")
         found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
-        for doubt in found.doubts():
+        doubts = list(found.doubts())
+        for doubt in doubts:
             warn(doubt)
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, sides, options.quantile)
@@ -74,6 +75,13 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
             "clipped_fraction": float(found.coverage.clipped.mean()),
             "unseen_objects": [item.identifier for item in objects if not item.seen],
             "contradicting_frames": found.contradicting,
+            "warnings": [
+                *doubts,
+                *(
+                    f"{name}: {gain} times as bright as other frames show it. [texturing.exposure]"
+                    for name, gain in found.contradicting.items()
+                ),
+            ],
         }
 
     return task.run(work)

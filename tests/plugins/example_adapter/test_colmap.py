@@ -153,6 +153,7 @@ def _binary(made):
         path.rename(path.with_suffix(".bin"))
 
 
+@pytest.mark.fault("C14")
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
