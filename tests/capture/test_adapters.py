@@ -169,5 +169,6 @@ def test_one_that_returns_no_scan_fails_in_a_sentence(announce, tmp_path, capsys
     announce(theirs=f"{_THEIRS}\ndef read(path, options):\n    return {{'frames': []}}\n")
     (tmp_path / "theirs").mkdir()
     assert main(["ingest", str(tmp_path / "theirs"), "-o", str(tmp_path / "out"), "-q"]) == 3
-    assert "'theirs' (pkg.theirs) failed: it returned a dict" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "'theirs' (pkg.theirs) failed: TypeError('it returned a dict in the place" in said
     assert not (tmp_path / "out").exists()

@@ -18,11 +18,10 @@ from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
-from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
-from usdbrdf.tasks.task import Task
+from usdbrdf.tasks.task import Task, warned
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
@@ -56,8 +55,7 @@ def ingest(
 
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
-        for warning in scan.warnings:
-            warn(warning)
+        warnings = warned(scan.warnings)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
@@ -74,7 +72,7 @@ def ingest(
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
-            "warnings": list(scan.warnings),
+            "warnings": warnings,
         }
 
     return task.run(work)

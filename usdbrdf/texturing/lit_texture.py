@@ -56,6 +56,13 @@ class LitTexture:
                 "[texturing.unseen]"
             )
 
+    def contradictions(self) -> list[str]:
+        """A sentence on each contradicting frame; the user has been told of all at once."""
+        return [
+            f"{name}: {gain} times as bright as the other frames show it. [texturing.exposure]"
+            for name, gain in self.contradicting.items()
+        ]
+
 
 def lit_texture_from_frames(
     run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
