@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -630,29 +631,23 @@ def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys)
 # What --strict counts
 
 
-@pytest.fixture(scope="module")
-def doubtful(tmp_path_factory):
-    """An asset of a capture without lamps, and the capture."""
-    folder = tmp_path_factory.mktemp("doubtful")
-    dim = {"lamp": (0.25, 0.25, 0.25)}
-    made = make_capture(folder / "scan", frames=8, subdivisions=1, radiance=dim).folder
-    assert main(["convert", str(made), "-o", str(folder / "room"), "-q", *COARSE]) == 0
-    return made, folder / "room"
-
-
 @pytest.mark.fault("L1")
 @pytest.mark.fault("L7")
 @pytest.mark.fault("G13")
-def test_strict_is_7_after_the_same_work(doubtful, asset, capture, capsys):
-    made, room = doubtful
-    before = {path: path.read_bytes() for path in room.rglob("*") if path.is_file()}
-    capsys.readouterr()
-    assert main(["convert", str(made), "-o", str(room), *COARSE, "--strict"]) == 7
-    err = capsys.readouterr().err
-    assert re.search(r"usdbrdf: done, with \d+ warnings.*\[quality\.strict\]\n$", err)
-    assert {path: path.read_bytes() for path in before} == before
-    assert main(["shade", str(room), "-q", "--rays", "16", "--strict"]) == 7
-    assert main(["texture", str(room), "-q", "--texel-size", "0.3", "--strict"]) == 0
+def test_strict_is_7_after_the_same_work(capture, tmp_path, capsys):
+    scan, out = tmp_path / "scan", tmp_path / "out"
+    shutil.copytree(capture, scan)
+    call = ["ingest", str(scan), "-o", str(out), "-q", "--strict"]
+    assert main(call) == 0
+    (scan / "frames" / "0003.exr").unlink()
+    assert main(call) == 7
+    assert re.fullmatch(
+        r"usdbrdf: done, with 1 warnings.*\[quality\.strict\]\n", capsys.readouterr().err
+    )
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert main(call) == 7, "also where nothing has to be done"
+    assert main(call[:-1]) == 0
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.fault("R6")
@@ -670,7 +665,7 @@ def test_a_file_system_without_locks(capture, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.fault("R16")
-@pytest.mark.parametrize("closed", [(), (1,), (2,), (0, 1, 2)], ids=str)
+@pytest.mark.parametrize("closed", [(), (0, 1, 2)], ids=str)
 def test_without_home_locale_terminal_or_streams(capture, tmp_path, closed):
     """As a scheduler starts it: hardly any environment, and descriptors that are closed."""
     redirect = " ".join(f"{number}{'<' if number == 0 else '>'}&-" for number in closed)

@@ -15,8 +15,9 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.geometry.sides import Sides
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
@@ -401,16 +402,14 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
 
 
 def drop_cameras_inside(
-    frames: Frames, mesh: ScanMesh, seen: Int, names: Sequence[str], findings: Findings
+    frames: Frames, mesh: ScanMesh, sides: Sides, names: Sequence[str], findings: Findings
 ) -> list[int]:
     """Indices of the frames that show surfaces from the side from which others show them; those
-    that look at their backs from inside are noted in ``findings`` by their ``names``.
-
-    seen  (F, 2): how many frames see the front and the back of each face
-    """
+    that look at their backs from inside are noted in ``findings`` by their ``names``."""
     scene = RayScene(mesh.points, mesh.triangles)
     normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
-    alone = 2 * seen < seen[:, ::-1]  # on this side, compared with the other
+    # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
+    alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]
     usable: list[int] = []
     for i in range(len(frames)):
         origins, towards = frames.camera(i).rays(_probes() * frames.resolution[i])

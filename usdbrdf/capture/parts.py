@@ -312,7 +312,7 @@ def _sides(
         return sides_from_cameras(geometry.mesh, (frames.camera(i) for i in numbers))
 
     sides = seen(frames)
-    outside = drop_cameras_inside(frames, geometry.mesh, sides.frames, names, findings)
+    outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
     if 0 < len(outside) < len(frames):
         frames = frames_at(frames, outside)
         sides = seen(frames)
