@@ -212,8 +212,11 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved), NOTHING_KNOWN)
     psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 
+    # Where something changes with the view, but reflects next to nothing, it is no surface's lobe.
+    shows = lobe.evidence >= MIN_EVIDENCE and lobe.psi > psi_error
+
     def confidence(error: float, limit: float) -> str:
-        if lobe.evidence >= MIN_EVIDENCE and error <= limit:
+        if shows and error <= limit:
             return "high"
         return "low" if lobe.evidence >= SOME_EVIDENCE else "none"
 

@@ -12,6 +12,7 @@ from usdbrdf.transport.brdf import (
     masking,
     masking_width,
     reflectance,
+    share_of_base,
 )
 
 NAME = "usdbrdf_lobe"
@@ -61,6 +62,7 @@ def register(mi: Any) -> None:
             y = masking_width(phi) if self.kind == PAPER else dr.maximum(phi, MIN_ALPHA)
             base, rise = reflectance(wo_h, self.kind, dr.safe_sqrt)
             g = masking(cos_i, y, dr.safe_sqrt) * masking(cos_o, y, dr.safe_sqrt)
+            base = base * share_of_base(f0, self.kind, dr.minimum)
             value = (diffuse / dr.pi + g * d * (base + f0 * rise)) * cos_o
             share = self._glossy_share(si, diffuse, f0)
             lobe = d * cos_h / (4 * dr.maximum(wo_h, 1e-8))

@@ -12,7 +12,8 @@ f_nd(phi, psi) = base(phi) + psi * slope(phi); psi = 0 still leaves the grazing 
 
 Measured in practice are other surfaces than the paper's. DIELECTRIC is the lobe of renderers: the
 same D, Smith's masking of the same alpha (y = alpha), and Fresnel's equations, made affine in psi
-through F0 of 0.02 and 0.06. CONDUCTOR has that masking, and the paper's F with F0 of each channel.
+through F0 of 0.02 and 0.06; below, ``share_of_base`` takes it to nothing. CONDUCTOR has that
+masking, and the paper's F with F0 of each channel.
 
 The formulas are plain operators: they take numbers, NumPy's arrays and Dr.Jit's, and may be called
 from compiled functions, in whose precision they are computed.
@@ -99,6 +100,13 @@ def reflectance(cos_wh: Any, kind: int, sqrt: Any = np.sqrt) -> Any:
         return low - _LOW_F0 * rise, rise
     x = grazing(cos_wh)
     return x, 1.0 - x
+
+
+def share_of_base(f0: Any, kind: int, minimum: Any = np.minimum) -> Any:
+    """By what ``base`` is to be multiplied where F0 is known, so that F vanishes with F0: a
+    dielectric of the index of air reflects nothing at any angle. Fresnel's equations below the
+    least F0 that F is made affine from, to .007 (root mean square over cosines)."""
+    return minimum(1.0, f0 / _LOW_F0) ** (1 / 6) if kind == DIELECTRIC else 1.0
 
 
 @formula

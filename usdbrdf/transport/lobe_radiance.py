@@ -31,6 +31,7 @@ from usdbrdf.transport.brdf import (
     reflectance,
     reflected_density,
     sample_half_vector,
+    share_of_base,
     stretched,
     width_of_masking,
 )
@@ -422,7 +423,8 @@ def lobe_radiance(
         numbers = stream[part]
         samples = trace_lobe_samples(lit, points.take(part), mixture, seed, numbers, alphas[part])
         base, slope = non_diffuse(samples, phi[part, None].astype(np.float32), lit.lobe)
-        result[part] = base[..., 0] + psi[part] * slope[..., 0]
+        share = share_of_base(F0_OF_PSI * psi[part], lit.lobe)
+        result[part] = share * base[..., 0] + psi[part] * slope[..., 0]
     return result
 
 

@@ -37,6 +37,7 @@ from usdbrdf.transport.brdf import (
     masking,
     masking_width,
     reflectance,
+    share_of_base,
     width_of_masking,
 )
 
@@ -160,7 +161,7 @@ def fitted_albedo(
     y = width_of_masking(phi, kind)
     g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
     base, rise = reflectance(_WH[:, None], kind)
-    return np.asarray(_over_cosines(lobe, g) @ (base + f0 * rise))
+    return np.asarray(_over_cosines(lobe, g) @ (share_of_base(f0, kind) * base + f0 * rise))
 
 
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:
