@@ -10,8 +10,8 @@ exposures, diffuse albedo, lamps, glass and masks are kept; new are, from the se
 
     coated   phi log-uniform in [0.02, 0.6], psi uniform in [0.1, 1]; the coated objects of CAPTURE,
              and --coated of its diffuse ones
-    metals   phi alike, F0 in [0.15, 0.97], oftener bright, channels up to 0.4 apart; those of CAPTURE,
-             and --metals of its small coated objects
+    metals   phi alike, F0 in [0.15, 0.97], oftener bright, channels up to 0.4 apart; the metals of
+             CAPTURE, and --metals of its small coated objects
 
 Truth is Mitsuba's own: coated is ``roughplastic``, GGX with Smith's masking and Fresnel's
 equations, alpha = phi, the index of refraction that has F0 = 0.08 psi, ``nonlinear``; metal is
