@@ -57,17 +57,18 @@ LEAST_ERROR = 1e-3  # no stated error is taken to be less
 
 
 def main() -> int:
-    own, _, others = " ".join(sys.argv[1:]).partition(" -- ")
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    others = sys.argv[split + 1 :]
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("captures", nargs="+", type=Path, metavar="CAPTURE")
     parser.add_argument("-o", "--output", type=Path, default=Path("benchmark-results/rooms"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--objects", action="store_true")
-    options = parser.parse_args(own.split())
+    options = parser.parse_args(sys.argv[1:split])
     rooms = []
     for capture in options.captures:
         asset = options.output / capture.name
-        seconds = None if asset.exists() else converted(capture, asset, others.split())
+        seconds = None if asset.exists() else converted(capture, asset, others)
         rooms.append(room_figures(capture, asset) | {"cpu_s": seconds})
         print(f"{capture.name}: done", file=sys.stderr)
     rows = [row_of_table(room) for room in rooms]
@@ -100,7 +101,7 @@ class RoomObject:
     """Truth of an object, and what its material says; F0 and colour are None where there is none.
 
     pixels    in the frame that shows the third most
-    evidence, unresolved... are the asset's own: what an error model may depend on
+    evidence, samples: of the fit, what an error model may depend on
     """
 
     room: str
