@@ -23,7 +23,7 @@ from usdbrdf.material.verdict import (
 
 def _lobe(**numbers: float) -> LobeEstimate:
     sharp = LobeEstimate(
-        phi=0.1, psi=0.8, phi_error=0.02, psi_error=0.05, unresolved=0.0, cost=1.0, evidence=0.8,
+        phi=0.1, psi=0.8, phi_error=0.02, psi_error=0.05, unresolved=0.0, cost=1.0, evidence=1.0,
         phi_median=0.3, psi_median=0.6, psi_upper=0.9,
     )  # fmt: skip
     return sharp._replace(**numbers)
@@ -32,7 +32,8 @@ def _lobe(**numbers: float) -> LobeEstimate:
 @pytest.mark.parametrize("evidence", [MIN_EVIDENCE, 1.0])
 def test_a_measurement_is_published_as_found(evidence: float):
     found = verdict_on_views(_lobe(evidence=evidence), True)
-    assert (found.phi, found.psi, found.phi_error, found.psi_error) == (0.1, 0.8, 0.02, 0.05)
+    assert (found.phi, found.psi, found.psi_error) == (0.1, 0.8, 0.05)
+    assert found.phi_error == 0.02 if evidence == 1 else found.phi_error > 0.02
     assert (found.phi_confidence, found.psi_confidence) == ("high", "high")
     assert (found.status, found.psi_upper) == ("measured", 0.9)
 
@@ -89,6 +90,22 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
             math.hypot(0.05, 0.8 / 3 * min(unresolved / 0.1, 1)), rel=0.03
         )
         assert found.phi_confidence == confidence
+
+
+def test_a_lobe_that_explains_less_is_less_certain_of_phi():
+    # Of redrawn rooms, fits with half of the evidence were off by more than twice the stated error.
+    errors = [
+        verdict_on_views(_lobe(evidence=evidence), True).phi_error
+        for evidence in (1.0, 0.9, 0.5, 0.2, 0.0)
+    ]
+    assert errors == sorted(errors)
+    assert errors[1] < 1.25 * errors[0]
+    assert errors[2] == pytest.approx(2.3 * errors[0], rel=0.1)
+    assert errors[-1] == pytest.approx(NOTHING_KNOWN)
+    # So a highlight that is badly explained is no measurement, if its width was hardly known.
+    wide = _lobe(phi_error=0.06)
+    assert verdict_on_views(wide, True).status == "measured"
+    assert verdict_on_views(wide._replace(evidence=MIN_EVIDENCE), True).status == "prior"
 
 
 @pytest.mark.fault("L2")

@@ -171,6 +171,7 @@ MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
+_UNEXPLAINED = calibration.number("verdict.unexplained_in_phi")
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
@@ -202,14 +203,17 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
 
     What the frames determine is published as found. Of a highlight that is hardly larger than the
     samples' footprint they say something, but the stated error includes what the footprint may have
-    done. Where they do not determine both numbers, the medians of what remains likely are
-    published: no highlight is knowledge too. Names and classes of objects tell nothing here.
+    done; phi's grows also by what the lobe leaves unexplained. Where they do not determine both
+    numbers, the medians of what remains likely are published: no highlight is knowledge too.
+    Names and classes of objects tell nothing here.
     """
     if lobe is None:
         errors = float(NOTHING_KNOWN), float(NOTHING_KNOWN)
         return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
-    phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved), NOTHING_KNOWN)
+    unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
+    phi_error = lobe.phi_error * math.sqrt(1 + _UNEXPLAINED * unexplained)
+    phi_error = min(math.hypot(phi_error, lobe.unresolved), NOTHING_KNOWN)
     psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 
     # Where something changes with the view, but reflects next to nothing, it is no surface's lobe.
