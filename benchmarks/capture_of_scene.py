@@ -50,7 +50,7 @@ PLACES, LOOKS = 300, 8  # candidates: places, and directions from each
 CELL = 0.2  # m: the size of the pieces of surface that are to be seen
 WORTH = np.array([1.0, 0.8, 0.6, 0.15, 0.05])  # of seeing a piece for the first, second ... time
 # Brightness: the middle exposure saturates at so many times the brightest tenth of ordinary pixels.
-HEADROOM, BRIGHT = 1.5, 90
+HEADROOM, BRIGHT = 3.0, 90
 
 
 def main() -> int:
