@@ -103,8 +103,10 @@ def _solved_channel(
     num_sources, num_segments = len(g), len(albedo)
     size = np.bincount(asked.segment, minlength=num_segments)
     effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
-    of_segment = np.zeros((len(observed), num_segments))
-    of_segment[np.arange(len(observed)), asked.segment] = 1
+
+    def by_segment(values: Double) -> Double:
+        return np.bincount(asked.segment, values, num_segments)
+
     for _ in range(iterations):
         parts = np.exp(g)[:, None] * sources.share
         total = known + parts.sum(axis=0)
@@ -114,11 +116,17 @@ def _solved_channel(
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
-        jacobian = np.concatenate([(parts / total).T, of_segment], axis=1)
+        # A texel depends on all sources and on the albedo of one segment.
+        parts /= total
         rows = num_sources + num_segments + 1
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
-        curvature[:-1, :-1] = jacobian.T @ (jacobian * weight[:, None])
-        gradient[:-1] = jacobian.T @ (weight * residual)
+        curvature[:num_sources, :num_sources] = parts @ (parts * weight).T
+        for source, part in enumerate(parts):
+            both = by_segment(part * weight)
+            curvature[source, num_sources:-1] = curvature[num_sources:-1, source] = both
+        np.fill_diagonal(curvature[num_sources:-1, num_sources:-1], by_segment(weight))
+        gradient[:num_sources] = parts @ (weight * residual)
+        gradient[num_sources:-1] = by_segment(weight * residual)
         _add_priors(curvature, gradient, sources, channel, (g, albedo, mean))
         damped = curvature + 1e-3 * np.diag(np.diag(curvature))
         step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
