@@ -18,6 +18,7 @@ from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
 
@@ -29,7 +30,12 @@ class FrameRecord:
     name               as the capture calls it, for messages
     image_path         absolute
     world_from_camera  (4, 4) float64, OpenGL axes, not yet known to be rigid
+    intrinsics         fx, fy, cx, cy in pixels; the first pixel's centre is (0.5, 0.5)
     resolution         width, height that the intrinsics belong to
+    lens               how the camera bends light before its intrinsics; a photograph through a lens
+                       that bends becomes one pinhole frame or several
+    mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
+                       not used; or None
     """
 
     name: str
@@ -40,6 +46,8 @@ class FrameRecord:
     exposure_time: float = 1.0
     saturation_radiance: float = math.inf
     noise_floor_radiance: float = 0.0
+    lens: Lens = PINHOLE
+    mask_path: Path | None = None
 
 
 def frames_from_records(

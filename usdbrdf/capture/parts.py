@@ -265,6 +265,12 @@ def scan_from_parts(
                 "[capture.duplicate]"
             )
         known.add(record.image_path)
+    bent = next((r for r in records if r.lens.bends), None)
+    if bent is not None:
+        raise InputRefused(
+            f"{source}: the frame {bent.name!r} has a lens that bends light. Undistort the images "
+            "to a pinhole camera first. [capture.camera]"
+        )
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
     rigid = at_image_size(rigid, findings, source)
     findings.refuse_too_few_frames(source, total)
