@@ -18,7 +18,9 @@ from usdbrdf.capture.checks import (
     refuse_rays_that_miss,
     refuse_without_parallax,
     rigid_records,
+    with_masks,
 )
+from usdbrdf.capture.develop import frames_of_photographs
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
@@ -265,26 +267,23 @@ def scan_from_parts(
                 "[capture.duplicate]"
             )
         known.add(record.image_path)
-    bent = next((r for r in records if r.lens.bends), None)
-    if bent is not None:
-        raise InputRefused(
-            f"{source}: the frame {bent.name!r} has a lens that bends light. Undistort the images "
-            "to a pinhole camera first. [capture.camera]"
-        )
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
-    rigid = at_image_size(rigid, findings, source)
-    findings.refuse_too_few_frames(source, total)
+    rigid = with_masks(at_image_size(rigid, findings, source), findings)
+    photographs = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
+    frames, views, photograph_of = frames_of_photographs(photographs, rigid)
+    findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
-    frames = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
-    refuse_without_parallax(frames, geometry.mesh, source)
+    if not any(r.lens.curve == "equirectangular" for r in rigid):
+        refuse_without_parallax(frames, geometry.mesh, source)
     hit_share = refuse_rays_that_miss(frames, geometry.mesh, source)
     usable = check_frames(
-        frames, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
+        photographs, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
     )
-    findings.refuse_too_few_frames(source, total)
+    kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
+    findings.refuse_too_few_frames(source, total, views=len(kept))
     findings.warn_of_dropped_frames(source, total)
     findings.count("rays_hit_percent", round(100 * hit_share))
-    frames = frames_at(frames, usable)
+    frames = frames_at(frames, kept)
     sides = _sides(geometry, frames, findings)
     return Scan(
         name=name,
@@ -299,6 +298,7 @@ def scan_from_parts(
         up_axis=options.up_axis or geometry.up_axis or up_axis,
         usd_geometry=geometry.usd_geometry,
         object_prims=geometry.object_prims,
+        views=tuple(views[i] for i in kept) if any(views) else (),
         turned_faces=sides.turned,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
@@ -330,7 +330,10 @@ def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
     columns: dict[str, Any] = {
         k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
     }
-    return replace(frames, image_paths=tuple(frames.image_paths[i] for i in rows), **columns)
+    for name in ("image_paths", "photographs", "masks", "lenses"):
+        found = getattr(frames, name)
+        columns[name] = tuple(found[i] for i in rows) if found else ()
+    return replace(frames, **columns)
 
 
 def as_photographs(

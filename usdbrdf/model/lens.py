@@ -70,6 +70,21 @@ class Lens:
         ):
             raise InputRefused(f"{self}: this is no lens. Correct its numbers. [camera.lens]")
 
+    def described(self, intrinsics: tuple[float, float, float, float]) -> str:
+        """All of its numbers that are not 0, in words, such as
+        ``fisheye fx 790.2 fy 790.3 cx 876.1 cy 584.9 k1 -0.03 k2 -0.006``."""
+        numbered = [
+            *zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True),
+            *zip(_SHAPE.get(self.curve, ()), self.shape, strict=True),
+            *((f"k{i + 1}", k) for i, k in enumerate(self.radial)),
+            *((f"d{i + 1}", d) for i, d in enumerate(self.divisor)),
+            *((f"p{i + 1}", p) for i, p in enumerate(self.tangential)),
+            *((f"s{i + 1}", s) for i, s in enumerate(self.prism)),
+            ("b", self.skew),
+        ]
+        words = [f"{name} {float(number)!r}" for name, number in numbered if number]
+        return " ".join([self.curve, *words, *(["radial first"] if self.radial_first else [])])
+
     @property
     def bends(self) -> bool:
         """False for a pinhole."""
