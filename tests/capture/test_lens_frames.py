@@ -305,3 +305,17 @@ def test_a_plain_capture_has_no_views(tmp_path):
     scan = read_scan(make_capture(tmp_path / "room").folder, IngestOptions())
     assert (scan.views, scan.frames.photographs, scan.frames.lenses) == ((), (), ())
     assert not PINHOLE.bends
+
+
+def test_faces_that_the_mask_hides_are_left_out(tmp_path):
+    made = capture_through(tmp_path / "room", "EQUIRECTANGULAR", frames=8)
+    white = np.zeros((48, 96, 3), np.uint8)
+    white[18:30, 40:56] = 255  # straight ahead
+    write_preview_png(made.folder / "mask.png", white)
+    with edited(made.manifest) as document:
+        for frame in document["frames"][1:]:
+            frame["mask_path"] = "mask.png"
+    scan = read_scan(made.folder, IngestOptions())
+    assert [view.face for view in scan.views] == [
+        "front", "right", "left", "up", "down", "back", *["front"] * 7
+    ]  # fmt: skip

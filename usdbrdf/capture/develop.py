@@ -21,7 +21,7 @@ import numpy as np
 from numba import prange
 
 from usdbrdf.capture.checks import FrameRecord
-from usdbrdf.capture.lens_views import views_of
+from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import CLIPPED_SHARE, PHOTOGRAPH_ENCODING, read_recorded
 from usdbrdf.files.images import needs_float, read_exr, write_exr
@@ -63,7 +63,7 @@ def frames_of_photographs(
     poses, intrinsics, sizes = [], [], []
     for k, record in enumerate(records):
         stem = f"{k:05d}_{re.sub(_UNSAFE, '_', record.image_path.stem)}"
-        for found in views_of(record.lens, record.intrinsics, record.resolution):
+        for found in _views(record):
             pose = record.world_from_camera.copy()
             pose[:3, :3] = pose[:3, :3] @ found.photograph_from_frame
             numbers.append(k)
@@ -98,6 +98,17 @@ def frames_of_photographs(
     return frames, tuple(views), which
 
 
+def _views(record: FrameRecord) -> list[PinholeView]:
+    """The frames of a photograph, of several those alone that its mask leaves something of."""
+    camera = (record.lens, record.intrinsics, record.resolution)
+    found = list(views_of(*camera))
+    if record.mask_path is None or len(found) == 1:
+        return found
+    width, height = record.resolution
+    white = mask_at_size(record.mask_path, height, width)
+    return [view for view in found if shows_any(view, *camera, white)]
+
+
 def developed(scan: Scan, folder: Path, place: Place) -> Frames:
     """The scan's frames with images below ``folder``; those that are views of photographs are
     handed to ``place``, one after the other.
@@ -111,8 +122,8 @@ def developed(scan: Scan, folder: Path, place: Place) -> Frames:
     shown = progress(views, total=len(views), label="ingest: lenses", unit="frames")
     for i, view in shown:
         place(str(frames.image_paths[i]), partial(_write_frame, frames, i, view))
-    _recorded.cache_clear()
-    _places.cache_clear()
+    for cache in (_recorded, _places, mask_at_size):
+        cache.cache_clear()
     linear = frames.encoding == PHOTOGRAPH_ENCODING
     return replace(
         frames,
@@ -144,6 +155,7 @@ def _recorded(photograph: Path, mask: Path | None, encoding: str, saturation: fl
     return recorded
 
 
+@lru_cache(maxsize=1)
 def mask_at_size(path: Path, height: int, width: int) -> Bool:
     """(H, W) where a mask's picture is not black, by its nearest pixel; InputRefused for another
     shape than the photograph's."""

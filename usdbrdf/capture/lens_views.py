@@ -85,6 +85,19 @@ def views_of(lens: Lens, intrinsics: Intrinsics, resolution: Size) -> tuple[Pinh
     return (PinholeView("", np.eye(3), intrinsics, resolution),)
 
 
+def shows_any(
+    view: PinholeView, lens: Lens, intrinsics: Intrinsics, resolution: Size, white: Bool
+) -> bool:
+    """Whether a frame shows anything of what a mask (H, W) leaves of the photograph."""
+    fx, fy, cx, cy = view.intrinsics
+    width, height = view.resolution
+    bounds = (-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy)
+    face = _probed((lens, intrinsics, resolution), view.photograph_from_frame, bounds)
+    column, row = face.pixels[face.inside].astype(np.int64).T
+    rows, columns = white.shape
+    return bool(white[row.clip(0, rows - 1), column.clip(0, columns - 1)].any())
+
+
 class _Probes(NamedTuple):
     """A face at a grid of points: their places x, y (P,) in its plane at the distance 1, y down;
     directions (P, P, 3) in the photograph's camera, unit; whether the photograph shows them."""
