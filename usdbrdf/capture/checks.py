@@ -322,9 +322,8 @@ def at_image_size(
             continue
         across, down = record.resolution
         said = f"{width} x {height} pixels, but the intrinsics are for {across} x {down}"
-        # Whoever scales an image rounds its sides to whole pixels, COLMAP's undistorter now and
-        # then by one more.
-        if abs(width * down - height * across) > across:
+        # Whoever scales an image rounds its sides to whole pixels.
+        if abs(width * down - height * across) >= across:
             findings.drop(record.name, said, "capture.size")
             continue
         if (width, height) != record.resolution:

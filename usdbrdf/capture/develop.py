@@ -234,21 +234,22 @@ def _resample(
     """inset: pixels that ``source`` has been padded by; turn: pixels of a whole turn, or 0."""
     height, width = places.shape[:2]
     for j in prange(height):
-        value = np.empty(3)
+        value, total, clipped = np.empty(3), np.empty(3), np.empty(3, np.bool_)
+        weights = np.empty((2, 2 * _LOBES))
         for i in range(width):
             ux, vx = _step(places, j, i, 0, 1, turn)
             uy, vy = _step(places, j, i, 1, 0, turn)
             taps_x, taps_y = _taps(ux, vx), _taps(uy, vy)
             taps = taps_x * taps_y
-            total = np.zeros(3)
-            clipped = np.zeros(3, np.bool_)
+            total[:] = 0.0
+            clipped[:] = False
             known = True
             for tap in range(taps):
                 dx = (tap // taps_y + 0.5) / taps_x - 0.5
                 dy = (tap % taps_y + 0.5) / taps_y - 0.5
                 u = places[j, i, 0] + dx * ux + dy * uy
                 v = places[j, i, 1] + dx * vx + dy * vy
-                if not _value_at(source, u, v, inset, turn, limit, value):
+                if not _value_at(source, u, v, inset, turn, limit, weights, value):
                     known = False
                     break
                 for c in range(3):
@@ -292,8 +293,9 @@ def _taps(u: float, v: float) -> int:
 
 @kernel
 def _value_at(
-    source: Float, u: float, v: float, inset: int, turn: float, limit: np.float32, value: Double
-) -> bool:
+    source: Float, u: float, v: float, inset: int, turn: float, limit: np.float32,
+    weights: Double, value: Double,
+) -> bool:  # fmt: skip
     """The photograph at a place, into ``value`` (3,); False where it is unknown there."""
     height, width = source.shape[:2]
     if turn > 0:
@@ -303,22 +305,14 @@ def _value_at(
     x, y = u + inset - 0.5, v + inset - 0.5
     i, j = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - i, y - j
+    clean = _lanczos(source, i, j, fx, fy, limit, weights, value)
     i0, j0 = min(max(i, 0), width - 1), min(max(j, 0), height - 1)
     i1, j1 = min(max(i + 1, 0), width - 1), min(max(j + 1, 0), height - 1)
-    clean = True
-    for b in range(1 - _LOBES, _LOBES + 1):
-        row = min(max(j + b, 0), height - 1)
-        for a in range(1 - _LOBES, _LOBES + 1):
-            column = min(max(i + a, 0), width - 1)
-            for c in range(3):
-                # NaN is no less than the limit, either.
-                clean = clean and source[row, column, c] < limit
     for c in range(3):
         p, q = source[j0, i0, c], source[j0, i1, c]
         r, s = source[j1, i0, c], source[j1, i1, c]
         if clean:
-            mean = _lanczos(source, i, j, fx, fy, c)
-            value[c] = min(max(mean, min(min(p, q), min(r, s))), max(max(p, q), max(r, s)))
+            value[c] = min(max(value[c], min(min(p, q), min(r, s))), max(max(p, q), max(r, s)))
         else:
             mean, bright, most = 0.0, False, 0.0
             for k in range(4):
@@ -335,24 +329,44 @@ def _value_at(
 
 
 @kernel
-def _lanczos(source: Float, i: int, j: int, fx: float, fy: float, c: int) -> float:
+def _lanczos(
+    source: Float, i: int, j: int, fx: float, fy: float, limit: np.float32, weights: Double,
+    value: Double,
+) -> bool:  # fmt: skip
+    """The filter's mean into ``value``; False where one of its pixels is clipped or unknown."""
     height, width = source.shape[:2]
-    total, weights = 0.0, 0.0
-    for b in range(1 - _LOBES, _LOBES + 1):
-        row = min(max(j + b, 0), height - 1)
-        wy = _weight(b - fy)
-        for a in range(1 - _LOBES, _LOBES + 1):
-            weight = wy * _weight(a - fx)
-            weights += weight
-            total += weight * source[row, min(max(i + a, 0), width - 1), c]
-    return total / weights
+    _set_weights(fx, weights[0])
+    _set_weights(fy, weights[1])
+    value[:] = 0.0
+    for b in range(2 * _LOBES):
+        row = min(max(j + 1 - _LOBES + b, 0), height - 1)
+        for a in range(2 * _LOBES):
+            column = min(max(i + 1 - _LOBES + a, 0), width - 1)
+            weight = weights[1, b] * weights[0, a]
+            for c in range(3):
+                # NaN is no less than the limit, either.
+                if not source[row, column, c] < limit:
+                    return False
+                value[c] += weight * source[row, column, c]
+    return True
 
 
 @kernel
-def _weight(distance: float) -> float:
-    if abs(distance) < 1e-6:
-        return 1.0
-    if abs(distance) >= _LOBES:
-        return 0.0
-    x = np.pi * distance
-    return float(_LOBES * np.sin(x) * np.sin(x / _LOBES) / (x * x))
+def _set_weights(f: float, weights: Double) -> None:
+    """sinc(d) sinc(d / lobes) at the distances d = a - f of the pixels a = 1 - lobes, ..., lobes,
+    their sum made 1."""
+    if f < 1e-6 or f > 1 - 1e-6:
+        weights[:] = 0.0
+        weights[_LOBES - 1 + int(f > 0.5)] = 1.0
+        return
+    total = 0.0
+    # sin(pi (a - f)) is sin(pi f), but for its sign.
+    sine, sign = np.sin(np.pi * f), -1.0
+    for k in range(2 * _LOBES):
+        distance = k + 1 - _LOBES - f
+        weight = sign * sine * np.sin(np.pi * distance / _LOBES) / distance**2
+        weights[k] = weight
+        total += weight
+        sign = -sign
+    for k in range(2 * _LOBES):
+        weights[k] /= total

@@ -228,7 +228,7 @@ def _images_fit(
         except ImageRefused:
             continue
         across, down = camera.resolution
-        if abs(width * down - height * across) > across:
+        if abs(width * down - height * across) >= across:
             return False
         if not lens_of(camera)[0].bends:
             return True
