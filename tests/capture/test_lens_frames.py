@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from tests.lens_scenes import CAMERAS, camera_of, capture_through, rays_of, surface_of
-from tests.scenes import edited, make_capture
+from tests.scenes import edited, make_capture, ring_of_poses
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
-from usdbrdf.asset.readers.scene import frames_from_stage
+from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
+from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.develop import resampled
 from usdbrdf.capture.lens_views import pinhole_views
@@ -271,8 +272,8 @@ def test_what_later_steps_depend_on_is_the_photograph(tmp_path):
     assert hashed() != before
 
 
-def test_photographs_of_eight_bits_become_linear_frames(tmp_path):
-    made = capture_through(tmp_path / "room", "OPENCV")
+def in_eight_bits(made):
+    """An eighth of the radiance as sRGB in PNG files."""
     with edited(made.manifest) as document:
         for i, frame in enumerate(document["frames"]):
             linear = read_exr(made.image(i)) / 8
@@ -282,15 +283,28 @@ def test_photographs_of_eight_bits_become_linear_frames(tmp_path):
             frame["file_path"] = f"frames/{i:04d}.png"
             shown = (255 * encoded + 0.5).clip(0, 255).astype(np.uint8)
             write_preview_png(made.folder / frame["file_path"], shown)
+            frame["exposure_time"] = 0.02
+
+
+def test_photographs_of_eight_bits_become_linear_frames(tmp_path):
+    """And photographs of other views, by a pinhole camera, are in the same unit."""
+    made = capture_through(tmp_path / "room", "OPENCV")
+    views = make_capture(tmp_path / "views", poses=ring_of_poses(8, height=1.6))
+    in_eight_bits(made)
+    in_eight_bits(views)
     asset = Asset.at(tmp_path / "asset")
     with owned_folder(asset.folder):
         ingest(made.folder, asset, IngestOptions(assume_srgb=True))
-    frames = frames_from_stage(open_weaker(asset, "texturing"))
+    stage = open_weaker(asset, "texturing")
+    frames = frames_from_stage(stage)
     assert (frames.encoding, frames.radiometric) == ("lin_rec709_scene", False)
-    pixels, shown = read_frame(frames, 0), surface_of(made, frames.camera(0))
-    inner = (shown == made.names.index("walls")) & pixels.valid
+    others = photographs_of_views(views.manifest, asset, stage, scene_from_stage(stage))
     expected = np.array(made.radiance["walls"]) / 8
-    assert np.abs(pixels.radiance[inner] / expected - 1).max() < 0.05
+    for some in (frames, others.frames):
+        pixels, shown = read_frame(some, 0), surface_of(made, some.camera(0))
+        inner = (shown == made.names.index("walls")) & pixels.valid
+        assert inner.sum() > 20
+        assert np.abs(pixels.radiance[inner] / expected - 1).max() < 0.05
 
 
 def test_a_lens_that_shows_nothing_is_dropped_with_words(tmp_path):
