@@ -333,3 +333,35 @@ def test_faces_that_the_mask_hides_are_left_out(tmp_path):
     assert [view.face for view in scan.views] == [
         "front", "right", "left", "up", "down", "back", *["front"] * 7
     ]  # fmt: skip
+
+
+def test_lenses_of_documents_and_of_single_frames(tmp_path):
+    made = make_capture(tmp_path / "room")
+    small = (-0.02, 0.01, 0.003, 0.002, -0.001, 0.004, 0.001, -0.002, 0.003, 0.001, 0.002, -0.001)
+    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+    with edited(made.manifest) as document:
+        document |= {"camera_model": "OPENCV", "k1": -0.05, "p2": 0.001}
+        frames = document["frames"]
+        frames[1] |= dict(zip(names, small, strict=True))
+        frames[2] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k4": 0.002, "p2": 0}
+        frames[3] |= {"camera_model": "FISHEYE624", "distortion_params": list(small)}
+        frames[4] |= {"distortion_params": list(small[:6])}
+        frames[5] |= {"k1": 0, "p2": 0}
+    scan = read_scan(made.folder, IngestOptions())
+    found = {}
+    for i, path in enumerate(scan.frames.image_paths):
+        view = scan.views[i]
+        number = int(view.photograph.stem) if view else int(path.stem)
+        found.setdefault(number, view and view.lens)
+    k1, k2, k3, k4, k5, k6, p1, p2, *prism = small
+    assert found[0] == Lens(radial=(-0.05, 0.0, 0.0, 0.0), tangential=(0.0, 0.001))
+    assert found[1] == Lens(
+        radial=(k1, k2, k3), divisor=(k4, k5, k6), tangential=(p1, p2), prism=tuple(prism)
+    )
+    assert found[2] == Lens(curve="fisheye", radial=(0.01, 0.0, 0.0, 0.002))
+    assert found[3] == Lens(
+        curve="fisheye", radial=small[:6], tangential=(p2, p1), prism=tuple(prism),
+        radial_first=True,
+    )  # fmt: skip
+    assert found[4] == Lens(radial=small[:4], tangential=small[4:6])
+    assert found[5] is None
