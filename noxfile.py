@@ -4,7 +4,9 @@ nox -s room -- shading      the tests of one room
 nox -s figures -- OUT       accuracy on the sample, as docs/accuracy.md tells it
 """
 
+import json
 import sys
+from pathlib import Path
 
 import nox
 
@@ -56,10 +58,7 @@ def room(session: nox.Session) -> None:
 @nox.session
 def everything(session: nox.Session) -> None:
     """All tests, as they run before a change is accepted."""
-    install(
-        session,
-        "test,colmap,dcc,denoise,render" if sys.version_info < (3, 13) else "test,colmap,denoise",
-    )
+    install(session, "test,colmap,dcc,denoise,render")
     session.run("python", "-m", "pytest", *session.posargs)
 
 
@@ -78,6 +77,28 @@ def speed(session: nox.Session) -> None:
     """The speed benchmarks, each against a reference of the same run."""
     install(session, "test,denoise,render")
     session.run("python", "benchmarks/run_all.py", "--quick", *session.posargs)
+
+
+@nox.session(venv_backend="none")
+def hashes(session: nox.Session) -> None:
+    """Make constraints-hashed.txt anew from constraints.txt, for the Python at hand."""
+    report = Path(session.create_tmp()) / "report.json"
+    told = ("install", "-q", "--dry-run", "--ignore-installed", "--no-deps", "--report", report)
+    session.run(sys.executable, "-m", "pip", *map(str, told), "-r", "constraints.txt")
+    hashed = Path("constraints-hashed.txt")
+    head = hashed.read_text("utf-8").splitlines()[:2]
+    rows = [
+        f"{item['metadata']['name'].lower().replace('_', '-')}=={item['metadata']['version']} "
+        f"--hash=sha256:{item['download_info']['archive_info']['hashes']['sha256']}"
+        for item in json.loads(report.read_text("utf-8"))["install"]
+    ]
+    hashed.write_text("\n".join([*head, *sorted(rows)]) + "\n", "utf-8")
+
+
+@nox.session(venv_backend="none")
+def supply(session: nox.Session) -> None:
+    """SBOM and known vulnerabilities of this environment, into dist/; skipped where offline."""
+    session.run("bash", ".ci/supply", *session.posargs, env={"USDBRDF_PYTHON": sys.executable})
 
 
 @nox.session

@@ -23,6 +23,7 @@ SLOW = (
     "delivery/test_package_usdz.py",
     "evaluation",
     "faults/test_bad_captures.py",
+    "faults/test_frames_that_disagree.py",
     "faults/test_kill_resume.py",
     "job/test_child.py",
     "job/test_kill_resume.py",

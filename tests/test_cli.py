@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -265,6 +268,7 @@ def test_output_that_is_a_file_or_lies_in_one(capture, tmp_path, capsys):
     assert file.read_text() == "mine"
 
 
+@pytest.mark.fault("R5")
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_read_only_output(capture, tmp_path, capsys):
     tmp_path.chmod(0o555)
@@ -282,12 +286,14 @@ def test_output_where_nothing_can_be_made(output, capture, capsys):
     assert refused(capsys, "convert", capture, "-o", output)[0] == 4
 
 
+@pytest.mark.fault("R10")
 def test_foreign_folder(capture, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert refused(capsys, "convert", capture, "-o", tmp_path)[0] == 6
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
+@pytest.mark.fault("R6")
 def test_busy_folder(asset, capsys):
     held = folder_lock(asset / ".usdbrdf")
     with ThreadPoolExecutor(1) as another:
@@ -334,6 +340,7 @@ def test_json_of_a_refused_run_is_empty(tmp_path, capsys):
     assert refused(capsys, "ingest", tmp_path / "none", "-o", tmp_path / "out", "--json")[0] == 3
 
 
+@pytest.mark.fault("S4")
 def test_message_about_a_strange_name_is_printable(tmp_path, capsys):
     main(["ingest", str(tmp_path / "no\x1b[31mne"), "-o", str(tmp_path / "out")])
     assert "\x1b" not in capsys.readouterr().err
@@ -433,6 +440,7 @@ def edited_asset(asset, capture):
         copy.unlink()
 
 
+@pytest.mark.fault("R9")
 def test_edited_by_hand_is_refused(capture, asset, edited_asset, capsys):
     layer, made = edited_asset
     status, line = refused(capsys, "convert", capture, "-o", asset, *COARSE)
@@ -443,6 +451,7 @@ def test_edited_by_hand_is_refused(capture, asset, edited_asset, capsys):
     assert layer.read_bytes() == made + b"# by hand\n"
 
 
+@pytest.mark.fault("R9")
 def test_edited_by_hand_is_adopted(capture, asset, edited_asset, capsys):
     layer, made = edited_asset
     assert main(["convert", str(capture), "-o", str(asset), "--adopt", *COARSE]) == 0
@@ -451,6 +460,7 @@ def test_edited_by_hand_is_adopted(capture, asset, edited_asset, capsys):
     assert "adopted-1.usda" in capsys.readouterr().err
 
 
+@pytest.mark.fault("R9")
 def test_edited_by_hand_is_discarded(capture, asset, edited_asset):
     layer, made = edited_asset
     assert main(["convert", str(capture), "-o", str(asset), "--discard", "-q", *COARSE]) == 0
@@ -461,6 +471,7 @@ def test_edited_by_hand_is_discarded(capture, asset, edited_asset):
 # Ends that come from outside
 
 
+@pytest.mark.fault("R3")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_signals(number, status, capture, tmp_path, monkeypatch, capsys):
     handler = signal.getsignal(signal.SIGTERM)
@@ -480,6 +491,7 @@ def test_signals(number, status, capture, tmp_path, monkeypatch, capsys):
     assert signal.getsignal(signal.SIGTERM) is handler
 
 
+@pytest.mark.fault("R3")
 def test_terminated_while_it_works(capture, tmp_path):
     arguments = [sys.executable, "-m", "usdbrdf", "convert", str(capture)]
     arguments += ["-o", str(tmp_path / "out"), "--texel-size", "0.02"]
@@ -563,6 +575,7 @@ KINDS = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.fault("R16")
 @KINDS
 def test_what_nobody_hears_changes_neither_work_nor_status(kind, capture, tmp_path):
     folder = tmp_path / "out"
@@ -574,6 +587,7 @@ def test_what_nobody_hears_changes_neither_work_nor_status(kind, capture, tmp_pa
     assert run_into("ingest", capture, stderr=kind) == (2, "")
 
 
+@pytest.mark.fault("R16")
 @pytest.mark.parametrize("arguments", [["convert", "--help"], ["adapters"], ["--version"]])
 def test_a_reader_who_has_seen_enough_of_a_list(arguments):
     assert run_into(*arguments, stdout="gone") == (0, "")
@@ -612,3 +626,74 @@ def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys)
     assert "Traceback" in err
     assert "defect of usdbrdf" in err
     assert list(tmp_path.iterdir()) == []
+
+
+# What --strict counts
+
+
+@pytest.mark.fault("L1")
+@pytest.mark.fault("L7")
+@pytest.mark.fault("G13")
+def test_strict_is_7_after_the_same_work(capture, tmp_path, capsys):
+    scan, out = tmp_path / "scan", tmp_path / "out"
+    shutil.copytree(capture, scan)
+    call = ["ingest", str(scan), "-o", str(out), "-q", "--strict"]
+    assert main(call) == 0
+    (scan / "frames" / "0003.exr").unlink()
+    assert main(call) == 7
+    assert re.fullmatch(
+        r"usdbrdf: done, with 1 warnings.*\[quality\.strict\]\n", capsys.readouterr().err
+    )
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert main(call) == 7, "also where nothing has to be done"
+    assert main(call[:-1]) == 0
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.fault("R6")
+def test_a_file_system_without_locks(capture, tmp_path, monkeypatch, capsys):
+    def no_locks(*_arguments):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "lockf", no_locks)
+    call = ["ingest", str(capture), "-o", str(tmp_path / "out"), "-q"]
+    status, line = refused(capsys, *call)
+    assert status == 5
+    assert "--without-lock" in line
+    assert not (tmp_path / "out").exists()
+    assert main([*call, "--without-lock"]) == 0
+
+
+@pytest.mark.fault("R16")
+@pytest.mark.parametrize("closed", [(), (0, 1, 2)], ids=str)
+def test_without_home_locale_terminal_or_streams(capture, tmp_path, closed):
+    """As a scheduler starts it: hardly any environment, and descriptors that are closed."""
+    redirect = " ".join(f"{number}{'<' if number == 0 else '>'}&-" for number in closed)
+    call = f"exec {sys.executable} -m usdbrdf ingest {capture} -o {tmp_path}/out --json {redirect}"
+    root = Path(__file__).parents[1]
+    done = subprocess.run(
+        ["/bin/sh", "-c", call],
+        env={"PYTHONPATH": str(root), "LANG": "C", "LC_ALL": "C", "TMPDIR": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    # The summary that was asked for cannot be handed over; the work is done all the same.
+    assert done.returncode == (4 if 1 in closed else 0), done.stderr
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "out/.usdbrdf/stamps/1-ingest.json").is_file()
+    if not closed:
+        assert json.loads(done.stdout)["steps"]["ingest"]["reran"]
+
+
+@pytest.mark.fault("S5")
+def test_strange_names_of_folders_pass_through_all_commands(tmp_path):
+    folder = tmp_path / "a b é 椅子 # @ [1] ; <UDIM> %04d"
+    made = make_capture(folder / "scan", frames=8, subdivisions=1).folder
+    room = folder / ("x" * 200)
+    assert main(["convert", str(made), "-o", str(room), "-q", *COARSE]) == 0
+    assert main(["validate", str(room)]) == 0
+    assert main(["package", str(room), "-q", "-o", str(folder / "room.usdz")]) == 0
+    moved = room.rename(folder / "moved")
+    assert main(["validate", str(moved)]) == 0

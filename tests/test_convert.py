@@ -178,6 +178,7 @@ def test_every_object_has_a_whole_material_in_every_look(capture, asset):
     assert_dressed(stage, [prim_of(stage, name) for name in (*capture.names, "hidden")])
 
 
+@pytest.mark.fault("L2")
 def test_an_object_that_no_frame_sees_is_neutral_and_says_so(asset):
     stage = open_edited(asset)
     assert read_fit(stage, str(prim_of(stage, "hidden").GetPath())).status == "unseen"
@@ -254,6 +255,7 @@ def test_a_capture_in_other_units_does_not_fit_the_root(capture, copy):
     assert {name: state(copy.folder)[name] for name in before} == before
 
 
+@pytest.mark.fault("R13")
 def test_the_number_of_threads_changes_nothing(base, capture, asset):
     single = base / "single" / "room"
     done = subprocess.run(
@@ -268,6 +270,7 @@ def test_the_number_of_threads_changes_nothing(base, capture, asset):
 # Other inputs
 
 
+@pytest.mark.fault("G9")
 def test_without_labels_connected_parts_are_the_objects(tmp_path):
     made = make_capture(tmp_path / "scan", subdivisions=1)
     write_ply(made.folder / "mesh.ply", made.points, made.triangles)
@@ -280,6 +283,7 @@ def test_without_labels_connected_parts_are_the_objects(tmp_path):
     assert_dressed(stage, meshes)
 
 
+@pytest.mark.fault("I10")
 def test_photographs_give_a_result_that_is_not_called_radiometric(tmp_path, capsys):
     made = make_capture(tmp_path / "scan", subdivisions=1)
     for image in sorted((made.folder / "frames").iterdir()):
@@ -302,6 +306,7 @@ def test_photographs_give_a_result_that_is_not_called_radiometric(tmp_path, caps
     assert frames_from_stage(stage).radiometric is False
 
 
+@pytest.mark.fault("C10")
 def test_a_lamp_that_saturates_in_every_frame_is_a_lower_bound(tmp_path):
     made = make_capture(
         tmp_path / "scan",
@@ -321,6 +326,7 @@ def test_a_lamp_that_saturates_in_every_frame_is_a_lower_bound(tmp_path):
     assert 0.5 in read_exr(tmp_path / "room/textures/lamp.coverage.exr")
 
 
+@pytest.mark.fault("G13")
 def test_an_environment_lights_an_open_scene_by_pi_times_its_radiance(tmp_path):
     made = make_capture(tmp_path / "scan", subdivisions=1, room=False)
     folder = tmp_path / "box"

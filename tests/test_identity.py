@@ -177,6 +177,7 @@ def test_without_a_home_kernels_are_kept_for_the_time_being(copy):
         assert err.startswith(f"usdbrdf: compiled kernels are kept in {copy / 'tmp'}")
 
 
+@pytest.mark.fault("R16")
 @pytest.mark.skipif(
     not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can become another user"
 )

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.job.interrupts import Terminated, interruptible, loading
-from usdbrdf.job.progress import set_quiet, show, tell
+from usdbrdf.job.progress import fill_closed_streams, set_quiet, show, tell
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, and raises nothing for a user's mistake."""
     try:
         with interruptible():
+            fill_closed_streams()
             return _run(sys.argv[1:] if arguments is None else arguments)
     except UsdBrdfError as error:
         return _refuse(str(error), error.exit_code)

@@ -27,7 +27,8 @@ from usdbrdf.options import REQUIRED, Insert, Option, OptionField, Options, opti
 EXIT_CODES = """exit codes:
   0 done   1 a defect of usdbrdf   2 wrong options   3 input refused (do not retry)
   4 disk, memory, permission or a missing package (retry may help)   5 asset folder busy
-  6 asset folder is not ours, or files of ours were edited by hand   7 validate found errors
+  6 asset folder is not ours, or files of ours were edited by hand
+  7 validate found errors, or a step warned and --strict was given
   130 interrupted   143 terminated"""
 _INSERT_KEYS = {item.option.name: item for item in option_fields(Insert) if item.option}
 

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 from usdbrdf import options
 from usdbrdf.command_parser import Command
 from usdbrdf.job.interrupts import loading
-from usdbrdf.job.progress import printable, say, set_quiet, show
+from usdbrdf.job.progress import printable, say, set_quiet, show, tell
 from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from contextlib import AbstractContextManager
 
+    from usdbrdf.asset.layout import Asset
     from usdbrdf.job.task import TaskResult
 
 
@@ -37,6 +39,16 @@ class _Talking(TalkOptions, Command):
 class _Run(_Talking):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
+    without_lock: bool = option("--without-lock", False)
+    """go on where the file system has no locks: see that nothing else writes into the asset"""
+    strict: bool = option("--strict", False)
+    "exit with 7 if a step of this asset warned, now or when it was done"
+
+    def working_on(self, folder: Path) -> AbstractContextManager[Asset]:
+        """The asset folder, made ready and locked as these options say."""
+        from usdbrdf.pipeline import working_on
+
+        return working_on(folder, wait_s=self.wait_s, without_lock=self.without_lock)
 
     def report(self, results: Mapping[str, TaskResult], folder: Path) -> int:
         """What the tasks found, with the root layer, whose name only a finished ingest knows."""
@@ -51,7 +63,12 @@ class _Run(_Talking):
         if steps.get("ingest", {}).get("radiometric") is False:
             doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
             lines = [f"warning: {doubt}", *lines]
-        return self.told({"asset": str(root), "steps": steps}, *lines)
+        status = self.told({"asset": str(root), "steps": steps}, *lines)
+        doubts = sum(len(result.summary.get("warnings", ())) for result in results.values())
+        if self.strict and doubts:
+            tell(f"usdbrdf: done, with {doubts} warnings, which --strict counts. [quality.strict]")
+            return 7
+        return status
 
 
 class _RunOnCapture(_Run):
@@ -83,6 +100,7 @@ class Convert(EditOptions, _RunOnCapture):
             plugins=self.plugins,
             hand_edits=self.hand_edits,
             wait_s=self.wait_s,
+            without_lock=self.without_lock,
         )
         return self.report(results, self.output)
 
@@ -94,8 +112,8 @@ class Ingest(_RunOnCapture):
 
     def run(self) -> int:
         with loading():
-            from usdbrdf.pipeline import ingest, working_on
-        with working_on(self.output, wait_s=self.wait_s) as asset:
+            from usdbrdf.pipeline import ingest
+        with self.working_on(self.output) as asset:
             done = ingest(self.capture, asset, self.ingest, self.adapter, plugins=self.plugins)
         return self.report({"ingest": done}, self.output)
 
@@ -108,7 +126,7 @@ class _RunOnAsset(_Run):
         with loading():
             from usdbrdf import pipeline
         name = type(self).__name__.lower()
-        with pipeline.working_on(self.asset, wait_s=self.wait_s) as asset:
+        with self.working_on(self.asset) as asset:
             done = getattr(pipeline, name)(asset, getattr(self, name))
         return self.report({name: done}, self.asset)
 

@@ -28,16 +28,28 @@ class ImageRefused(InputRefused):
     """One image cannot be used; a capture with enough others goes on without it."""
 
 
+class CrashedChild(InputRefused):
+    """A child process died of a signal while it worked on the input."""
+
+
 class EnvironmentFailure(UsdBrdfError):
     """Disk, memory, permission, a missing optional package, time: trying again may help."""
 
     exit_code = 4
 
 
+class LateChild(EnvironmentFailure):
+    """A child process did not end in time and was stopped."""
+
+
 class FolderBusy(UsdBrdfError):
     """Another run works in the same output folder."""
 
     exit_code = 5
+
+
+class NoLocks(FolderBusy):
+    """The file system of the output folder has no working locks: nobody knows who works there."""
 
 
 class OwnershipConflict(UsdBrdfError):

@@ -47,6 +47,7 @@ def convert(
     plugins: bool = True,
     hand_edits: HandEdits = "refuse",
     wait_s: float = 0.0,
+    without_lock: bool = False,
 ) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
@@ -54,14 +55,16 @@ def convert(
     output    asset folder, made if absent; its root layer is OUTPUT/<name>.usda
     adapter   name of the one that reads the capture; None: the first that recognises it, among
               those of other packages too if ``plugins``
-    hand_edits, wait_s   as of ``working_on``
+    hand_edits, wait_s, without_lock   as of ``working_on``
     returns   what each step found, by name
 
     Raises UsdBrdfError (see ``usdbrdf.errors``); an interrupted or failed call leaves what was
     valid before, and the same call again goes on where it stopped.
     """
     chosen = options or ConvertOptions()
-    with working_on(output, hand_edits=hand_edits, wait_s=wait_s) as asset:
+    with working_on(
+        output, hand_edits=hand_edits, wait_s=wait_s, without_lock=without_lock
+    ) as asset:
         return {
             "ingest": ingest(Path(capture), asset, chosen.ingest, adapter, plugins=plugins),
             "texture": texture(asset, chosen.texture),

@@ -29,6 +29,7 @@ def test_one_label(label, identifier):
     assert identifier_from(label) == identifier
 
 
+@pytest.mark.fault("G11")
 def test_labels_that_collide_get_a_suffix_and_the_exact_one_keeps_its_name():
     names = unique_identifiers(["a b", "a_b", "a-b", "A_B", "a_b"])
     assert names[1] == "a_b"
@@ -50,6 +51,7 @@ def random_label(rng):
     )
 
 
+@pytest.mark.fault("G11")
 @pytest.mark.parametrize("seed", range(50))
 def test_any_labels_give_legal_unique_names(seed):
     rng = random.Random(seed)

@@ -12,6 +12,7 @@ import pytest
 from tests.scenes import make_capture
 from usdbrdf.capture import adapters
 from usdbrdf.capture.adapters import list_adapters, read_scan
+from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted import bounds
@@ -36,6 +37,8 @@ def announce(monkeypatch, tmp_path):
 
 
 _THEIRS = """
+from usdbrdf.model.capture import Scan
+
 NAME = "theirs"
 DESCRIPTION = "their format"
 
@@ -43,7 +46,9 @@ def matches(path):
     return path.name == "theirs"
 
 def read(path, options):
-    return ("read by theirs", path, options)
+    scan = object.__new__(Scan)
+    object.__setattr__(scan, "name", "read by theirs")
+    return scan
 
 def explode(*_):
     raise RuntimeError("boom")
@@ -66,12 +71,13 @@ def test_theirs_is_found_and_used(announce, tmp_path):
     announce(theirs=_THEIRS)
     (tmp_path / "theirs").mkdir()
     options = IngestOptions()
-    assert read_scan(tmp_path / "theirs", options)[0] == "read by theirs"
-    assert read_scan(tmp_path, options, "theirs")[0] == "read by theirs"
+    assert read_scan(tmp_path / "theirs", options).name == "read by theirs"
+    assert read_scan(tmp_path, options, "theirs").name == "read by theirs"
     ours = ["transforms", "scanner-app", "colmap"]
     assert [a.name for a in list_adapters(plugins=False)] == ours
 
 
+@pytest.mark.fault("S6")
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
@@ -96,6 +102,7 @@ def test_a_broken_one_is_reported_listed_and_skipped(announce, tmp_path, capsys,
         read_scan(capture.folder, IngestOptions(), "theirs")
 
 
+@pytest.mark.fault("S6")
 def test_one_that_hangs_at_import_is_reported_and_skipped(announce, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bounds, "PLUGIN_SECONDS", 5.0)
     announce(theirs="while True: pass")
@@ -148,3 +155,22 @@ def test_nothing_recognised_lists_what_would_be(tmp_path):
 def test_options_out_of_range_are_usage_errors(options):
     with pytest.raises(UsageError, match=r"\[usage.option\]$"):
         IngestOptions(**options)
+
+
+@pytest.mark.fault("S6")
+@pytest.mark.parametrize("signature", ["path", "path, options, more", "*, path"])
+def test_one_made_for_another_version_of_ours_fails_in_a_sentence(announce, tmp_path, signature):
+    announce(theirs=f"{_THEIRS}\ndef read({signature}):\n    return None\n")
+    (tmp_path / "theirs").mkdir()
+    with pytest.raises(InputRefused, match=r"'theirs' \(pkg.theirs\) failed: TypeError.*authors"):
+        read_scan(tmp_path / "theirs", IngestOptions())
+
+
+@pytest.mark.fault("S6")
+def test_one_that_returns_no_scan_fails_in_a_sentence(announce, tmp_path, capsys):
+    announce(theirs=f"{_THEIRS}\ndef read(path, options):\n    return {{'frames': []}}\n")
+    (tmp_path / "theirs").mkdir()
+    assert main(["ingest", str(tmp_path / "theirs"), "-o", str(tmp_path / "out"), "-q"]) == 3
+    said = capsys.readouterr().err
+    assert "'theirs' (pkg.theirs) failed: TypeError('it returned a dict in the place" in said
+    assert not (tmp_path / "out").exists()

@@ -62,6 +62,8 @@ def test_every_channel_must_rise_above_the_noise_floor(tmp_path):
     assert not frame.valid[1, 2]
 
 
+@pytest.mark.fault("I3")
+@pytest.mark.fault("I4")
 def test_nan_infinity_and_negative_light_are_unknown_not_black(tmp_path):
     pixels = np.full((2, 4, 3), 1.0, np.float32)
     pixels[0, 0, 0] = np.nan
@@ -76,6 +78,18 @@ def test_nan_infinity_and_negative_light_are_unknown_not_black(tmp_path):
     assert frame.num_clamped == 1
     assert not frame.clipped.any()
     assert frame.valid.sum() == 5
+
+
+@pytest.mark.fault("I4")
+@pytest.mark.parametrize(("level", "ringing"), [(-0.9e-3, True), (-1.1e-3, False), (-0.01, False)])
+def test_ringing_is_a_thousandth_of_the_median(tmp_path, level, ringing):
+    """Further below zero nothing was ever light, whatever the unit."""
+    for unit in (1.0, 1e4):
+        pixels = np.full((2, 4, 3), unit, np.float32)
+        pixels[0, 0, 0] = level * unit
+        _write(tmp_path / "a.exr", pixels, "float")
+        frame = read_frame(_frames(tmp_path / "a.exr"), 0)
+        assert (frame.num_clamped, int(frame.unknown.sum())) == ((1, 0) if ringing else (0, 1))
 
 
 def test_limits_belong_to_the_recorded_channels_not_to_rec709(tmp_path):

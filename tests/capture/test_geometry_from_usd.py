@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
@@ -198,6 +201,7 @@ def _metadata(key, value):
 _NAN = [(np.nan, 0, 0), (1, 0, 0), (0, 1, 0)]
 
 
+@pytest.mark.fault("S1")
 @pytest.mark.parametrize(
     ("author", "rule", "words"),
     [
@@ -241,6 +245,10 @@ def test_a_reference_may_lead_into_the_capture_but_not_beyond(tmp_path):
     stage.Save()
     with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
         meshes_from_usd(tmp_path / "geo" / "a.usda")
+    # A folder is allowed, not all whose names begin like it.
+    (tmp_path / "li").mkdir()
+    with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
+        meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path / "li",))
     found = meshes_from_usd(tmp_path / "geo" / "a.usda", allow=(tmp_path,))
     assert [each.label for each in found.objects] == ["seat"]
 
@@ -336,3 +344,59 @@ def test_faces_of_a_usd_mesh_that_look_away_are_turned_in_our_layer_alone(captur
         atol=1e-5,
     )
     assert file.read_bytes() == before
+
+
+@pytest.mark.fault("S3")
+@pytest.mark.parametrize("how", ["sublayer", "itself", "reference", "inherit"])
+def test_layers_that_name_each_other_end_in_a_sentence(tmp_path, how):
+    root = 'def Xform "scan" ({arc}) {{ def Mesh "m" {{}} }}'
+    arcs = {"reference": "references = @./{other}@</scan>", "inherit": "inherits = </scan/m>"}
+    for name, other in (("a.usda", "b.usda"), ("b.usda", "a.usda")):
+        other = name if how == "itself" else other
+        sub = f"subLayers = [@./{other}@]" if how in ("sublayer", "itself") else ""
+        arc = arcs.get(how, "").format(other=other)
+        text = f'#usda 1.0\n(\n defaultPrim = "scan"\n {sub}\n)\n{root.format(arc=arc)}\n'
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputRefused, match=r"a\.usda: .*\[(stage|mesh|child)\.\w+\]$"):
+        meshes_from_usd(tmp_path / "a.usda")
+
+
+@pytest.mark.fault("S3")
+def test_prims_nested_beyond_reason_kill_a_child_and_nothing_else(tmp_path):
+    depth = 200_000
+    nested = 'def Xform "a" {\n' * depth + "}\n" * depth
+    (tmp_path / "a.usda").write_text(f'#usda 1.0\n(\n defaultPrim = "a"\n)\n{nested}')
+    with pytest.raises(InputRefused, match=r"a\.usda.*\[(child\.crashed|stage\.input)\]$"):
+        meshes_from_usd(tmp_path / "a.usda")
+
+
+def _usdz(path, entries, *, compressed=False):
+    kind = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path, "w", kind) as package:
+        for name, content in entries:
+            package.writestr(name, content)
+
+
+_ROOM = '#usda 1.0\n(\n defaultPrim = "scan"\n)\ndef Xform "scan" {}\n'
+
+
+@pytest.mark.fault("S3")
+@pytest.mark.parametrize("name", ["../evil.usda", "/evil.usda", "a/../../evil.usda", "..\\evil"])
+def test_a_package_whose_entries_leave_it_is_refused_and_nothing_is_written(tmp_path, name):
+    (tmp_path / "capture").mkdir()
+    path = tmp_path / "capture" / "a.usdz"
+    _usdz(path, [("room.usda", _ROOM), (name, _ROOM)])
+    before = set(tmp_path.rglob("*"))
+    with pytest.raises(InputRefused, match=r"a\.usdz: .*\[(paths|stage|mesh)\.\w+\]$"):
+        meshes_from_usd(path)
+    assert set(tmp_path.rglob("*")) == before
+    assert not Path("/evil.usda").exists()
+
+
+@pytest.mark.fault("S3")
+def test_a_compressed_package_is_no_usdz_and_is_not_blown_up(tmp_path):
+    """A gigabyte of zeros in a megabyte: USD reads stored entries alone."""
+    _usdz(tmp_path / "a.usdz", [("room.usda", _ROOM), ("b.usda", bytes(1 << 30))], compressed=True)
+    assert (tmp_path / "a.usdz").stat().st_size < 2 << 20
+    with pytest.raises(InputRefused, match=r"a\.usdz: .*\[(stage|mesh)\.\w+\]$"):
+        meshes_from_usd(tmp_path / "a.usdz")

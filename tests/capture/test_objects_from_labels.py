@@ -29,12 +29,14 @@ def test_connected_parts_come_largest_first_and_the_small_ones_together():
     assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
 
 
+@pytest.mark.fault("G9")
 def test_one_large_part_is_one_object():
     split = segmentation(_squares([2, 0.05]), None, table_path=None, min_area=0.01)
     assert split.labels == (("scan", ""),)
     assert split.face_object.tolist() == [0] * 4
 
 
+@pytest.mark.fault("G10")
 def test_ids_may_be_sparse_and_negative(tmp_path):
     path = tmp_path / "objects.json"
     path.write_text('{"objects": [{"id": 7, "name": "chair", "class_name": "seat"}, {"id": 9}]}')
@@ -61,6 +63,7 @@ def test_labels_of_the_document_count_the_broken_faces_too(tmp_path):
     assert [name for name, _ in split.labels] == ["object_1", "object_3", "object_4", "object_5"]
 
 
+@pytest.mark.fault("G10")
 def test_too_many_objects_are_no_objects():
     mesh = _squares([1.0] * 40_000, face_label=np.arange(80_000))
     with pytest.raises(InputRefused, match=r"80000 different.*65535.*\[objects.limit\]"):

@@ -101,6 +101,7 @@ def test_a_folder_without_photographs_is_refused(tmp_path):
         read_scan(export, IngestOptions())
 
 
+@pytest.mark.fault("C9")
 def test_missing_exposures_count_as_equal(tmp_path):
     export, _ = make_export(tmp_path)
     with edited(export / "frame_00004.json") as document:

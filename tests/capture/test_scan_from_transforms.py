@@ -64,6 +64,7 @@ def test_intrinsics_of_a_frame_come_before_those_of_all(capture):
     np.testing.assert_allclose(scan.frames.intrinsics[5], capture.intrinsics)
 
 
+@pytest.mark.fault("I7")
 @pytest.mark.parametrize("factor", [0.5, 2])
 def test_images_scaled_by_one_number_have_their_intrinsics_scaled(capture, factor):
     rescale_images(capture, factor)
@@ -75,6 +76,7 @@ def test_images_scaled_by_one_number_have_their_intrinsics_scaled(capture, facto
     assert "12 of 12 frames" in warning
 
 
+@pytest.mark.fault("I7")
 @pytest.mark.parametrize("factor", [0.5, 2])
 @pytest.mark.parametrize("state", ["cx, cy", "angle"])
 def test_images_of_another_size_are_noticed_where_no_size_is_stated(capture, factor, state):
@@ -102,6 +104,7 @@ def test_applied_transform_and_scale_are_undone(capture):
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-9)
 
 
+@pytest.mark.fault("C2")
 def test_almost_rigid_poses_are_snapped_and_the_user_hears_of_it(capture):
     with edited(capture.manifest) as document:
         for frame in document["frames"]:
@@ -138,6 +141,7 @@ def test_options_come_before_the_document(capture, tmp_path):
     assert scan.frames.encoding == "lin_ap1_scene"
 
 
+@pytest.mark.fault("I10")
 def test_photographs_need_a_word_of_consent(capture):
     with edited(capture.manifest) as document:
         for i, frame in enumerate(document["frames"]):
@@ -179,6 +183,7 @@ def test_labels_may_come_as_a_list(capture):
     assert np.bincount(scan.mesh.face_object).tolist() == [len(capture.triangles) - 100, 100]
 
 
+@pytest.mark.fault("S5")
 def test_names_of_any_kind_pass_through_the_whole_reader(tmp_path):
     capture = make_capture(tmp_path / "a #1 [x] é 椅子")
     with edited(capture.folder / "objects.json") as document:

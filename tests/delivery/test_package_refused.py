@@ -12,6 +12,7 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.images import write_exr
 
 
+@pytest.mark.fault("S2")
 @pytest.mark.parametrize(
     "path", ["/etc/hostname", "../../../../../../../../etc/hostname", "./textures/link.exr"]
 )
@@ -33,6 +34,7 @@ def test_addresses_are_refused_as_such(room, tmp_path, path):
         packed(room, tmp_path)
 
 
+@pytest.mark.fault("S2")
 def test_a_refusal_leaves_no_folder_behind(room, tmp_path):
     edit(room, CHAIR_FILE.format("./gone.exr"))
     (tmp_path / "there").mkdir()

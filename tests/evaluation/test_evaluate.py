@@ -123,6 +123,7 @@ def test_the_command_prints_its_summary(room, views, tmp_path, capsys):
     assert "3 views, diffuse baseline -> full model: FLIP" in err
 
 
+@pytest.mark.fault("R15")
 def test_without_matplotlib_one_line_says_so(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     usdbrdf.job.progress.set_quiet(False)

@@ -357,6 +357,26 @@ def test_the_capture_is_good_without_a_fault(capture):
     assert scan.warnings == ()
 
 
+@pytest.mark.fault("I1", "many truncated images")
+@pytest.mark.fault("I5", "all nan")
+@pytest.mark.fault("I7", "half width", "cropped images")
+@pytest.mark.fault("I8", "wrong channels")
+@pytest.mark.fault("C1", "many frames without pose", "too few frames")
+@pytest.mark.fault("C2", "scaled poses", "sheared poses")
+@pytest.mark.fault("C3", "mirrored poses")
+@pytest.mark.fault("C4", "infinity outside a pose")
+@pytest.mark.fault("C5", "one viewpoint")
+@pytest.mark.fault("C6", "frame listed twice")
+@pytest.mark.fault("C7", "rays miss")
+@pytest.mark.fault("C10", "all saturated")
+@pytest.mark.fault("C11", "all black")
+@pytest.mark.fault("C12", "fisheye", "distortion")
+@pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
+@pytest.mark.fault("G1", "missing mesh", "empty mesh")
+@pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")
+@pytest.mark.fault("G10", "label count")
+@pytest.mark.fault("S1", "mesh leads out", "image leads out", "image links out")
+@pytest.mark.fault("S4", "hostile name")
 @pytest.mark.parametrize("fault", REFUSED)
 def test_fault_is_refused(capture, fault):
     recipe, rule, words = REFUSED[fault]
@@ -373,6 +393,14 @@ def test_fault_is_refused(capture, fault):
     assert _files(capture.folder.parent) == before
 
 
+@pytest.mark.fault("I1", "truncated image")
+@pytest.mark.fault("I3", "nan beyond the limit")
+@pytest.mark.fault("I13", "empty image")
+@pytest.mark.fault("C1", "frame without pose", "frame without file")
+@pytest.mark.fault("C4", "infinity in a pose", "pose with null")
+@pytest.mark.fault("C6", "duplicate image")
+@pytest.mark.fault("C10", "saturated frame")
+@pytest.mark.fault("C11", "black frame")
 @pytest.mark.parametrize("fault", DROPPED)
 def test_fault_of_one_frame_drops_it_with_a_warning(capture, fault):
     recipe, rule, words = DROPPED[fault]
@@ -385,6 +413,8 @@ def test_fault_of_one_frame_drops_it_with_a_warning(capture, fault):
     assert [word for word in words if word not in warning] == [], warning
 
 
+@pytest.mark.fault("I3")
+@pytest.mark.fault("I4")
 def test_small_faults_are_counted_and_nothing_is_dropped(capture):
     def spoil(image: np.ndarray) -> np.ndarray:
         image[0, 0, 0] = np.nan
@@ -400,6 +430,7 @@ def test_small_faults_are_counted_and_nothing_is_dropped(capture):
     assert scan.counts["pixels_negative_clamped"] == 1
 
 
+@pytest.mark.fault("I3")
 def test_the_limit_of_nonfinite_pixels_is_an_option(capture):
     _images(range(12), _with_nan(0.3))(capture)
     with pytest.raises(InputRefused, match="--max-nonfinite"):
@@ -407,6 +438,7 @@ def test_the_limit_of_nonfinite_pixels_is_an_option(capture):
     assert len(read_scan(capture.folder, IngestOptions(max_nonfinite=0.4)).frames) == 12
 
 
+@pytest.mark.fault("C2")
 def test_pose_scale_divides_the_stated_factor_out(capture):
     _poses(lambda m: m @ np.diag([2.5, 2.5, 2.5, 1]))(capture)
     scan = read_scan(capture.folder, IngestOptions(pose_scale=2.5))
@@ -415,6 +447,7 @@ def test_pose_scale_divides_the_stated_factor_out(capture):
         read_scan(capture.folder, IngestOptions(pose_scale=3))
 
 
+@pytest.mark.fault("C7")
 @pytest.mark.parametrize(
     ("convention", "change"),
     [
@@ -430,6 +463,7 @@ def test_the_convention_that_would_hit_is_named(tmp_path, convention, change):
         read_scan(capture.folder, IngestOptions())
 
 
+@pytest.mark.fault("S1")
 def test_allow_outside_opens_one_folder_and_no_other(capture):
     _symlink_out(capture)
     with pytest.raises(InputRefused, match=r"\[paths.outside\]"):
@@ -438,6 +472,7 @@ def test_allow_outside_opens_one_folder_and_no_other(capture):
     assert scan.frames.image_paths[0].name == "elsewhere.exr"
 
 
+@pytest.mark.fault("C13")
 @pytest.mark.parametrize("name", ["transforms.json", "mesh.ply", "objects.json"])
 @pytest.mark.parametrize("seed", range(13))
 def test_a_damaged_document_ends_in_a_refusal_or_in_the_scan_that_it_tells(capture, name, seed):

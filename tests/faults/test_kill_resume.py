@@ -135,6 +135,7 @@ def hashes(asset: Path) -> dict[str, str]:
     return {path.relative_to(asset).as_posix(): sha256_of(path) for path in files}
 
 
+@pytest.mark.fault("R2")
 @pytest.mark.parametrize(("step", "fault"), IN_STEPS)
 def test_killed_step_resumes_to_the_same_bytes(base, undisturbed, case, step, fault):
     asset = case(step)
@@ -145,6 +146,7 @@ def test_killed_step_resumes_to_the_same_bytes(base, undisturbed, case, step, fa
     assert hashes(asset) == hashes(undisturbed[step])
 
 
+@pytest.mark.fault("R2")
 def test_a_convert_killed_once_in_every_step_ends_in_the_same_bytes(base, undisturbed, case):
     asset = case("ingest")
     call = command("convert", base, asset)
@@ -202,6 +204,7 @@ def test_texturing_goes_on_after_the_last_saved_frame(resumed):
     assert found == {"read_frames": 1, "first frame": 1}
 
 
+@pytest.mark.fault("R2")
 def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resumed):
     asset = case("shade")
     assert main(command("shade", base, asset)) == 0
@@ -224,6 +227,7 @@ def test_a_step_that_was_being_published_is_not_computed_again(resumed):
 # Other ways to be interrupted
 
 
+@pytest.mark.fault("R1")
 @pytest.mark.parametrize("fault", ["before_publish", "mid_publish:3"])
 def test_full_disk_while_publishing(base, undisturbed, case, monkeypatch, capsys, fault):
     asset = case("fit")
@@ -245,6 +249,8 @@ def test_full_disk_while_publishing(base, undisturbed, case, monkeypatch, capsys
     assert hashes(asset) == before
 
 
+@pytest.mark.fault("R3")
+@pytest.mark.fault("R6")
 def test_a_second_run_is_refused_and_the_first_stops_when_told_to(base, undisturbed, case):
     asset = case("ingest")
     call = command("convert", base, asset)

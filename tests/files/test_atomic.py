@@ -39,6 +39,7 @@ def run_python(code, *arguments, fault=""):
     )
 
 
+@pytest.mark.fault("R11")
 def test_publish_replaces_and_readers_keep_the_old_file(tmp_path):
     final, staged = tmp_path / "final", tmp_path / "staged"
     final.write_text("old")
@@ -79,6 +80,7 @@ def test_failure_leaves_the_old_file_and_no_litter(tmp_path):
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
 
 
+@pytest.mark.fault("R2")
 @pytest.mark.parametrize("side", ["before", "after"])
 def test_kill_around_the_rename(tmp_path, side):
     path = tmp_path / "a.txt"
@@ -148,6 +150,7 @@ def test_folders_that_cannot_be_flushed(tmp_path, monkeypatch, error):
         flush_folder(tmp_path)  # network file systems say so
 
 
+@pytest.mark.fault("R1")
 def test_really_full_disk(tmp_path):
     """A limit on the file size fails in write() as a full disk does, at half the content."""
     code = """

@@ -39,6 +39,7 @@ def test_numbers_that_are_not_finite(read, number):
         read(text)
 
 
+@pytest.mark.fault("C13")
 @pytest.mark.parametrize(
     "text", ['{"a": 1,\n"b": {"a": 2},\n"a": 3}', '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]']
 )
@@ -47,6 +48,7 @@ def test_key_twice(read, text):
         read(text)
 
 
+@pytest.mark.fault("C13")
 @pytest.mark.parametrize("text", ["", "{", '{"a": 1,}', "[1, 2", "nan", "{'a': 1}", '{"a": 1} x'])
 def test_malformed(read, text):
     with pytest.raises(InputRefused, match=r"doc\.json:1: not valid JSON.+\[document\.json\]$"):
@@ -63,6 +65,7 @@ def test_not_utf8(read):
         read(b'["\xff"]')
 
 
+@pytest.mark.fault("C13")
 def test_depth(read, monkeypatch):
     assert read("[" * 64 + "]" * 64)
     for depth in (65, 200_000):
@@ -74,12 +77,14 @@ def test_depth(read, monkeypatch):
         read('{"a": {}}')
 
 
+@pytest.mark.fault("C13")
 def test_size(read, monkeypatch):
     monkeypatch.setattr(documents, "MAX_BYTES", 10)
     with pytest.raises(InputRefused, match=r"11 bytes.+limit of 10.+\[document\.size\]$"):
         read('["1234567"]')
 
 
+@pytest.mark.fault("I13")
 def test_not_a_regular_file(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path, tmp_path / "fifo", tmp_path / "none", tmp_path / ("x" * 300)):

@@ -63,6 +63,7 @@ def test_equal_pixels_give_equal_bytes(tmp_path, radiance):
     assert b"lin_rec709_scene" in (tmp_path / "a.exr").read_bytes()
 
 
+@pytest.mark.fault("I14")
 def test_half_floats_are_clamped_and_counted(tmp_path):
     pixels = np.array([[[65504, 65505, -1e30], [0, 1, 2]]], np.float32)
     assert write_exr(tmp_path / "a.exr", pixels) == 2
@@ -87,6 +88,7 @@ def test_wrong_shape_is_our_bug(tmp_path, shape):
         write_exr(tmp_path / "a.exr", np.zeros(shape, np.float32))
 
 
+@pytest.mark.fault("R1")
 def test_full_disk_keeps_the_old_file(tmp_path, monkeypatch, radiance):
     path = tmp_path / "a.exr"
     write_exr(path, radiance)
@@ -123,6 +125,7 @@ def test_full_disk_keeps_the_old_file(tmp_path, monkeypatch, radiance):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.fault("R1")
 def test_really_full_disk_keeps_the_old_file(tmp_path, radiance):
     """A limit on the file size fails in write() as a full disk does."""
     code = """
@@ -154,6 +157,7 @@ except EnvironmentFailure as error:
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.fault("I12")
 def test_exr_whose_header_lies_about_its_size(tmp_path, radiance):
     path = tmp_path / "a.exr"
     write_exr(path, radiance)
@@ -168,6 +172,25 @@ def test_exr_whose_header_lies_about_its_size(tmp_path, radiance):
 def test_folder_that_is_not_there(tmp_path, radiance):
     with pytest.raises(EnvironmentFailure, match=r"cannot be written.+\[image\.write\]$"):
         write_exr(tmp_path / "none/a.exr", radiance)
+
+
+@pytest.mark.fault("R1")
+def test_a_file_that_does_not_read_back_is_not_published(tmp_path, monkeypatch, radiance):
+    """A disk that loses what it said it wrote."""
+    path = tmp_path / "a.exr"
+    write_exr(path, radiance)
+    before, write = path.read_bytes(), images._write
+
+    def losing(path, staged, spec, pixels):
+        pixels = np.array(pixels)
+        pixels[-1, -1, -1] += 1
+        write(path, staged, spec, pixels)
+
+    monkeypatch.setattr(images, "_write", losing)
+    with pytest.raises(EnvironmentFailure, match=r"does not read back.+\[image\.write\]$"):
+        write_exr(path, radiance + 1)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_preview(tmp_path, radiance):
@@ -189,6 +212,7 @@ def test_nan_and_infinity_come_as_they_are(tmp_path, radiance):
     assert np.array_equal(read_radiance(tmp_path / "a.exr"), radiance, equal_nan=True)
 
 
+@pytest.mark.fault("I8")
 def test_channels_are_chosen_by_name(tmp_path):
     names = ("Z", "albedo.R", "B", "A", "G", "R")
     pixels = np.tile(np.arange(6, dtype=np.float32), (3, 4, 1))
@@ -197,6 +221,7 @@ def test_channels_are_chosen_by_name(tmp_path):
     assert read_radiance(tmp_path / "a.exr").flags["C_CONTIGUOUS"]
 
 
+@pytest.mark.fault("I8")
 @pytest.mark.parametrize("names", [("Y",), ("U", "V"), ("R", "G"), ("a.R", "a.G", "a.B", "a.A")])
 def test_wrong_channels_are_listed(tmp_path, names):
     write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, len(names)), np.float32), names)
@@ -204,6 +229,7 @@ def test_wrong_channels_are_listed(tmp_path, names):
         read_radiance(tmp_path / "a.exr")
 
 
+@pytest.mark.fault("I9")
 def test_data_window_is_placed_in_the_display_window(tmp_path):
     pixels = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
     write_with_oiio(tmp_path / "a.exr", pixels, ("R", "G", "B"), window=(6, -1, 8, 4))
@@ -214,12 +240,14 @@ def test_data_window_is_placed_in_the_display_window(tmp_path):
     assert image_size(tmp_path / "a.exr")[:2] == (8, 4)
 
 
+@pytest.mark.fault("I9")
 def test_data_window_larger_than_the_display_window(tmp_path):
     pixels = np.arange(6 * 7 * 3, dtype=np.float32).reshape(6, 7, 3)
     write_with_oiio(tmp_path / "a.exr", pixels, ("R", "G", "B"), window=(-2, -1, 4, 3))
     assert np.array_equal(read_radiance(tmp_path / "a.exr"), pixels[1:4, 2:6])
 
 
+@pytest.mark.fault("I9")
 def test_data_window_beside_the_display_window(tmp_path):
     pixels = np.ones((2, 2, 3), np.float32)
     for window in ((-9, 0, 4, 3), (0, 50, 4, 3)):
@@ -227,6 +255,7 @@ def test_data_window_beside_the_display_window(tmp_path):
         assert np.isnan(read_radiance(tmp_path / "a.exr")).all()
 
 
+@pytest.mark.fault("I1")
 @pytest.mark.parametrize("suffix", [".exr", ".hdr", ".tif", ".png", ".jpg"])
 @pytest.mark.parametrize("fraction", [0.0, 0.02, 0.3, 0.5, 0.9, 0.99])
 def test_truncated_file_is_refused(tmp_path, radiance, suffix, fraction, capfd):
@@ -239,6 +268,7 @@ def test_truncated_file_is_refused(tmp_path, radiance, suffix, fraction, capfd):
         read_radiance(cut)
 
 
+@pytest.mark.fault("I1")
 @pytest.mark.parametrize("length", [3, 100, -1])
 @pytest.mark.parametrize("compression", ["none", "zip", "piz", "dwaa"])
 def test_exr_truncated_anywhere(tmp_path, radiance, compression, length):
@@ -247,6 +277,51 @@ def test_exr_truncated_anywhere(tmp_path, radiance, compression, length):
     path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(ImageRefused):
         read_radiance(path)
+
+
+def _two_parts(path, first, second, names):
+    """A multi-part EXR: each part one picture with channels of these names."""
+    specs = []
+    for pixels, channels in zip((first, second), names, strict=True):
+        spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "half")
+        spec.channelnames = channels
+        spec.attribute("compression", "zip")
+        spec.attribute("oiio:subimagename", f"part {len(specs)}")
+        specs.append(spec)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), tuple(specs))
+    assert output.write_image(first)
+    assert output.open(str(path), specs[1], "AppendSubimage")
+    assert output.write_image(second)
+    assert output.close()
+
+
+@pytest.mark.fault("I8")
+@pytest.mark.fault("I11")
+def test_the_part_with_red_green_and_blue_is_read_wherever_it_stands(tmp_path, radiance):
+    path, depth = tmp_path / "a.exr", np.ones((24, 40, 1), np.float32)
+    _two_parts(path, depth, radiance, (("Z",), ("R", "G", "B")))
+    assert np.array_equal(read_radiance(path), radiance.astype(np.float16))
+    assert image_size(path) == (40, 24, ("R", "G", "B"))
+    _two_parts(path, depth, radiance, (("Z",), ("N.X", "N.Y", "N.Z")))
+    with pytest.raises(ImageRefused, match=r"no channels R, G and B among 'Z'"):
+        read_radiance(path)
+
+
+@pytest.mark.fault("I11")
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_an_unfinished_part_is_refused_or_was_not_needed(tmp_path, radiance, share):
+    """Never zeros, and never another part's pixels."""
+    path = tmp_path / "a.exr"
+    for names in ((("R", "G", "B"), ("x", "y", "z")), (("x", "y", "z"), ("R", "G", "B"))):
+        _two_parts(path, radiance, radiance + 1, names)
+        path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+        try:
+            found = read_radiance(path)
+        except ImageRefused:
+            continue
+        assert names[0][0] == "R", "the part lies at the end of the file"
+        assert np.array_equal(found, radiance.astype(np.float16))
 
 
 def test_jpeg_with_a_thumbnail_and_a_tail(tmp_path, radiance):
@@ -261,6 +336,7 @@ def test_jpeg_with_a_thumbnail_and_a_tail(tmp_path, radiance):
         read_radiance(path)
 
 
+@pytest.mark.fault("I2")
 def test_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance):
     """A window of random bytes slides over the file; nothing else may ever come out."""
     path = tmp_path / "a.exr"
@@ -284,6 +360,7 @@ def test_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance):
     assert refused > 100
 
 
+@pytest.mark.fault("I13")
 def test_what_is_not_a_regular_file(tmp_path):
     os.mkfifo(tmp_path / "fifo.exr")
     (tmp_path / "folder.exr").mkdir()
@@ -330,6 +407,7 @@ def test_alpha_does_not_darken(tmp_path):
     assert np.allclose(read_radiance(path), pixels[..., :3], atol=1 / 255)
 
 
+@pytest.mark.fault("I12")
 def test_limits(tmp_path, radiance):
     write_exr(tmp_path / "a.exr", radiance)
     read_radiance(tmp_path / "a.exr", max_side=40)
@@ -341,6 +419,7 @@ def test_limits(tmp_path, radiance):
         read_exr(tmp_path / "b.exr")
 
 
+@pytest.mark.fault("I12")
 def test_what_is_made_is_limited_not_what_is_stored(tmp_path, radiance):
     """373 bytes with one pixel in a display window of 16384 x 4096 would be made 768 MiB."""
     path = tmp_path / "a.exr"
@@ -392,6 +471,7 @@ for more in (1, 16, 40, 64, 96, 110, 128):
     assert all(row.endswith((" read", "[environment.memory]")) for row in rows), rows
 
 
+@pytest.mark.fault("I2")
 @pytest.mark.parametrize("error", [SystemError, RuntimeError, IndexError, UnicodeDecodeError])
 def test_whatever_the_decoder_raises_is_a_refusal(tmp_path, monkeypatch, radiance, error):
     """Damaged PIZ blocks have been seen to raise a SystemError."""
@@ -410,7 +490,8 @@ def test_whatever_the_decoder_raises_is_a_refusal(tmp_path, monkeypatch, radianc
         read_radiance(tmp_path / "a.exr")
 
 
-@pytest.mark.parametrize("compression", ["piz", "dwaa", "b44"])
+@pytest.mark.fault("I2")
+@pytest.mark.parametrize("compression", ["none", "zip", "piz", "dwaa", "b44"])
 def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compression):
     path = tmp_path / "a.exr"
     write_with_oiio(path, radiance, ("R", "G", "B"), "half", compression=compression)
@@ -426,9 +507,10 @@ def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compress
             assert read_radiance(path).shape[2] == 3
         except ImageRefused:
             refused += 1
-    assert refused > 20
+    assert refused > (20 if compression != "none" else 0), "a byte of the header at least"
 
 
+@pytest.mark.fault("I12")
 @pytest.mark.parametrize("side", [15_000, 60_000, 1_000_000])
 def test_decompression_bomb_is_refused_before_it_is_decoded(tmp_path, side):
     def chunk(kind, content):

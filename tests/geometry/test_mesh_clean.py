@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.geometry.mesh_clean import CleanMesh, clean_mesh
 
 
@@ -25,6 +25,7 @@ def test_a_clean_mesh_comes_back_bit_for_bit():
     assert set(clean.counts.values()) == {0}
 
 
+@pytest.mark.fault("G3")
 def test_dead_weight_is_removed_and_counted():
     points = np.array(
         [[9, 9, 9], [0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [0, 0, 0]], np.float32
@@ -59,6 +60,7 @@ def _edges(clean: CleanMesh, index: int) -> np.ndarray:
     return np.unique(edges, axis=0, return_counts=True)[1]
 
 
+@pytest.mark.fault("G4")
 def test_surfaces_are_separated_where_more_than_two_faces_meet():
     fan = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], np.float32)
     sphere, faces = _sphere(1)
@@ -90,6 +92,7 @@ def test_objects_that_touch_and_leaves_with_two_sides_are_no_damage():
     assert clean.triangles.tolist() == triangles.tolist()
 
 
+@pytest.mark.fault("G4")
 def test_a_broken_soup_keeps_its_good_faces_and_their_labels():
     rng = np.random.default_rng(3)
     lattice = np.stack(np.meshgrid(*[np.arange(3)] * 3), -1).reshape(-1, 3)
@@ -145,3 +148,13 @@ def test_reduction_keeps_objects_in_proportion_and_the_small_ones_alive():
     again = clean_mesh(both, faces, labels, decimate=1000)
     assert again.points.tobytes() == clean.points.tobytes()
     assert again.triangles.tobytes() == clean.triangles.tobytes()
+
+
+def test_without_pymeshlab_sound_meshes_pass_and_others_end_in_a_sentence(tmp_path, monkeypatch):
+    (tmp_path / "pymeshlab.py").write_text("raise ModuleNotFoundError('No module named pymeshlab')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    points, triangles = _sphere(1)
+    face_object = np.zeros(len(triangles), np.int32)
+    assert len(clean_mesh(points, triangles, face_object).triangles) == len(triangles)
+    with pytest.raises(EnvironmentFailure, match=r"pymeshlab.*installation.*\[child\.start\]$"):
+        clean_mesh(points, np.concatenate([triangles, triangles[:1]]), np.zeros(81, np.int32))

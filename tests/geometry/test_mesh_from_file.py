@@ -8,7 +8,7 @@ import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
-from usdbrdf.untrusted.mesh_files import mesh_from_file
+from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file
 
 _SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -58,6 +58,7 @@ def test_glb_nodes_become_labels_in_world_positions(tmp_path):
     np.testing.assert_allclose(mesh.points.max(axis=0), [4, 1, 1], atol=1e-6)
 
 
+@pytest.mark.fault("G2")
 @pytest.mark.parametrize("broken", ["nan", "index"])
 def test_a_few_broken_faces_are_left_out(tmp_path, broken):
     points, triangles, face_object, _ = room_mesh(subdivisions=8)
@@ -74,6 +75,8 @@ def test_a_few_broken_faces_are_left_out(tmp_path, broken):
     assert len(mesh.triangles) == len(mesh.face_label) == expected.sum()
 
 
+@pytest.mark.fault("G1")
+@pytest.mark.fault("G8")
 @pytest.mark.parametrize(
     ("name", "content", "rule"),
     [
@@ -109,3 +112,12 @@ def test_a_folder_in_place_of_the_mesh_is_refused(tmp_path):
     (tmp_path / "mesh.ply").mkdir()
     with pytest.raises(InputRefused, match=r"not a regular file.*\[mesh.missing\]"):
         mesh_from_file(tmp_path / "mesh.ply")
+
+
+@pytest.mark.fault("G7")
+def test_more_triangles_than_can_be_a_scan_are_refused_before_they_are_looked_at(tmp_path):
+    """50 million and one, which take no memory."""
+    many = np.broadcast_to(np.arange(3, dtype=np.int32), (50_000_001, 3))
+    mesh = FileMesh(points=np.eye(3, dtype=np.float32), triangles=many)
+    with pytest.raises(InputRefused, match=r"50000001 triangles .*Reduce.*\[mesh\.size\]$"):
+        checked_mesh(mesh, tmp_path / "mesh.ply")

@@ -116,7 +116,8 @@ def test_normals_turn_with_their_faces_and_missing_ones_are_made(room):
     right = corner_normals(room.points, room.triangles, 40)
     wrong = _wound(room, turned)
     flipped = np.where(turned[:, None, None], -right[:, [0, 2, 1]], right)
-    sides = Sides(turned=turned, both=np.zeros(len(turned), np.bool_))
+    nothing = np.zeros(len(turned), np.bool_)
+    sides = Sides(turned=turned, both=nothing, frames=np.zeros((len(turned), 2), np.int32))
     given_all = np.ones(len(turned), np.bool_)
     given = turned_towards_cameras(replace(wrong, corner_normals=flipped), sides, given_all, 40)
     np.testing.assert_array_equal(given.triangles, room.triangles)
@@ -129,6 +130,7 @@ def test_normals_turn_with_their_faces_and_missing_ones_are_made(room):
     np.testing.assert_array_equal(made.corner_normals, right)
 
 
+@pytest.mark.fault("G3")
 def test_a_capture_with_turned_faces_is_the_same_scan(tmp_path):
     made = make_capture(tmp_path / "right")
     expected = read_scan(made.folder, IngestOptions())

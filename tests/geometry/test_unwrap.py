@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import re
+import signal
+import sys
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.physics.surfaces import quad, sphere, world_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import CrashedChild, InputRefused
+from usdbrdf.geometry import unwrap as module
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import PADDING, TexelSizes, pack_triangles_singly, unwrap
 from usdbrdf.model.scene import Scene, SceneObject
@@ -88,6 +95,7 @@ def test_no_two_triangles_share_a_texel_centre(unwrapped):
         assert taken.max() == 1
 
 
+@pytest.mark.fault("G7")
 def test_an_atlas_beyond_the_limit_is_refused_with_the_cure(monkeypatch):
     monkeypatch.setattr("usdbrdf.geometry.unwrap.MAX_SIDE", 64)
     scene = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0))]).scene
@@ -120,3 +128,105 @@ def test_each_chart_has_the_density_that_its_pixels_ask_for():
     np.testing.assert_allclose(np.sqrt(0.5 / texels), side, rtol=0.06)
     assert uv.min() >= 0
     assert uv.max() <= 1
+
+
+def _two_squares() -> Scene:
+    return world_of([
+        quad((0, 0, 0), (1, 0, 0), (0, 1, 0)), quad((0, 0, 1), (0, 1, 0), (1, 0, 0)),
+    ]).scene  # fmt: skip
+
+
+def _whole(scene: Scene, uv: np.ndarray, resolution: np.ndarray) -> None:
+    """Every triangle has a place of its own in an atlas."""
+    assert uv.min() >= 0
+    assert uv.max() <= 1
+    pixel = (uv * resolution[scene.face_object][:, None]).astype(np.float64)
+    a, b = pixel[:, 1] - pixel[:, 0], pixel[:, 2] - pixel[:, 0]
+    assert (np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1).all()
+
+
+@pytest.mark.fault("G5")
+@pytest.mark.parametrize("end", ["crash", "hang"])
+def test_an_object_that_the_unwrapper_cannot_take_is_packed_triangle_by_triangle(
+    monkeypatch, capsys, end
+):
+    """Alone: the others keep their charts. The child that ends is a real one."""
+    scene = _two_squares()
+    first = scene.objects[0].num_faces
+    run = module.run_child
+
+    def ending(function, arrays, parameters, seconds, label):
+        # The second object lies at z = 1.
+        if not (arrays["points"][arrays["triangles"]][..., 2] == 1).any():
+            return run(function, arrays, parameters, seconds, label)
+        return run(f"{__name__}:{end}", arrays, parameters, 60 if end == "crash" else 1, label)
+
+    monkeypatch.setattr(module, "run_child", ending)
+    uv, resolution = unwrap(scene, TexelSizes.even(scene, 0.1))
+    _whole(scene, uv, resolution)
+    expected, size = pack_triangles_singly(scene.points[scene.triangles[first:]], 0.1)
+    np.testing.assert_array_equal(uv[first:], expected)
+    assert tuple(resolution[1]) == size
+    monkeypatch.setattr(module, "run_child", run)
+    alone = unwrap(scene, TexelSizes.even(scene, 0.1))
+    np.testing.assert_array_equal(uv[:first], alone[0][:first])
+    said = capsys.readouterr().err
+    assert said.count("warning: ") == 1
+    assert re.search(r"packed one by one.*(SIGSEGV|within 1 s).*\[texturing\.unwrap\]\n$", said)
+
+
+def crash(arrays, parameters):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hang(arrays, parameters):
+    time.sleep(600)
+
+
+@pytest.mark.fault("G5")
+def test_an_atlas_too_large_after_that_is_refused(monkeypatch, capsys):
+    scene = _two_squares()
+    monkeypatch.setattr(module, "MAX_SIDE", 25)
+
+    def crashing(*_):
+        raise CrashedChild("unwrapping crashed (SIGSEGV). Repair the input. [child.crashed]")
+
+    monkeypatch.setattr(module, "run_child", crashing)
+    with pytest.raises(InputRefused, match=r"\[texturing\.size\]$"):
+        unwrap(scene, TexelSizes.even(scene, 0.05))
+
+
+@pytest.mark.fault("G6")
+@pytest.mark.parametrize("fault", ["nan", "outside", "empty atlas", "another number of faces"])
+def test_coordinates_that_are_none_are_made_again(monkeypatch, fault):
+    """xatlas has been seen to return NaN, and success, for a sphere of 1e-12 across."""
+
+    class Atlas:
+        width = 0 if fault == "empty atlas" else 64
+        height = 64
+
+        def add_mesh(self, points, triangles):
+            self.triangles = triangles
+
+        def generate(self, *_):
+            pass
+
+        def __getitem__(self, _):
+            uv = np.full((int(self.triangles.max()) + 1, 2), 0.5, np.float32)
+            uv[0] = {"nan": np.nan, "outside": 1.5}.get(fault, 0.5)
+            faces = self.triangles[1:] if fault.startswith("another") else self.triangles
+            return None, faces, uv
+
+    fake = SimpleNamespace(Atlas=Atlas, PackOptions=SimpleNamespace, ChartOptions=SimpleNamespace)
+    monkeypatch.setitem(sys.modules, "xatlas", fake)
+    scene = _two_squares()
+    first = np.array([obj.first_face for obj in scene.objects], np.int64)
+    count = np.array([obj.num_faces for obj in scene.objects], np.int64)
+    found = module.unwrap_objects(
+        {
+            "points": scene.points, "triangles": scene.triangles, "first": first, "count": count,
+            **TexelSizes.even(scene, 0.1)._asdict(),
+        },
+        {},
+    )  # fmt: skip
+    _whole(scene, found["corner_uv"], found["resolution"])

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +99,7 @@ def test_crash_is_a_refused_input(child, name):
         child("die", signal=name)
 
 
+@pytest.mark.fault("R4")
 def test_kill_from_outside_is_the_environment(child):
     with pytest.raises(EnvironmentFailure, match=r"out of memory.+\[child\.killed\]"):
         child("die", signal="SIGKILL")
@@ -206,6 +209,7 @@ def test_bug_in_a_child_is_a_bug(child, name, what):
     assert "Traceback" in str(caught.value.__cause__)
 
 
+@pytest.mark.fault("R4")
 def test_memory_limit(child):
     with pytest.raises(EnvironmentFailure, match=r"out of memory"):
         child("hungry", memory_limit_bytes=8 << 30)
@@ -235,6 +239,35 @@ def test_a_child_imports_nothing_but_what_its_function_needs():
     assert said.stdout == "[]\n"
 
 
+@pytest.mark.fault("S7")
 def test_pickled_arrays_do_not_leave(child):
     with pytest.raises(ValueError, match="Object arrays"):
         child("double", {"x": np.array([object()])}, factor=1)
+
+
+@pytest.mark.fault("R14")
+def test_children_of_a_threaded_program_are_not_forked_from_it(child, monkeypatch):
+    """A fork copies locks that other threads hold and leaves nobody to open them."""
+
+    def forking(*_):
+        raise AssertionError("forked")
+
+    monkeypatch.setattr(os, "fork", forking)
+    done, lock = threading.Event(), threading.Lock()
+
+    def busy():
+        while not done.is_set():
+            with lock:
+                sum(range(1000))
+
+    threads = [threading.Thread(target=busy) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda i: child("double", {"x": np.ones(2)}, factor=i), range(6)))
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+    assert [each["x"].tolist() for each in found] == [[i, i] for i in range(6)]

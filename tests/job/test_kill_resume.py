@@ -27,6 +27,7 @@ def undisturbed(tmp_path_factory, toy, hashes):
     return hashes(asset)
 
 
+@pytest.mark.fault("R2")
 @pytest.mark.parametrize("fault", FAULTS + RENAMES)
 def test_killed_run_resumes_to_the_same_bytes(
     tmp_path, toy, toy_process, hashes, undisturbed, fault
@@ -121,6 +122,7 @@ def test_work_for_other_parameters_is_swept_even_where_nothing_runs(tmp_path, to
     assert not list((asset / ".usdbrdf/work").iterdir())
 
 
+@pytest.mark.fault("R1")
 @pytest.mark.parametrize(
     "fault", ["before_write:4", "checkpoint:2", "before_publish", "mid_publish:2", "before_stamp"]
 )

@@ -44,6 +44,7 @@ def holder(tmp_path):
         process.kill()
 
 
+@pytest.mark.fault("R6")
 def test_second_run_is_refused_at_once_and_told_who_holds_it(tmp_path, holder):
     started = time.monotonic()
     with (
@@ -54,6 +55,7 @@ def test_second_run_is_refused_at_once_and_told_who_holds_it(tmp_path, holder):
     assert time.monotonic() - started < 1
 
 
+@pytest.mark.fault("R6")
 def test_lock_of_a_killed_run_is_free(tmp_path, holder):
     holder.kill()
     holder.wait()
@@ -138,6 +140,7 @@ def test_a_forked_child_has_no_part_in_the_lock(tmp_path):
         assert locked_by_another_process(tmp_path)
 
 
+@pytest.mark.fault("R6")
 @pytest.mark.parametrize("error", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
 def test_without_locks_a_run_refuses_unless_told_otherwise(tmp_path, monkeypatch, error):
     def no_locks(*_arguments):

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -48,6 +52,7 @@ def test_folder_of_a_run_killed_before_its_record_is_ours_and_is_swept(tmp_path)
     assert not [name for name in names_in(tmp_path) if TEMPORARY_PREFIX in name]
 
 
+@pytest.mark.fault("C13")
 def test_damaged_record_is_written_again_and_a_newer_one_refused(tmp_path):
     state = own(tmp_path / "room")
     (state / "job.json").write_text("{")
@@ -58,6 +63,7 @@ def test_damaged_record_is_written_again_and_a_newer_one_refused(tmp_path):
         own(tmp_path / "room")
 
 
+@pytest.mark.fault("R5")
 def test_output_that_is_a_file_or_below_one(tmp_path):
     (tmp_path / "file").write_text("x")
     for output in (tmp_path / "file", tmp_path / "file/room"):
@@ -66,6 +72,7 @@ def test_output_that_is_a_file_or_below_one(tmp_path):
     assert names_in(tmp_path) == ["file"]
 
 
+@pytest.mark.fault("R5")
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
 def test_unwritable_parent(tmp_path):
     tmp_path.chmod(0o500)
@@ -74,6 +81,43 @@ def test_unwritable_parent(tmp_path):
             own(tmp_path / "room")
     finally:
         tmp_path.chmod(0o700)
+
+
+@pytest.mark.fault("R5")
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_an_unwritable_parent_of_another_user():
+    """What the test above cannot see as root. All is imported before the change: the interpreter
+    may be out of reach after it."""
+    code = """
+import os, sys
+from pathlib import Path
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.job.ownership import owned_folder
+os.setgid(65534); os.setuid(65534)
+for name in ("room", "above/room"):
+    try:
+        with owned_folder(Path(sys.argv[1]) / name):
+            pass
+    except EnvironmentFailure as error:
+        print(error)
+"""
+    folder = Path(tempfile.mkdtemp(prefix="usdbrdf-test-"))
+    try:
+        folder.chmod(0o755)
+        search = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(folder)],
+            env={**os.environ, "PYTHONPATH": search},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        said = done.stdout.splitlines()
+        assert len(said) == 2
+        assert all(re.search(r"not writable.+\[environment\.output\]$", line) for line in said)
+        assert names_in(folder) == []
+    finally:
+        shutil.rmtree(folder)
 
 
 def test_unwritable_parent_as_the_system_reports_it(tmp_path, monkeypatch):

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from usdbrdf.job import progress as module
@@ -34,6 +39,7 @@ def test_bar_on_a_terminal(capsys, monkeypatch):
     assert captured.out == ""
 
 
+@pytest.mark.fault("S4")
 def test_names_cannot_command_the_terminal(capsys):
     say("chair \x1b[2J\u202e椅子")
     assert capsys.readouterr().err == "chair \\x1b[2J\\u202e椅子\n"
@@ -44,3 +50,23 @@ def test_quiet(capsys):
     say("hello")
     assert list(progress(range(2), total=2, label="texture", unit="frames")) == [0, 1]
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.fault("R16")
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path):
+    """Or what a library prints would stand in it."""
+    code = """
+import os, sys
+from usdbrdf.job.progress import fill_closed_streams
+fill_closed_streams()
+file = os.open(sys.argv[1], os.O_CREAT | os.O_RDWR)
+for number in range(3):
+    os.write(number, b"printed by a library")
+os.write(file, str(file).encode())
+"""
+    search = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+    call = ["/bin/sh", "-c", '"$0" -c "$1" "$2" <&- >&- 2>&-', sys.executable, code]
+    subprocess.run(
+        [*call, str(tmp_path / "file")], env={**os.environ, "PYTHONPATH": search}, check=True
+    )
+    assert int((tmp_path / "file").read_text()) > 2

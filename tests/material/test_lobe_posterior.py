@@ -64,6 +64,7 @@ def test_costs_that_do_not_differ_say_that_nothing_is_known():
     assert found.psi_error == pytest.approx(NOTHING_KNOWN)
 
 
+@pytest.mark.fault("L6")
 @pytest.mark.parametrize("without", [0.0, 20.0])
 def test_a_lobe_that_explains_nothing_has_no_evidence(without: float):
     terms, _ = _normal(0.3, 0.5, 0.1, 0.1, 50)

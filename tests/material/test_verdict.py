@@ -51,6 +51,7 @@ def test_each_parameter_is_judged_by_its_own_error(share: float):
     assert found.status == ("measured" if share < 1 else "prior")
 
 
+@pytest.mark.fault("L3")
 @pytest.mark.parametrize("evidence", [0.0, 0.9 * SOME_EVIDENCE, SOME_EVIDENCE, 0.9 * MIN_EVIDENCE])
 def test_without_a_highlight_what_remains_likely_is_published(evidence: float):
     found = verdict_on_views(_lobe(evidence=evidence, psi_median=0.05, psi_upper=0.2), True)
@@ -90,6 +91,7 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
         assert found.phi_confidence == confidence
 
 
+@pytest.mark.fault("L2")
 def test_what_no_frame_sees_is_unseen():
     found = verdict_on_views(None, False)
     assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.5, 1.0, "unseen")
@@ -99,6 +101,7 @@ def test_what_no_frame_sees_is_unseen():
     assert verdict_on_views(None, True).status == "prior"
 
 
+@pytest.mark.fault("L3")
 @pytest.mark.parametrize("keep", [True, False])
 def test_one_frame_measures_where_it_tells_roughnesses_apart(keep: bool):
     found = verdict_on_frame((0.1, 0.02), 0.8, 0.5, True, keep)

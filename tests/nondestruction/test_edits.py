@@ -130,6 +130,7 @@ def broken(edited, base):
         shutil.rmtree(folder)
 
 
+@pytest.mark.fault("R9")
 @pytest.mark.parametrize(("kind", "run"), RUNS)
 def test_edits_that_cannot_be_read_change_nothing_of_what_is_measured(
     capture, run_again, broken, capsys, kind, run

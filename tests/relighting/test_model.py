@@ -98,6 +98,7 @@ def test_normals_of_the_file_are_taken_and_others_made(tmp_path: Path) -> None:
     assert made.corner_normals == pytest.approx(np.tile([0, 0, 1], (1, 3, 1)))
 
 
+@pytest.mark.fault("S1")
 def test_what_a_model_names_stays_beside_it(tmp_path: Path) -> None:
     folder = tmp_path / "model"
     folder.mkdir()

@@ -184,6 +184,7 @@ def test_auto_is_the_filter_where_it_is_installed():
     ]
 
 
+@pytest.mark.fault("R15")
 def test_without_the_package_auto_is_none_and_oidn_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     assert [chosen_filter(wanted) for wanted in ("auto", "none")] == ["none", "none"]

@@ -61,6 +61,7 @@ def test_a_capture_that_shows_little_of_the_mesh_is_warned_about():
     assert not [*_texture_of(CoverageMap.of(~some, some)).doubts()]
 
 
+@pytest.mark.fault("R13")
 def test_passes_for_lack_of_memory_change_no_byte(tmp_path, monkeypatch, capsys):
     made = make_capture(tmp_path / "scan", frames=9, subdivisions=1)
     once, thrice = tmp_path / "once", tmp_path / "thrice"
@@ -97,6 +98,7 @@ class _Picture:
         return values.reshape(2, 4, 3)
 
 
+@pytest.mark.fault("I14")
 @pytest.mark.parametrize(("unit", "stored"), [(1.0, "half"), (1e5, "float"), (1e-7, "float")])
 def test_maps_keep_their_digits_whatever_the_unit(tmp_path, unit, stored):
     values = np.float32(unit) * np.random.default_rng(3).lognormal(-2, 1, (8, 3)).astype(np.float32)
@@ -123,6 +125,7 @@ def test_a_capture_near_the_end_of_half_floats_keeps_its_lit_map(tmp_path, capsy
     assert "[image.clamped]" not in capsys.readouterr().err
 
 
+@pytest.mark.fault("C8")
 @pytest.mark.parametrize("wrong", [[7], range(1, 12, 2)], ids=["one frame", "every second frame"])
 def test_exposures_that_contradict_each_other_are_noticed(tmp_path, capsys, wrong):
     made = make_capture(tmp_path / "scan", noise=0.02, noise_floor_radiance=0)

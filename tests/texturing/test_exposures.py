@@ -58,6 +58,7 @@ def test_good_frames_raise_no_alarm(seed, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.fault("C8")
 @pytest.mark.parametrize("factor", [4.0, 1.6, 0.5])
 def test_a_few_wrong_exposures_are_named_with_their_gains(factor, capsys):
     wrong = {5: factor, 6: factor, 31: factor}
@@ -71,6 +72,7 @@ def test_a_few_wrong_exposures_are_named_with_their_gains(factor, capsys):
     assert printed.endswith("[texturing.exposure]\n")
 
 
+@pytest.mark.fault("C8")
 @pytest.mark.parametrize(
     "wrong", [range(1, FRAMES, 2), range(FRAMES // 2), range(0, FRAMES, 3)], ids=str
 )

@@ -144,6 +144,7 @@ def test_texels_in_groups_get_what_they_get_together(room: Room):
             np.testing.assert_array_equal(own.arrays()[name], expected)
 
 
+@pytest.mark.fault("R13")
 def test_the_number_of_threads_changes_no_bit(room: Room):
     many = _empty(room.world)
     _observe(room.world, room.frames, many)

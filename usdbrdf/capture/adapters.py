@@ -174,11 +174,16 @@ def _loaded(point: EntryPoint) -> Adapter:
 
 def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     """What a chosen adapter makes of a capture."""
+    from usdbrdf.model.capture import Scan
+
     assert adapter.module is not None
     for named in (path, options.mesh, options.objects):
         refuse_nameless(named)
     try:
-        return adapter.module.read(path, options)
+        scan = adapter.module.read(path, options)
+        if not isinstance(scan, Scan):
+            raise TypeError(f"it returned a {type(scan).__name__} in the place of a Scan")
+        return scan
     except UsdBrdfError:
         raise
     except Exception as error:

@@ -16,11 +16,12 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.geometry.sides import Sides
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
 
 
@@ -80,6 +81,7 @@ _CURES = {
     "capture.saturated": "Add shorter exposures, or correct saturation_radiance.",
     "capture.black": "Remove the black frames, or correct noise_floor_radiance.",
     "capture.duplicate": "Remove the repeated frames.",
+    "capture.inside": "Check that mesh and poses share frame and unit, and the axes of the poses.",
 }
 
 
@@ -161,6 +163,7 @@ LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
 _MIN_HIT_SHARE = 0.2
+_MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -432,10 +435,38 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
     )
 
 
+def drop_cameras_inside(
+    frames: Frames, mesh: ScanMesh, sides: Sides, names: Sequence[str], findings: Findings
+) -> list[int]:
+    """Indices of the frames that show surfaces from the side from which others show them; those
+    that look at their backs from inside are noted in ``findings`` by their ``names``."""
+    scene = RayScene(mesh.points, mesh.triangles)
+    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
+    # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
+    alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]
+    usable: list[int] = []
+    for i in range(len(frames)):
+        origins, towards = frames.camera(i).rays(_probes() * frames.resolution[i])
+        face = scene.closest(origins, towards).face
+        back = (towards * normals[face]).sum(axis=1) > 0
+        behind = float(((face >= 0) & alone[face, back.astype(np.int64)]).mean())
+        if behind > _MAX_BEHIND:
+            said = f"{behind:.0%} of its rays hit surfaces from behind, as others see them"
+            findings.drop(names[i], f"{said} (limit {_MAX_BEHIND:.0%})", "capture.inside")
+        else:
+            usable.append(i)
+    return usable
+
+
+def _probes() -> Double:
+    """(P, 2) places in an image, in parts of its sides, at which it is probed with rays."""
+    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
     count = min(len(frames), _PROBED_FRAMES)
-    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    grid = _probes()
     hits = 0
     for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
         camera = frames.camera(i)

@@ -14,6 +14,7 @@ from usdbrdf.capture.checks import (
     FrameRecord,
     at_image_size,
     check_frames,
+    drop_cameras_inside,
     frames_from_records,
     refuse_rays_that_miss,
     refuse_without_parallax,
@@ -281,10 +282,14 @@ def scan_from_parts(
     )
     kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
     findings.refuse_too_few_frames(source, total, views=len(kept))
-    findings.warn_of_dropped_frames(source, total)
     findings.count("rays_hit_percent", round(100 * hit_share))
-    frames = frames_at(frames, kept)
-    sides = _sides(geometry, frames, findings)
+    # From here on the faces of a photograph count one by one.
+    total += len(kept) - len(usable)
+    frames, used = frames_at(frames, kept), [rigid[photograph_of[i]].name for i in kept]
+    sides, outside = _sides(geometry, frames, used, findings)
+    frames, kept = frames_at(frames, outside), [kept[i] for i in outside]
+    findings.refuse_too_few_frames(source, total)
+    findings.warn_of_dropped_frames(source, total)
     return Scan(
         name=name,
         adapter=adapter,
@@ -305,11 +310,20 @@ def scan_from_parts(
     )
 
 
-def _sides(geometry: ScanGeometry, frames: Frames, findings: Findings) -> Sides:
-    """Which faces have to be turned towards the cameras, and which show both sides."""
-    numbers = progress(range(len(frames)), total=len(frames), label="sides", unit="frames")
-    cameras = (frames.camera(i) for i in numbers)
-    sides = sides_from_cameras(geometry.mesh, cameras)
+def _sides(
+    geometry: ScanGeometry, frames: Frames, names: Sequence[str], findings: Findings
+) -> tuple[Sides, list[int]]:
+    """Which faces have to be turned towards the cameras, and which show both sides; and the numbers
+    of the frames that were not taken inside of something."""
+
+    def seen(frames: Frames) -> Sides:
+        numbers = progress(range(len(frames)), total=len(frames), label="sides", unit="frames")
+        return sides_from_cameras(geometry.mesh, (frames.camera(i) for i in numbers))
+
+    sides = seen(frames)
+    outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
+    if 0 < len(outside) < len(frames):
+        sides = seen(frames_at(frames, outside))
     turned, both = int(sides.turned.sum()), int(sides.both.sum())
     findings.count("faces_turned", turned)
     findings.count("faces_of_two_sides", both)
@@ -320,8 +334,8 @@ def _sides(geometry: ScanGeometry, frames: Frames, findings: Findings) -> Sides:
         )
     if both and geometry.usd_geometry is not None:
         # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
-        return Sides(turned=sides.turned, both=np.zeros_like(sides.both))
-    return sides
+        sides = replace(sides, both=np.zeros_like(sides.both))
+    return sides, outside
 
 
 def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:

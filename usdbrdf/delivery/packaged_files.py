@@ -210,7 +210,7 @@ def file_in_asset(path: str, asset: Asset) -> Path:
             "name that copy in edits.usda. [package.outside]"
         )
     place = Path(os.path.realpath(asset.folder / path))
-    if "<UDIM>" in path:
+    if "<UDIM>" in place.name:
         raise InputRefused(f"{path}: tiled (UDIM) textures are not packaged. [package.udim]")
     if not place.is_relative_to(os.path.realpath(asset.folder)):
         raise InputRefused(

@@ -26,6 +26,7 @@ from usdbrdf.model.arrays import Byte, Float
 MAX_SIDE = 65_536  # pixels
 MAX_PIXELS = 1 << 28
 MAX_CHANNELS = 64
+_MAX_PARTS = 64  # of one file, which are searched for R, G and B
 MAX_DECLARED_BYTES = 4 << 30
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
 # A display window may be larger than what the file holds; beyond this many bytes not by any factor.
@@ -167,7 +168,8 @@ def write_preview_png(path: Path, rgb8: Byte) -> None:
 
 
 def _open(path: Path, max_side: int) -> Any:
-    """An OpenImageIO reader on the first image of a regular file whose header is within limits."""
+    """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
+    part that has R, G and B, or the first if none has."""
     if path.suffix.lower() in _RAW_SUFFIXES:
         raise ImageRefused(
             f"{path}: camera raw files are not read (only their preview would be). Develop it "
@@ -193,6 +195,7 @@ def _open(path: Path, max_side: int) -> Any:
         source = oiio.ImageInput.open(str(path), hint)
         if source is None:
             raise _Undecoded
+        _seek_colour(source)
     spec = source.spec()
     if source.format_name() not in _FORMATS or spec.deep or spec.full_depth > 1 or spec.depth > 1:
         raise ImageRefused(
@@ -201,6 +204,18 @@ def _open(path: Path, max_side: int) -> Any:
         )
     _check_limits(path, spec, status.st_size, max_side)
     return source
+
+
+def _seek_colour(source: Any) -> None:
+    for part in range(_MAX_PARTS):
+        if part and not source.seek_subimage(part, 0):
+            break
+        if {"r", "g", "b"} <= {name.lower() for name in source.spec().channelnames}:
+            return
+    if part:
+        source.geterror()  # that there is no such part
+        if not source.seek_subimage(0, 0):
+            raise _Undecoded
 
 
 class _Undecoded(Exception):
@@ -277,7 +292,8 @@ def _pixels(path: Path, source: Any) -> Float:
     with _decoding(
         path, source, "truncated or damaged", "image.truncated", making=4 * math.prod(shape)
     ):
-        pixels = source.read_image(0, 0, 0, spec.nchannels, "float")
+        part = source.current_subimage()
+        pixels = source.read_image(part, 0, 0, spec.nchannels, "float")
         if pixels is None or source.has_error or pixels.shape != shape:
             raise _Undecoded
     return np.asarray(pixels, dtype=np.float32)

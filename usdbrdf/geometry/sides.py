@@ -55,10 +55,14 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Sides:
-    """turned, both (F,) bool: the winding shows the wrong side; frames see either side."""
+    """turned, both (F,) bool: the winding shows the wrong side; frames see either side.
+
+    frames  (F, 2) int32: how many of them see the front, which the winding tells, and the back
+    """
 
     turned: Bool
     both: Bool
+    frames: Int
 
 
 def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
@@ -77,7 +81,7 @@ def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
         facing = np.where(
             lost, _looking_around(mesh, rays, normals, lost, shown, part, agrees), facing
         )
-    return Sides(turned=facing < 0, both=seen.both)
+    return Sides(turned=facing < 0, both=seen.both, frames=seen.frames)
 
 
 def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sightings:

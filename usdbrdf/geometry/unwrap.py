@@ -12,9 +12,9 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import CrashedChild, InputRefused, LateChild
 from usdbrdf.job.child import run_child
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Double, Float, Int
 from usdbrdf.model.mesh import compact, doubled_areas
@@ -24,6 +24,8 @@ from usdbrdf.model.scene import Scene, SceneObject
 # new ones, with two mip levels.
 _GAP, PADDING = 2, 4
 MAX_SIDE = 16384
+# What charts may take: at least, and for each triangle.
+_SECONDS, _SECONDS_OF_FACE = 120.0, 2e-3
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -156,7 +158,8 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """UVs of every object in its own atlas: corner_uv (F, 3, 2) in [0, 1], v up, and the atlas
     size in texels of each object, (num_objects, 2) int32 width, height.
 
-    Raises InputRefused when an atlas would be larger than 16,384 texels on a side.
+    An object on which xatlas crashes or hangs has its triangles packed one by one. Raises
+    InputRefused when an atlas would be larger than 16,384 texels on a side.
     """
 
     def too_large(obj: SceneObject, said: str) -> InputRefused:
@@ -174,23 +177,47 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
             raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
-    result = run_child(
-        "usdbrdf.geometry.unwrap:unwrap_objects",
-        {
-            "points": scene.points,
-            "triangles": scene.triangles,
-            "first": first,
-            "count": count,
-            **sizes._asdict(),
-        },
-        {},
-        timeout_s=120 + 2e-3 * len(scene.triangles),
-        label="unwrapping the objects",
-    )
+    given = {"points": scene.points, "triangles": scene.triangles, **sizes._asdict()}
+    try:
+        result = _in_child({**given, "first": first, "count": count}, "unwrapping the objects")
+    except (CrashedChild, LateChild):
+        result = _one_by_one(scene, sizes)
     for obj, (width, height) in zip(scene.objects, result["resolution"], strict=True):
         if max(width, height) > MAX_SIDE:
             raise too_large(obj, f"texture would be {width} x {height}")
     return result["corner_uv"], result["resolution"]
+
+
+def _in_child(arrays: Mapping[str, Array], label: str) -> dict[str, Array]:
+    """``unwrap_objects``, where it may crash or hang as xatlas does on some meshes."""
+    faces = int(arrays["count"].sum())
+    seconds = _SECONDS + _SECONDS_OF_FACE * faces
+    return run_child(f"{__name__}:unwrap_objects", arrays, {}, seconds, label)
+
+
+def _one_by_one(scene: Scene, sizes: TexelSizes) -> dict[str, Array]:
+    """The same with a child for each object; one that still crashes or hangs has each of its
+    triangles packed by itself, and the user hears of it."""
+    corner_uv = np.zeros((len(scene.triangles), 3, 2), np.float32)
+    resolution = np.zeros((len(scene.objects), 2), np.int32)
+    for i, obj in enumerate(scene.objects):
+        points, triangles = compact(scene.points, scene.triangles[obj.faces])[1:]
+        own = TexelSizes(sizes.side[obj.faces], sizes.pixels[obj.faces])
+        arrays = {"points": points, "triangles": triangles, **own._asdict()}
+        arrays |= {"first": np.zeros(1, np.int64), "count": np.array([obj.num_faces])}
+        try:
+            found = _in_child(arrays, f"unwrapping <{obj.prim_path}>")
+            corner_uv[obj.faces], resolution[i] = found["corner_uv"], found["resolution"][0]
+        except (CrashedChild, LateChild) as error:
+            warn(
+                f"<{obj.prim_path}>: its {obj.num_faces} triangles are packed one by one, which "
+                f"wastes texels: {str(error).rpartition('. ')[0]}. Clean that part of the mesh. "
+                "[texturing.unwrap]"
+            )
+            corner_uv[obj.faces], resolution[i] = pack_triangles_singly(
+                scene.points[scene.triangles[obj.faces]], float(own.side.min())
+            )
+    return {"corner_uv": corner_uv, "resolution": resolution}
 
 
 def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf import errors
-from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.errors import CrashedChild, EnvironmentFailure, LateChild, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
@@ -102,9 +102,9 @@ def run_child(
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
 
-    A UsdBrdfError raised there is raised here with its class. Death by a signal is an
-    InputRefused; running out of time or memory, SIGKILL and what cannot be imported there are
-    EnvironmentFailures.
+    A UsdBrdfError raised there is raised here with its class. Death by a signal is a CrashedChild,
+    an InputRefused; running out of time a LateChild, an EnvironmentFailure as running out of
+    memory, SIGKILL and what cannot be imported there are.
     """
     with scratch_folder() as folder:
         with environment_failures(label):
@@ -148,7 +148,7 @@ def _run(folder: Path, timeout_s: float, label: str) -> int:
     try:
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:
-        raise EnvironmentFailure(
+        raise LateChild(
             f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
             "again when the machine is less busy, or simplify the input. [child.timeout]"
         ) from error
@@ -173,7 +173,7 @@ def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
             "and the limits of this shell (ulimit -a). [child.start]"
         )
     how = signal.Signals(-status).name
-    return InputRefused(f"{label} crashed ({how}).{said} Repair the input. [child.crashed]")
+    return CrashedChild(f"{label} crashed ({how}).{said} Repair the input. [child.crashed]")
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, NoLocks, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, sha256_of
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.paths import inside
@@ -89,7 +89,7 @@ def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
         if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
             raise
         if not without_lock:
-            raise FolderBusy(
+            raise NoLocks(
                 f"{path.parent.parent}: this file system has no working locks ({error.strerror}), "
                 "so two runs could write here at once. See that nothing else does and run with "
                 "--without-lock, or name a folder on another disk. [lock.none]"
@@ -124,9 +124,15 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
         with environment_failures(str(asset)):
             while True:
                 state = _accepted(asset, made)
-                with suppress(FileNotFoundError):  # a run that failed took its folder away
+                try:
                     held.enter_context(folder_lock(state, wait_s, without_lock=without_lock))
                     break
+                except FileNotFoundError:
+                    continue  # a run that failed took its folder away
+                except NoLocks:
+                    if state in made:
+                        _remove_empty(state, made)
+                    raise
             held.enter_context(_removed_if_unused(asset, made))
             record = state / "job.json"
             try:
@@ -206,9 +212,15 @@ def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
             if state in made and [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]:
                 shutil.rmtree(state / "stamps", ignore_errors=True)
                 shutil.rmtree(state / "work", ignore_errors=True)
-                # The lock goes last: from then on another run may be in here.
-                for file in sorted(state.iterdir(), key=lambda file: file.name == "lock"):
-                    file.unlink()
-                for folder in made:
-                    folder.rmdir()
+                _remove_empty(state, made)
         raise
+
+
+def _remove_empty(state: Path, made: Sequence[Path]) -> None:
+    """Remove the files of the state folder and the folders ``made``, as far as they are empty."""
+    with suppress(OSError):
+        # The lock goes last: from then on another run may be in here.
+        for file in sorted(state.iterdir(), key=lambda file: file.name == "lock"):
+            file.unlink()
+        for folder in made:
+            folder.rmdir()

@@ -20,6 +20,16 @@ _SECONDS_BETWEEN_LINES = 30.0
 _quiet = False
 
 
+def fill_closed_streams() -> None:
+    """Standard streams that are closed lead nowhere, before a file of ours takes their number and
+    gets what some library prints."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+
+
 def set_quiet(quiet: bool) -> None:
     """Silence ``progress`` and ``say`` (the command line's -q)."""
     global _quiet
@@ -52,6 +62,10 @@ def tell(line: str) -> None:
 def show(text: str, *, whole: bool = False) -> None:
     """Lines to stdout. EnvironmentFailure where they cannot be written. A reader who goes away has
     seen enough, unless it is a program that needs the ``whole``: then UsdBrdfError."""
+    if sys.stdout is None:  # closed from the start
+        if whole:
+            raise EnvironmentFailure("stdout is closed. [environment.output]")
+        return
     try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

@@ -205,9 +205,9 @@ def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
     return np.concatenate([texels.from_image(i, picture) for i, picture in enumerate(filtered)])
 
 
-# Shares that are worth a warning: of the known texels with an albedo over 1, of light's directions
-# that leave the scan.
-_MANY_OVER_ONE, _MOSTLY_OPEN = 0.05, 0.5
+# What is worth a warning: shares of the known texels with an albedo over 1, and of light's
+# directions that leave the scan; the relative standard error of S.
+_MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY = 0.05, 0.5, 0.2
 
 
 @dataclass(frozen=True)
@@ -275,6 +275,13 @@ class Shaded:
                     f"radiance is {radiance}, +-{100 * self.radiance_error(i):.0f} %. Capture a "
                     "shorter exposure to measure it. [shading.estimated]"
                 )
+        error = float(np.median(self.relative_error))
+        if error > _NOISY:
+            yield (
+                f"half of the texels have an irradiance with a relative standard error of "
+                f"{100 * error:.0f} % or more. Allow more --rays, or ask for a smaller "
+                "--standard-error. [shading.noise]"
+            )
         if self.over_one > _MANY_OVER_ONE:
             yield (
                 f"{100 * self.over_one:.0f} % of the seen texels have an albedo over 1 and were "

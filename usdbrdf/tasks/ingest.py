@@ -19,11 +19,10 @@ from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.develop import developed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
-from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
-from usdbrdf.tasks.task import Task
+from usdbrdf.tasks.task import Task, warned
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
@@ -57,8 +56,7 @@ def ingest(
 
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
-        for warning in scan.warnings:
-            warn(warning)
+        warnings = warned(scan.warnings)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         # Photographs through lenses become frames last, when nothing else can be refused.
@@ -77,7 +75,7 @@ def ingest(
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
-            "warnings": list(scan.warnings),
+            "warnings": warnings,
         }
 
     return task.run(work)

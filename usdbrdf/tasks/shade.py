@@ -18,13 +18,12 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
-from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface
 from usdbrdf.tasks.outside import outside_of, write_outside
-from usdbrdf.tasks.task import Task
+from usdbrdf.tasks.task import Task, warned
 from usdbrdf.transport.denoise import chosen_filter
 
 
@@ -76,9 +75,9 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
-        for doubt in shaded.doubts(identifiers := [item.identifier for item in objects]):
-            warn(doubt)
-        summary = {**shaded.summary(identifiers), "denoise": lightmap_filter}
+        doubts = warned(shaded.doubts(identifiers := [item.identifier for item in objects]))
+        found = {"denoise": lightmap_filter, "warnings": doubts}
+        summary = shaded.summary(identifiers) | found
         return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work)

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import code_version
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
+
+
+def warned(doubts: Iterable[str]) -> list[str]:
+    """The sentences, which the user has then been told; as "warnings" of its summary they stay with
+    what the task made, for --strict."""
+    sentences = list(doubts)
+    for sentence in sentences:
+        warn(sentence)
+    return sentences
 
 
 @dataclass(frozen=True, kw_only=True)

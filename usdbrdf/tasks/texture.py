@@ -16,10 +16,10 @@ from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
-from usdbrdf.job.progress import progress, say, warn
+from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
-from usdbrdf.tasks.task import Task
+from usdbrdf.tasks.task import Task, warned
 from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
 from usdbrdf.texturing.passes import most_texels
@@ -54,8 +54,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
         side = 1000 * float(np.median(sides))
         say(f"texture: {len(surface.texels):,} texels of {side:.3g} mm, {len(frames)} frames")
         found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
-        for doubt in found.doubts():
-            warn(doubt)
+        doubts = warned(found.doubts())
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, sides, options.quantile)
         write_texturing_layer(
@@ -74,6 +73,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
             "clipped_fraction": float(found.coverage.clipped.mean()),
             "unseen_objects": [item.identifier for item in objects if not item.seen],
             "contradicting_frames": found.contradicting,
+            "warnings": doubts + found.contradictions(),
         }
 
     return task.run(work)

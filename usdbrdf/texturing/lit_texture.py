@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -55,6 +56,13 @@ class LitTexture:
                 "[texturing.unseen]"
             )
 
+    def contradictions(self) -> list[str]:
+        """A sentence on each contradicting frame; the user has been told of all at once."""
+        return [
+            f"{name}: {gain} times as bright as the other frames show it. [texturing.exposure]"
+            for name, gain in self.contradicting.items()
+        ]
+
 
 def lit_texture_from_frames(
     run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
@@ -93,9 +101,11 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
     measured = found.count > 0
     clipped = ~measured & (found.clipped > 0)
     if not (measured | clipped).any():
+        side = math.sqrt(float(np.median(texels.area)))
         raise InputRefused(
-            "no frame sees any surface well enough: too few pixels show it, or only at grazing "
-            "angles. Check the poses and the size of the images. [texturing.unseen]"
+            f"no frame sees any surface well enough with texels of {side:.3g} m: too few pixels "
+            "show them, or only at grazing angles. Check that the objects are larger than the "
+            "--texel-size, the poses, and the size of the images. [texturing.unseen]"
         )
     owner = texels.object_index()
     has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0

@@ -147,6 +147,7 @@ def _without_inverse(text):
     return json.dumps(document)
 
 
+@pytest.mark.fault("C14")
 @pytest.mark.parametrize(
     ("edit", "words"),
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +135,7 @@ class _Capture:
 
     images     whether images and masks are asked for
     is_legacy  whether it was made before documents stated what had been done to COLMAP's world
+    first_of_camera  of each camera without a stated size the first image, its width and height
     """
 
     source: Path
@@ -142,6 +143,9 @@ class _Capture:
     options: IngestOptions
     images: bool = True
     is_legacy: bool = False
+    first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
+        default_factory=dict
+    )
 
     def refuse(self, text: str, rule: str) -> InputRefused:
         return InputRefused(f"{self.source}: {text} [{rule}]")
@@ -224,7 +228,9 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         except ImageRefused as error:
             findings.drop(name, clause_of(error, path), "capture.image")
             return None
-        why = _why_of_another_size(capture, frame, width, height)
+        why = _why_of_another_size(capture, frame, width, height) or _why_unlike(
+            capture, frame, name, width, height
+        )
         if why:
             findings.drop(name, why, "capture.size")
             return None
@@ -298,6 +304,20 @@ def _why_of_another_size(
     return said and (
         f"the image is {width} x {height} pixels, but its {said}: either the images were scaled or "
         "the intrinsics"
+    )
+
+
+def _why_unlike(
+    capture: _Capture, frame: Mapping[str, Any], name: str, width: int, height: int
+) -> str:
+    """Why an image has not the camera that it shares with the frames before, "" if it may."""
+    camera = tuple(capture.number(frame, key) for key in ("fl_x", "fl_y", "cx", "cy"))
+    first, *size = capture.first_of_camera.setdefault(camera, (name, width, height))
+    if [width, height] == size or camera == (None,) * 4:
+        return ""
+    return (
+        f"the image is {width} x {height} pixels, but {first!r}, which has the same intrinsics and "
+        f"states no w and h either, is {size[0]} x {size[1]}"
     )
 
 

@@ -1,0 +1,63 @@
+"""What a person is told of light that was found badly, or not at all."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from usdbrdf.shading.shaded import Shaded
+
+
+def _shaded(*, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0) -> Shaded:
+    """Of one object that reflects, and as much of the light as the sentences speak of."""
+    nothing = SimpleNamespace()
+    return Shaded(
+        light=nothing,
+        unseen=nothing,
+        traced=SimpleNamespace(escaped=np.full(4, escaped)),
+        relative_error=np.array([0, error, error, 1], np.float32),
+        irradiance=np.ones((4, 3), np.float32),
+        emitters=SimpleNamespace(emissive=np.full(4, emits), lower_bound=np.zeros(1, np.bool_)),
+        albedo=np.ones((4, 3), np.float32),
+        unexplained=np.zeros(4, np.bool_),
+        over_one=over_one,
+        outside=outside,
+    )
+
+
+def test_good_light_leaves_no_doubt():
+    assert list(_shaded(emits=True).doubts(["box"])) == []
+
+
+@pytest.mark.parametrize(
+    ("found", "rule", "word"),
+    [
+        pytest.param({}, "no-light", "dark", marks=pytest.mark.fault("L1")),
+        pytest.param(
+            {"emits": True, "over_one": 0.06}, "albedo", "6 %", marks=pytest.mark.fault("L5")
+        ),
+        pytest.param(
+            {"emits": True, "escaped": 0.6}, "open", "60 %", marks=pytest.mark.fault("G13")
+        ),
+        pytest.param({"emits": True, "error": 0.3}, "noise", "30 %", marks=pytest.mark.fault("L7")),
+    ],
+)
+def test_each_doubt_is_told_and_no_other(found, rule, word):
+    (doubt,) = _shaded(**found).doubts(["box"])
+    assert doubt.endswith(f"[shading.{rule}]")
+    assert word in doubt
+
+
+@pytest.mark.parametrize("found", [{"over_one": 0.05}, {"escaped": 0.5}, {"error": 0.19}], ids=str)
+def test_at_the_limit_there_is_none(found):
+    assert list(_shaded(emits=True, **found).doubts(["box"])) == []
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_an_open_scan_whose_surroundings_are_given_is_no_doubt(estimated):
+    outside = SimpleNamespace(is_estimated=estimated)
+    doubts = list(_shaded(outside=outside, escaped=0.9).doubts(["box"]))
+    assert len(doubts) == estimated
+    assert all("--environment to measure it" in doubt for doubt in doubts)
