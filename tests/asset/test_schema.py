@@ -131,8 +131,13 @@ def test_every_attribute_is_known_and_documented(name):
 
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one; one of its
-    objects is made a metal."""
+    objects is made a metal, and its photographs were taken through a lens."""
     verify()
+    frames = built.scan.frames
+    paths = frames.image_paths
+    frames = replace(frames, photographs=paths, masks=paths, lenses=("fisheye",) * len(frames))
+    built.scan = replace(built.scan, frames=frames)
+    built.write_layer("scan")
     first, *others = built.fitted
     metal = replace(first, kind="conductor", f0=(0.5, 0.25, 0.125), f0_error=0.03125)
     built.fitted = (metal, *others)

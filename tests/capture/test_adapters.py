@@ -57,7 +57,7 @@ def explode(*_):
 
 def test_ours_are_there_even_if_nothing_is_installed(announce):
     announce()
-    assert [a.name for a in list_adapters()] == ["transforms", "scanner-app"]
+    assert [a.name for a in list_adapters()] == ["transforms", "scanner-app", "colmap"]
     assert all(a.module is not None and a.description for a in list_adapters())
 
 
@@ -73,7 +73,8 @@ def test_theirs_is_found_and_used(announce, tmp_path):
     options = IngestOptions()
     assert read_scan(tmp_path / "theirs", options).name == "read by theirs"
     assert read_scan(tmp_path, options, "theirs").name == "read by theirs"
-    assert [a.name for a in list_adapters(plugins=False)] == ["transforms", "scanner-app"]
+    ours = ["transforms", "scanner-app", "colmap"]
+    assert [a.name for a in list_adapters(plugins=False)] == ours
 
 
 @pytest.mark.fault("S6")
@@ -132,12 +133,13 @@ def test_ours_cannot_be_replaced(announce):
 
 
 def test_nothing_recognised_lists_what_would_be(tmp_path):
-    with pytest.raises(InputRefused, match=r"transforms: .*scanner-app: .*\[adapter.none\]"):
+    known = r"transforms: .*scanner-app: .*colmap: .*\[adapter.none\]"
+    with pytest.raises(InputRefused, match=known):
         read_scan(tmp_path, IngestOptions())
     with pytest.raises(InputRefused, match=r"no such file.*\[capture.missing\]"):
         read_scan(tmp_path / "nowhere", IngestOptions())
-    with pytest.raises(UsageError, match=r"'colmap' is not installed. Use one of transforms"):
-        read_scan(tmp_path, IngestOptions(), "colmap")
+    with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of transforms"):
+        read_scan(tmp_path, IngestOptions(), "opensfm")
 
 
 @pytest.mark.parametrize(

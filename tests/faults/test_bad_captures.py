@@ -269,11 +269,15 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         [r"'../\x1b[2J\n'", "outside"],
     ),
     "fisheye": (
-        _manifest(lambda d: d.update(camera_model="OPENCV_FISHEYE")),
+        _manifest(lambda d: d.update(camera_model="VR180_L")),
         "capture.camera",
-        ["OPENCV_FISHEYE", "PINHOLE", "Undistort"],
+        ["VR180_L", "OPENCV_FISHEYE", "Undistort"],
     ),
-    "distortion": (_frame(2, k1=0.01), "capture.camera", ["frames/0002.exr", "k1", "Undistort"]),
+    "distortion": (
+        _frame(2, distortion_params=[0.01, "x"]),
+        "capture.camera",
+        ["frames/0002.exr", "distortion_params", "Correct"],
+    ),
     "no focal length": (
         _manifest(lambda d: [d.pop("fl_x"), d.pop("fl_y")]),
         "capture.camera",

@@ -235,3 +235,41 @@ def test_stamp_has_no_time_and_no_absolute_path(asset):
         "summary",
         "version",
     }
+
+
+def test_outputs_that_take_long_are_made_once(tmp_path):
+    """An interrupted run leaves those that it finished to the next, and none to another task."""
+    asset, made = tmp_path / "room", []
+    (asset / ".usdbrdf").mkdir(parents=True)
+
+    def run(until, seed=0):
+        def write(name, place):
+            made.append(name)
+            place.write_text(f"{name} {seed}")
+
+        def work(run):
+            for name in ("a", "b/c", "d")[:until]:
+                run.output_kept(f"frames/{name}.exr", lambda place, name=name: write(name, place))
+            if until < 3:
+                raise InputRefused("killed")
+            return {}
+
+        arguments = {"parameters": {"seed": seed}, "inputs": {}, "work": work}
+        return run_task(asset, "toy", order=20, **arguments)
+
+    with pytest.raises(InputRefused):
+        run(2)
+    assert made == ["a", "b/c"]
+    assert not (asset / "frames").exists()
+    kept = next((asset / ".usdbrdf/work").glob("toy-*/kept/*a.exr*"))
+    kept.write_text("damaged")
+    assert run(3).reran
+    assert made == ["a", "b/c", "a", "d"]
+    assert (asset / "frames/b/c.exr").read_text() == "b/c 0"
+    assert (asset / "frames/a.exr").read_text() == "a 0"
+    assert not run(3).reran
+    (asset / "frames/d.exr").unlink()
+    assert "missing" in run(3).reason
+    run(3, seed=1)
+    assert (asset / "frames/a.exr").read_text() == "a 1"
+    assert list((asset / ".usdbrdf/work").iterdir()) == []

@@ -163,6 +163,17 @@ class Photographs:
     radiometric: Annotated[bool, Fact(CAPTURE, "radiometric", "bool", True, """True where pixel
         values are proportional to scene radiance. False for low dynamic range photographs: what
         was measured from them is relative.""")]
+    photograph: Annotated[Sequence[str], Fact(CAPTURE, "photograph", "asset", "", """The photograph
+        through a lens that the image of this time code was resampled from, a path relative to the
+        layer; empty where the image is the photograph itself.""", samples="changes",
+        when=lambda taken: any(taken.photograph))]
+    mask: Annotated[Sequence[str], Fact(CAPTURE, "mask", "asset", "", """The mask of that
+        photograph, whose black pixels the image does not have, a path relative to the layer; empty
+        where there is none.""", samples="changes", when=lambda taken: any(taken.mask))]
+    lens: Annotated[Sequence[str], Fact(CAPTURE, "lens", "string", "", """The lens of that
+        photograph: its curve and its numbers that are not 0, in pixels fx, fy, cx and cy; k, d, p
+        and s are radial, dividing, tangential and prism terms as OpenCV has them.""",
+        samples="changes", when=lambda taken: any(taken.lens))]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 MODULES = {
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
+    "colmap": "usdbrdf.capture.formats.colmap",
 }
 DESCRIPTIONS = {
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
+    "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
 }
 

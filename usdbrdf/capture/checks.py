@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
@@ -19,6 +20,7 @@ from usdbrdf.geometry.sides import Sides
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
 
@@ -30,7 +32,12 @@ class FrameRecord:
     name               as the capture calls it, for messages
     image_path         absolute
     world_from_camera  (4, 4) float64, OpenGL axes, not yet known to be rigid
+    intrinsics         fx, fy, cx, cy in pixels; the first pixel's centre is (0.5, 0.5)
     resolution         width, height that the intrinsics belong to
+    lens               how the camera bends light before its intrinsics; a photograph through a lens
+                       that bends becomes one pinhole frame or several
+    mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
+                       not used; or None
     """
 
     name: str
@@ -41,6 +48,8 @@ class FrameRecord:
     exposure_time: float = 1.0
     saturation_radiance: float = math.inf
     noise_floor_radiance: float = 0.0
+    lens: Lens = PINHOLE
+    mask_path: Path | None = None
 
 
 def frames_from_records(
@@ -63,9 +72,10 @@ MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
-    "capture.camera": "Correct the focal lengths and principal points.",
+    "capture.camera": "Correct the focal lengths, principal points and distortion.",
     "capture.file": "Copy the missing images, or remove their entries.",
     "capture.image": "Export the images again as R, G, B float EXR.",
+    "capture.mask": "Export a mask of the photograph's size for it, or remove its entry.",
     "capture.size": "Use the images that the intrinsics are for, or state the w and h of these.",
     "capture.nonfinite": "Export again, or accept masking with --max-nonfinite.",
     "capture.saturated": "Add shorter exposures, or correct saturation_radiance.",
@@ -104,10 +114,11 @@ class Findings:
         """Leave a frame out; ``warn_of_dropped_frames`` tells the user."""
         self.dropped.append(DroppedFrame(name, reason, rule))
 
-    def refuse_too_few_frames(self, source: Path, total: int) -> None:
-        """InputRefused if, of ``total`` frames, too many are dropped or too few are left."""
+    def refuse_too_few_frames(self, source: Path, total: int, *, views: int = 0) -> None:
+        """InputRefused if, of ``total`` frames, too many are dropped or too few are left; ``views``
+        of them, where photographs through a lens become several."""
         usable = total - len(self.dropped)
-        if usable >= MIN_FRAMES and len(self.dropped) <= _MAX_DROPPED_SHARE * total:
+        if max(usable, views) >= MIN_FRAMES and len(self.dropped) <= _MAX_DROPPED_SHARE * total:
             return
         limits = f"(needed: {MIN_FRAMES}, and no more than {_MAX_DROPPED_SHARE:.0%} dropped)"
         if not self.dropped:
@@ -213,7 +224,8 @@ def rigid_records(
         elif not _is_lens(record):
             lens = ", ".join(f"{number:g}" for number in record.intrinsics)
             size = " x ".join(map(str, record.resolution))
-            said = f"fx, fy, cx, cy = {lens} make no lens for {size} pixels"
+            bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
+            said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
             findings.drop(record.name, said, "capture.camera")
         else:
             axes = pose[:3, :3] / (pose_scale or 1.0)
@@ -244,7 +256,8 @@ def _is_lens(record: FrameRecord) -> bool:
     focal, centre = np.reshape(record.intrinsics, (2, 2)) / record.resolution
     low, high = _FOCAL_LENGTHS
     near = np.abs(centre) <= _FARTHEST_CENTRE
-    return bool(((focal >= low) & (focal <= high) & near).all())
+    sensible = bool(((focal >= low) & (focal <= high) & near).all())
+    return sensible and len(views_of(record.lens, record.intrinsics, record.resolution)) > 0
 
 
 def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:
@@ -271,6 +284,27 @@ def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float |
             f"unit of the mesh, pass --pose-scale {measured:.6g}. [capture.pose]"
         )
     return deviation
+
+
+def with_masks(records: Sequence[FrameRecord], findings: Findings) -> list[FrameRecord]:
+    """Records whose mask, if they name one, can be used; the others are dropped. The records have
+    the sizes of their images."""
+    kept: list[FrameRecord] = []
+    for record in records:
+        path = record.mask_path
+        try:
+            across, down = image_size(path)[:2] if path else record.resolution
+        except ImageRefused as error:
+            why = f"its mask cannot be used: {clause_of(error, path or record.image_path)}"
+            findings.drop(record.name, why, "capture.mask")
+            continue
+        width, height = record.resolution
+        if abs(width * down - height * across) >= max(across, width):
+            said = f"its mask has {across} x {down} pixels, itself {width} x {height}"
+            findings.drop(record.name, said, "capture.mask")
+            continue
+        kept.append(record)
+    return kept
 
 
 def at_image_size(

@@ -19,7 +19,9 @@ from usdbrdf.capture.checks import (
     refuse_rays_that_miss,
     refuse_without_parallax,
     rigid_records,
+    with_masks,
 )
+from usdbrdf.capture.develop import frames_of_photographs
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
@@ -267,19 +269,25 @@ def scan_from_parts(
             )
         known.add(record.image_path)
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
-    rigid = at_image_size(rigid, findings, source)
-    findings.refuse_too_few_frames(source, total)
+    rigid = with_masks(at_image_size(rigid, findings, source), findings)
+    photographs = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
+    frames, views, photograph_of = frames_of_photographs(photographs, rigid)
+    findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
-    frames = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
-    refuse_without_parallax(frames, geometry.mesh, source)
+    if not any(r.lens.curve == "equirectangular" for r in rigid):
+        refuse_without_parallax(frames, geometry.mesh, source)
     hit_share = refuse_rays_that_miss(frames, geometry.mesh, source)
     usable = check_frames(
-        frames, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
+        photographs, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
     )
-    findings.refuse_too_few_frames(source, total)
+    kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
+    findings.refuse_too_few_frames(source, total, views=len(kept))
     findings.count("rays_hit_percent", round(100 * hit_share))
-    frames, used = frames_at(frames, usable), [rigid[i].name for i in usable]
-    sides, frames = _sides(geometry, frames, used, findings)
+    # From here on the faces of a photograph count one by one.
+    total += len(kept) - len(usable)
+    frames, used = frames_at(frames, kept), [rigid[photograph_of[i]].name for i in kept]
+    sides, outside = _sides(geometry, frames, used, findings)
+    frames, kept = frames_at(frames, outside), [kept[i] for i in outside]
     findings.refuse_too_few_frames(source, total)
     findings.warn_of_dropped_frames(source, total)
     return Scan(
@@ -295,6 +303,7 @@ def scan_from_parts(
         up_axis=options.up_axis or geometry.up_axis or up_axis,
         usd_geometry=geometry.usd_geometry,
         object_prims=geometry.object_prims,
+        views=tuple(views[i] for i in kept) if any(views) else (),
         turned_faces=sides.turned,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
@@ -303,9 +312,9 @@ def scan_from_parts(
 
 def _sides(
     geometry: ScanGeometry, frames: Frames, names: Sequence[str], findings: Findings
-) -> tuple[Sides, Frames]:
-    """Which faces have to be turned towards the cameras, and which show both sides; and the frames
-    that were not taken inside of something."""
+) -> tuple[Sides, list[int]]:
+    """Which faces have to be turned towards the cameras, and which show both sides; and the numbers
+    of the frames that were not taken inside of something."""
 
     def seen(frames: Frames) -> Sides:
         numbers = progress(range(len(frames)), total=len(frames), label="sides", unit="frames")
@@ -314,8 +323,7 @@ def _sides(
     sides = seen(frames)
     outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
     if 0 < len(outside) < len(frames):
-        frames = frames_at(frames, outside)
-        sides = seen(frames)
+        sides = seen(frames_at(frames, outside))
     turned, both = int(sides.turned.sum()), int(sides.both.sum())
     findings.count("faces_turned", turned)
     findings.count("faces_of_two_sides", both)
@@ -327,7 +335,7 @@ def _sides(
     if both and geometry.usd_geometry is not None:
         # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
         sides = replace(sides, both=np.zeros_like(sides.both))
-    return sides, frames
+    return sides, outside
 
 
 def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
@@ -336,7 +344,10 @@ def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
     columns: dict[str, Any] = {
         k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
     }
-    return replace(frames, image_paths=tuple(frames.image_paths[i] for i in rows), **columns)
+    for name in ("image_paths", "photographs", "masks", "lenses"):
+        found = getattr(frames, name)
+        columns[name] = tuple(found[i] for i in rows) if found else ()
+    return replace(frames, **columns)
 
 
 def as_photographs(

@@ -50,7 +50,10 @@ from usdbrdf.options import PackageOptions
 
 _PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
 # Properties and schemas that name files of the capture or of other looks.
-_LEFT_OUT = ("usdBrdf:aov:", "usdBrdf:capture:image", "backPlate:")
+_LEFT_OUT = (
+    "usdBrdf:aov:", "usdBrdf:capture:image", "usdBrdf:capture:photograph", "usdBrdf:capture:mask",
+    "backPlate:",
+)  # fmt: skip
 _MAPPING = "usdBrdf:fit:mapping"
 _LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", "BackPlateAPI:")
 USDZ, GLB = ".usdz", ".glb"

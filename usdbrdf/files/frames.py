@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Lock
 
 import numpy as np
@@ -17,7 +18,7 @@ from usdbrdf.model.capture import Frames
 
 PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 # A half float stores 3.2 as 3.19922: a clipped channel is one close to the saturation.
-_CLIPPED_SHARE = 0.998
+CLIPPED_SHARE = 0.998
 # Threads that decode, and frames in memory besides the one that is used.
 _READERS, _AHEAD = 2, 3
 # Of a frame: three channels of radiance and four masks.
@@ -57,24 +58,14 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     """Read frame ``i``; ImageRefused where the file cannot be read whole.
 
     Limits hold for the channels as they were recorded, so linear images are judged before their
-    primaries change. Channels down to -1e-3 of the frame's median are ringing and become 0.
+    primaries change.
     """
-    recorded = read_radiance(frames.image_paths[i])
-    if frames.encoding == PHOTOGRAPH_ENCODING:
-        # Radiance is value * reference exposure / exposure time. The adapter wrote that factor into
-        # the saturation; unlike a median of exposure times it stays when frames are left out.
-        scale = np.float32(frames.saturation_radiance[i] / PHOTOGRAPH_SATURATION)
-        recorded = to_working_space(recorded, frames.encoding) * scale
-    unknown = _in_any_channel(~np.isfinite(recorded))
-    ringing = ~unknown & _in_any_channel(recorded < 0)
-    if ringing.any():
-        lowest = -_RINGING * max(float(np.median(recorded[~unknown])), 0.0)
-        below = ringing & _in_any_channel(recorded < lowest)
-        ringing, unknown = ringing & ~below, unknown | below
-    recorded[ringing] = np.maximum(recorded[ringing], 0)
-    recorded[unknown] = np.nan
+    saturation = float(frames.saturation_radiance[i])
+    recorded, unknown, num_clamped = read_recorded(
+        frames.image_paths[i], frames.encoding, saturation
+    )
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
-    clipped = _in_any_channel(recorded >= _CLIPPED_SHARE * frames.saturation_radiance[i])
+    clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
     photograph = frames.encoding == PHOTOGRAPH_ENCODING
     return FramePixels(
@@ -83,8 +74,32 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         clipped=clipped,
         dark=dark,
         unknown=unknown,
-        num_clamped=int(ringing.sum()),
+        num_clamped=num_clamped,
     )
+
+
+def read_recorded(path: Path, encoding: str, saturation: float) -> tuple[Float, Bool, int]:
+    """The radiance (H, W, 3) that an image records, in its own primaries, NaN where it is unknown;
+    where that is (H, W): some channel is NaN, infinite or clearly negative; and how many pixels had
+    a channel a little below zero.
+
+    Channels down to -1e-3 of the frame's median are ringing and become 0.
+    """
+    recorded = read_radiance(path)
+    if encoding == PHOTOGRAPH_ENCODING:
+        # Radiance is value * reference exposure / exposure time. The adapter wrote that factor into
+        # the saturation; unlike a median of exposure times it stays when frames are left out.
+        scale = np.float32(saturation / PHOTOGRAPH_SATURATION)
+        recorded = to_working_space(recorded, encoding) * scale
+    unknown = _in_any_channel(~np.isfinite(recorded))
+    ringing = ~unknown & _in_any_channel(recorded < 0)
+    if ringing.any():
+        lowest = -_RINGING * max(float(np.median(recorded[~unknown])), 0.0)
+        below = ringing & _in_any_channel(recorded < lowest)
+        ringing, unknown = ringing & ~below, unknown | below
+    recorded[ringing] = np.maximum(recorded[ringing], 0)
+    recorded[unknown] = np.nan
+    return recorded, unknown, int(ringing.sum())
 
 
 def read_frames(

@@ -90,17 +90,25 @@ def is_eight_bit(path: Path) -> bool:
     return str(_open(path, MAX_SIDE).spec().format) == "uint8"
 
 
-def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
-    """Write finite pixels, (H, W) or (H, W, 1 | 3 | 4), as ZIP-compressed scene-linear Rec.709.
+def write_exr(
+    path: Path,
+    pixels: Float,
+    *,
+    half: bool = True,
+    holes: bool = False,
+    encoding: str = "lin_rec709_scene",
+) -> int:
+    """Write finite pixels, (H, W) or (H, W, 1 | 3 | 4), as ZIP-compressed scene-linear colour.
 
-    Channels are named Y, RGB or RGBA. Values beyond +-65504 are clamped if ``half`` (as half floats
-    they would be infinite); returns how many. The file appears whole or not at all.
+    With ``holes`` NaN may stand for what is not known. Channels are named Y, RGB or RGBA. Values
+    beyond +-65504 are clamped if ``half`` (as half floats they would be infinite); returns how
+    many. The file appears whole or not at all.
     """
     image = np.atleast_3d(np.asarray(pixels, dtype=np.float32))
     names = _CHANNEL_NAMES.get(image.shape[2])
     if names is None or np.ndim(pixels) not in (2, 3) or not image.size:
         raise UsdBrdfError(f"{path}: {np.shape(pixels)=} is not (H, W[, 1|3|4]). [image.write]")
-    bad = int(np.count_nonzero(~np.isfinite(image)))
+    bad = int(np.count_nonzero(np.isinf(image) if holes else ~np.isfinite(image)))
     if bad:
         raise UsdBrdfError(f"{path}: {bad} values to be written are not finite. [image.write]")
     stored: Any = np.clip(image, -HALF_MAX, HALF_MAX).astype(np.float16) if half else image
@@ -108,12 +116,12 @@ def write_exr(path: Path, pixels: Float, *, half: bool = True) -> int:
     spec.channelnames = names
     spec.attribute("compression", "zip")
     spec.attribute("DateTime", _PINNED_DATE)
-    spec.set_colorspace("lin_rec709_scene")
+    spec.set_colorspace(encoding)
     if len(names) == 4:
         spec.alpha_channel = 3
     with temporary_beside(path) as staged:
         _write(path, staged, spec, stored)
-        if not np.array_equal(read_exr(staged), stored.astype(np.float32)):
+        if not np.array_equal(read_exr(staged), stored.astype(np.float32), equal_nan=holes):
             raise EnvironmentFailure(
                 f"{path}: the file does not read back as it was written. Check the disk. "
                 "[image.write]"

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from glob import escape as glob_escape
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,9 @@ class TaskRun:
         self.once: list[str] = []
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
+        self.kept: dict[str, Path] = {}
+        self._kept = folder / "kept"
+        self._kept.mkdir(exist_ok=True)
         self._checkpoints = folder / "checkpoints"
         self._checkpoints.mkdir(exist_ok=True)
         self._files: dict[tuple[str, int | None], Path] = {}
@@ -98,6 +102,29 @@ class TaskRun:
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
         return self._place(relative, self.outputs)
+
+    def output_kept(self, relative: str, write: Callable[[Path], None]) -> None:
+        """The same, written by ``write``, unless an interrupted run of the task got so far: for
+        outputs each of which takes long."""
+        relative = check_relative(relative)
+        stem = quote(relative, safe="")
+        for path in self._kept.glob(f"{glob_escape(stem)}.*"):
+            if sha256_of(path) == path.name.removeprefix(f"{stem}."):
+                self.kept[relative] = path
+        if relative not in self.kept:
+            with temporary_beside(self._kept / Path(relative).name) as staged:
+                write(staged)
+                self.kept[relative] = self._kept / f"{stem}.{sha256_of(staged)}"
+                publish(staged, self.kept[relative])
+        if relative not in self.outputs:
+            self.outputs.append(relative)
+
+    def gather(self) -> None:
+        """Bring the kept outputs to the others, when all is done."""
+        for relative, path in self.kept.items():
+            place = self.staged / relative
+            place.parent.mkdir(parents=True, exist_ok=True)
+            move(path, place)
 
     def output_once(self, relative: str) -> Path:
         """The same for a file that is the artist's once it exists: it is never replaced."""
@@ -199,7 +226,7 @@ def run_task(
     folder = work_folder / f"{name}-{wanted.fingerprint}"
     stamp, journal = stamp_path(asset, order, name), journal_path(asset, name)
     with environment_failures(name):
-        for place in (stamp.parent, folder / "staged", folder / "checkpoints"):
+        for place in (stamp.parent, *(folder / name for name in ("staged", "checkpoints", "kept"))):
             inside(asset, place)
         for place in (stamp.parent, work_folder):
             place.mkdir(parents=True, exist_ok=True)
@@ -220,6 +247,7 @@ def run_task(
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
         run = TaskRun(asset, name, folder)
         summary = json.loads(json_text(work(run)))
+        run.gather()
         for relative in (*run.outputs, *run.once):
             if not (run.staged / relative).is_file():
                 raise UsdBrdfError(f"the task {name} did not write {relative}. [task.output]")

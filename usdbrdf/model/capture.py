@@ -7,6 +7,7 @@ from pathlib import Path
 
 from usdbrdf.model.arrays import Bool, Double, Int
 from usdbrdf.model.camera import Camera
+from usdbrdf.model.lens import Lens
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 
 
@@ -26,6 +27,10 @@ class Frames:
     encoding              colour space of the stored images, in OpenColorIO's names:
                           "lin_rec709_scene", "lin_ap1_scene" or "srgb_rec709_scene"
     radiometric           False where the images are low dynamic range photographs
+    photographs           what the images were resampled from, N absolute paths, None where an image
+                          is the photograph itself; () where all are
+    masks                 whose black pixels these images do not have, in the same way
+    lenses                the lenses of these photographs in words, "" where there is none
     """
 
     image_paths: tuple[Path, ...]
@@ -37,9 +42,18 @@ class Frames:
     noise_floor_radiance: Double
     encoding: str = "lin_rec709_scene"
     radiometric: bool = True
+    photographs: tuple[Path | None, ...] = ()
+    masks: tuple[Path | None, ...] = ()
+    lenses: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.image_paths)
+
+    def recorded_in(self) -> list[Path]:
+        """The photographs and masks that all frames come from, each once."""
+        sources = self.photographs or (None,) * len(self)
+        found = [s or path for s, path in zip(sources, self.image_paths, strict=True)]
+        return list(dict.fromkeys([*found, *filter(None, self.masks)]))
 
     def camera(self, i: int) -> Camera:
         """The camera of frame i, named after its image."""
@@ -54,11 +68,32 @@ class Frames:
 
 
 @dataclass(frozen=True, kw_only=True)
+class View:
+    """How a frame is to be resampled out of a photograph.
+
+    photograph, mask        absolute; black pixels of the mask, which may be None, are not used
+    lens, intrinsics        of the photograph
+    photograph_from_frame   (3, 3) rotation of directions between the cameras' axes
+    face                    which part of the photograph it shows, "" for all of it
+    """
+
+    photograph: Path
+    mask: Path | None
+    lens: Lens
+    intrinsics: tuple[float, float, float, float]
+    photograph_from_frame: Double
+    face: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scan:
     """A capture, checked: what ``ingest`` writes into the stage.
 
     meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses; usd_geometry
     and object_prims are ``ScanGeometry``'s.
+    views          how frames come of photographs, None where the image is the photograph itself; ()
+                   where all are. The image paths of views are relative to the folder that they are
+                   yet to be written into (``capture.develop``)
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
     warnings       sentences that were printed, kept for the record
@@ -75,6 +110,7 @@ class Scan:
     up_axis: str = "Z"
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
+    views: tuple[View | None, ...] = ()
     turned_faces: Bool | None = None
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

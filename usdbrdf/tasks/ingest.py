@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from usdbrdf.asset.layers.scan_layer import (
 )
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
+from usdbrdf.capture.develop import developed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
@@ -58,6 +59,8 @@ def ingest(
         warnings = warned(scan.warnings)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
+        # Photographs through lenses become frames last, when nothing else can be refused.
+        scan = replace(scan, frames=developed(scan, asset.folder, run.output_kept))
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)

@@ -1,5 +1,5 @@
-"""Files that somebody else made: the one place where foreign meshes, USD and single pictures are
-parsed.
+"""Files that somebody else made: the one place where foreign meshes, USD, COLMAP's models and
+single pictures are parsed.
 
 Their parsers are large, and a crafted or damaged file can make them crash, hang or ask for any
 amount of memory. So each file is refused by its size before it is opened, and read in a child

@@ -35,12 +35,14 @@ class Limits(NamedTuple):
 LIMITS = {
     "mesh": Limits(8 * _GIB, 600.0, 64 * _GIB),
     "stage": Limits(4 * _GIB, 600.0, 64 * _GIB),  # all of its layers together
+    "model": Limits(8 * _GIB, 600.0, 64 * _GIB),
     "picture": Limits(2 * _GIB, 120.0, 24 * _GIB),
 }
 PLUGIN_SECONDS = 60.0  # for the import of another package's module, which may be a large one
 _CURES = {
     "mesh": "Name the mesh with --mesh, or put mesh.ply beside the poses.",
     "stage": "Check its name and permission.",
+    "model": "Copy the whole model, cameras and images.",
     "picture": "Check its name and permission.",
 }
 T = TypeVar("T")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -247,10 +248,15 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
     images = [storable_path(path, folder) for path in frames.image_paths]
-    stored = {name: getattr(frames, name) for name, _ in facts_of(Photographs) if name != "image"}
-    plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in stored.items()}
+    said: dict[str, Any] = {"image": images, "lens": frames.lenses}
+    for name, files in (("photograph", frames.photographs), ("mask", frames.masks)):
+        said[name] = [storable_path(file, folder) if file else "" for file in files]
+    for name, _ in facts_of(Photographs):
+        if name not in said:
+            value = getattr(frames, name)
+            said[name] = value.tolist() if isinstance(value, np.ndarray) else value
     plates = [Sdf.AssetPath(image) for image in images]
-    for fact, value in known_facts(Photographs(image=images, **plain)):
+    for fact, value in known_facts(Photographs(**said)):
         author_fact(prim, fact, value)
         if fact.name == "image":
             apply_schema(prim, "BackPlateAPI:photograph")

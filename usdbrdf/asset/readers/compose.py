@@ -155,7 +155,7 @@ def hashes_of_inputs(
         "geometry": maps.layers_elsewhere(asset.folder),
         "environment": [picture] if picture else [],
         "maps": asset.textures(*aovs),
-        "frames": [*maps.frames.image_paths] if photographs else [],
+        "frames": maps.frames.recorded_in() if photographs else [],
     }
     if picture and not picture.is_file():
         raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")

@@ -3,6 +3,7 @@ triangle soup in metres, and the records of the objects."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -60,15 +61,27 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
     read: dict[str, Any] = {}
     for field, fact in facts_of(Photographs):
         attribute = camera.GetPrim().GetAttribute(fact.attribute())
-        if fact.samples and field != "image":
+        if fact.type in ("asset", "string"):
+            continue
+        if fact.samples:
             read[field] = np.array([attribute.Get(time) for time in times], np.float64)
-        elif field != "image":
+        else:
             read[field] = attribute.Get()
     read["resolution"] = read["resolution"].astype(np.int32)
     paths = [asset_file(image, time) for time in times]
+
+    def of_all(name: str, get: Callable[[Usd.Attribute, float], Any]) -> tuple[Any, ...]:
+        """What only photographs through lenses have; () where none is one."""
+        attribute = camera.GetPrim().GetAttribute(CAPTURE.attribute(name))
+        said = attribute and attribute.HasAuthoredValue()
+        return tuple(get(attribute, time) for time in times) if said else ()
+
     return Frames(
         image_paths=tuple(path for path in paths if path is not None),
         world_from_camera=poses,
+        photographs=of_all("photograph", asset_file),
+        masks=of_all("mask", asset_file),
+        lenses=of_all("lens", lambda lens, time: str(lens.Get(time))),
         **read,
     )
 

@@ -93,12 +93,12 @@ def photographs_of_views(
     options = IngestOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
     total = len(records) + len(findings.dropped)
+    encoding = captured.encoding
     if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
+        encoding = PHOTOGRAPH_ENCODING
         records = [_as_the_captures_photographs(r, captured) for r in records]
     _refuse_none(len(records), findings, source)
-    frames = frames_from_records(
-        records, encoding=captured.encoding, radiometric=captured.radiometric
-    )
+    frames = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
     frames.world_from_camera[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
     mesh = ScanMesh(
         points=scene.points,
@@ -127,7 +127,8 @@ def _rigid_records(
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
     """8-bit record with its limits in the unit that ingest gave the capture's photographs."""
-    if captured.encoding != PHOTOGRAPH_ENCODING:
+    # What was resampled from photographs is linear.
+    if captured.encoding != PHOTOGRAPH_ENCODING and not captured.photographs:
         raise InputRefused(
             f"{record.image_path}: an 8-bit photograph, but the capture's images are "
             f"{captured.encoding}. Use views of the same kind. [evaluate.views]"

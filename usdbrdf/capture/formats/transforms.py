@@ -33,6 +33,7 @@ from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import Curve, Lens, whole_sphere
 from usdbrdf.options import IngestOptions
 
 
@@ -49,8 +50,16 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_CURVES: dict[str, Curve] = {
+    "PINHOLE": "perspective", "SIMPLE_PINHOLE": "perspective", "OPENCV": "perspective",
+    "PERSPECTIVE": "perspective", "SIMPLE_RADIAL": "perspective", "RADIAL": "perspective",
+    "FULL_OPENCV": "perspective", "FISHEYE": "fisheye", "OPENCV_FISHEYE": "fisheye",
+    "FISHEYE624": "fisheye", "EQUIRECTANGULAR": "equirectangular",
+}  # fmt: skip
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+# Folder of the reconstruction that old documents were made of, and what they had done to its world
+# without saying so (rows of applied_transform).
+_COLMAP, _LEGACY = "colmap/sparse/0", [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 # No number in a document means anything beyond this; nor, where it must be positive, below its
 # inverse.
 _LARGEST = 1e15
@@ -82,9 +91,6 @@ def read(path: Path, options: IngestOptions) -> Scan:
             f"{source.name}: {unknown} of {len(records)} frames state no saturation_radiance, so "
             "clipped pixels pass for radiance. [capture.saturation]"
         )
-    masks = sum("mask_path" in frame for frame in capture.document["frames"])
-    if masks and not photographs:
-        findings.warn(f"{source.name}: {masks} mask_path are not used. [capture.mask]")
     return scan_from_parts(
         records,
         lambda: geometry_from_file(
@@ -114,18 +120,29 @@ def frame_records(
     """
     source = source.resolve()
     _, records = _captured(source, options, findings, images=images)
+    bent = next((record for record in records if record.lens.bends), None)
+    if bent is not None:
+        raise InputRefused(
+            f"{source}: the view {bent.name!r} has a lens that bends light. Undistort the images "
+            "to a pinhole camera first. [capture.camera]"
+        )
     return at_image_size(records, findings, source) if images else records
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Capture:
-    """The document, its path, and what the user said; of each camera without a stated size the
-    first image, with its width and height."""
+    """The document, its path, and what the user said.
+
+    images     whether images and masks are asked for
+    is_legacy  whether it was made before documents stated what had been done to COLMAP's world
+    first_of_camera  of each camera without a stated size the first image, its width and height
+    """
 
     source: Path
     document: Mapping[str, Any]
     options: IngestOptions
     images: bool = True
+    is_legacy: bool = False
     first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
         default_factory=dict
     )
@@ -172,7 +189,16 @@ def _captured(
             f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
             "capture's own document. [capture.format]"
         )
-    capture = _Capture(source=source, document=document, options=options, images=images)
+    legacy = "applied_transform" not in document and (source.parent / _COLMAP).is_dir()
+    if legacy:
+        findings.warn(
+            f"{source.name}: {_COLMAP} lies beside it and it states no applied_transform, so its "
+            "poses are taken for those of nerfstudio before 2023, whose axes are undone; state "
+            "applied_transform if they are not. [capture.legacy]"
+        )
+    capture = _Capture(
+        source=source, document=document, options=options, images=images, is_legacy=legacy
+    )
     return capture, [r for frame in frames if (r := _record(capture, frame, findings))]
 
 
@@ -182,9 +208,9 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
     if not isinstance(name, str):
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
         return None
-    _refuse_distortion(capture, frame, name)
     width, height = capture.pixels(frame, "w"), capture.pixels(frame, "h")
     stated = width is not None and height is not None
+    lens = _lens(capture, frame, name)
     needed = capture.images or not stated
     path = _image_path(capture, name) if needed else capture.source.parent / name
     if needed and not path.is_file():
@@ -212,8 +238,10 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         name=name,
         image_path=path,
         world_from_camera=_undo_applied_transform(capture, pose),
-        intrinsics=_intrinsics(capture, frame, name, width, height),
+        intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
+        lens=lens,
+        mask_path=_mask(capture, frame, name),
         exposure_time=capture.positive(frame, "exposure_time") or 1.0,
         saturation_radiance=capture.positive(frame, "saturation_radiance") or math.inf,
         noise_floor_radiance=capture.number(frame, "noise_floor_radiance") or 0.0,
@@ -239,8 +267,10 @@ def _pose(matrix: object) -> Double | None:
 
 
 def _intrinsics(
-    capture: _Capture, frame: Mapping[str, Any], name: str, width: float, height: float
+    capture: _Capture, frame: Mapping[str, Any], name: str, lens: Lens, width: float, height: float
 ) -> tuple[float, float, float, float]:
+    if lens.curve == "equirectangular":
+        return whole_sphere(width, height)
     fx, fy = capture.positive(frame, "fl_x"), capture.positive(frame, "fl_y")
     if fx is None and (across := capture.positive(frame, "camera_angle_x")) is not None:
         fx = width / (2 * math.tan(across / 2))
@@ -291,21 +321,68 @@ def _why_unlike(
     )
 
 
-def _refuse_distortion(capture: _Capture, frame: Mapping[str, Any], name: str) -> None:
+def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
+    """What camera_model and the distortion of a frame, else of the document, say.
+
+    k1 to k4 are coefficients of r^2 to r^8, as nerfstudio has them; where k5 or k6 stand beside
+    them, k4 to k6 are OpenCV's, which divide.
+    """
     model = frame.get("camera_model", capture.document.get("camera_model", "PINHOLE"))
-    if model not in _PINHOLES:
+    if model not in _CURVES:
         raise capture.refuse(
-            f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_PINHOLES)}). "
+            f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_CURVES)}). "
             "Undistort the images to a pinhole camera first.",
             "capture.camera",
         )
-    bent = [key for key in _DISTORTION if capture.number(frame, key)]
-    if bent:
+    curve = _CURVES[model]
+    if curve == "equirectangular":
+        return Lens(curve=curve)
+    listed = frame.get("distortion_params", capture.document.get("distortion_params"))
+    if listed is not None:
+        return _listed_lens(capture, curve, listed, name)
+    number = {key: capture.number(frame, key) for key in _DISTORTION}
+    k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = (value or 0.0 for value in number.values())
+    divides = number["k5"] is not None or number["k6"] is not None
+    return Lens(
+        curve=curve,
+        radial=(k1, k2, k3) if divides else (k1, k2, k3, k4),
+        divisor=(k4, k5, k6) if divides else (),
+        tangential=(p1, p2),
+        prism=(s1, s2, s3, s4),
+    )
+
+
+def _listed_lens(capture: _Capture, curve: Curve, listed: object, name: str) -> Lens:
+    """nerfstudio's distortion_params: k1 to k4, p1, p2; or the twelve of Aria's FISHEYE624."""
+    sound = isinstance(listed, list) and all(type(n) in (int, float) for n in listed)
+    if not (sound and isinstance(listed, list) and len(listed) in (6, 12)):
         raise capture.refuse(
-            f"the frame {name!r} has lens distortion ({', '.join(bent)} not 0). Undistort the "
-            "images to a pinhole camera first, for instance with COLMAP's image_undistorter.",
+            f"the distortion_params of the frame {name!r} are not 6 or 12 numbers. Correct them.",
             "capture.camera",
         )
+    numbers = [float(n) for n in listed]
+    if len(numbers) == 6:
+        k1, k2, k3, k4, p1, p2 = numbers
+        return Lens(curve=curve, radial=(k1, k2, k3, k4), tangential=(p1, p2))
+    p0, p1, s0, s1, s2, s3 = numbers[6:]
+    return Lens(
+        curve=curve,
+        radial=tuple(numbers[:6]),
+        tangential=(p1, p0),
+        prism=(s0, s1, s2, s3),
+        radial_first=True,
+    )
+
+
+def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None:
+    mask = frame.get("mask_path")
+    if mask is None or not capture.images:
+        return None
+    if not isinstance(mask, str):
+        raise capture.refuse(
+            f"the mask_path of the frame {name!r} is not a file name. Correct it.", "capture.mask"
+        )
+    return path_in_capture(capture.source.parent, mask, capture.options)
 
 
 def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
@@ -313,7 +390,7 @@ def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
     scale = capture.positive({}, "applied_scale") or 1.0
     undone = pose.copy()
     undone[:3, 3] /= scale
-    applied = capture.document.get("applied_transform")
+    applied = capture.document.get("applied_transform", _LEGACY if capture.is_legacy else None)
     if applied is None:
         return undone
     matrix = _pose(applied)

@@ -1,7 +1,8 @@
-"""The example adapter, installed as a stranger would, on a COLMAP capture with known cameras."""
+"""The example adapter, installed as a stranger would, on an Open3D capture with known cameras."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -11,7 +12,6 @@ import sys
 import numpy as np
 import pytest
 from pxr import Sdf, Usd
-from scipy.spatial.transform import Rotation
 
 from tests.scenes import make_capture
 from usdbrdf.asset.readers.scene import frames_from_stage
@@ -61,43 +61,42 @@ def usdbrdf(installed, tmp_path):
 
 @pytest.fixture
 def capture(tmp_path):
-    """The box room as COLMAP writes it: two cameras, images in no order, points or none."""
+    """The box room as Open3D writes it."""
     made = make_capture(tmp_path / "Zimmer é (1)")
     made.manifest.unlink()
     (made.folder / "frames").rename(made.folder / "images")
-    sparse = made.folder / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    fx, fy, cx, cy = made.intrinsics
-    (sparse / "cameras.txt").write_text(
-        "# Camera list with one line of data per camera:\n"
-        f"1 PINHOLE 32 24 {fx} {fy} {cx} {cy}\n"
-        f"7 SIMPLE_RADIAL 32 24 {fx} {cx} {cy} 0\n"
-    )
-    lines = ["# Image list with two lines of data per image:"]
-    for i in reversed(range(len(made.world_from_camera))):
-        # COLMAP's camera sees y down and looks along +z.
-        opencv = made.world_from_camera[i] @ np.diag([1.0, -1.0, -1.0, 1.0])
-        camera_from_world = np.linalg.inv(opencv)
-        x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat()
-        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *camera_from_world[:3, 3]))
-        lines += [f"{i + 1} {pose} {1 if i % 2 else 7} {i:04d}.exr", "1.5 2.5 -1" if i % 3 else ""]
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    fx, fy, cx, cy = made.intrinsics.tolist()
+    # Lists in column order; pixel centres are whole numbers.
+    matrix = [fx, 0.0, 0.0, 0.0, fy, 0.0, cx - 0.5, cy - 0.5, 1.0]
+    cameras = []
+    for pose in made.world_from_camera:
+        # Open3D's camera sees y down and looks along +z.
+        camera_from_world = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        cameras.append(
+            {
+                "class_name": "PinholeCameraParameters",
+                "extrinsic": camera_from_world.T.reshape(-1).tolist(),
+                "intrinsic": {"width": 32, "height": 24, "intrinsic_matrix": matrix},
+            }
+        )
+    document = {"class_name": "PinholeCameraTrajectory", "parameters": cameras}
+    (made.folder / "trajectory.json").write_text(json.dumps(document))
     return made
 
 
 def test_it_is_listed(usdbrdf):
     done = usdbrdf("adapters")
     assert done.returncode == 0
-    [line] = [x for x in done.stdout.splitlines() if x.startswith("colmap ")]
-    assert "COLMAP text model" in line
-    assert "(usdbrdf_colmap)" in line
+    [line] = [x for x in done.stdout.splitlines() if x.startswith("open3d ")]
+    assert "Open3D camera trajectory" in line
+    assert "(usdbrdf_open3d)" in line
 
 
 def test_the_cameras_are_the_true_ones(usdbrdf, capture, tmp_path):
     asset = tmp_path / "asset é"
     done = usdbrdf("ingest", capture.folder, "-o", asset)
     assert done.returncode == 0, done.stderr
-    assert "[colmap.scale]" in done.stderr
+    assert "[open3d.saturation]" in done.stderr
     [root] = [p for p in asset.glob("*.usda") if p.name != "edits.usda"]
     stage = Usd.Stage.Open(str(root))
     frames = frames_from_stage(stage)
@@ -125,47 +124,40 @@ def test_an_upgraded_adapter_reads_again(usdbrdf, installed, capture, tmp_path):
     assert said().endswith(": up to date")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "asset/layers/scan.usdc"))
     parameters = layer.customLayerData["usdbrdf"]["parameters"]
-    assert parameters["adapter_package"] == "usdbrdf_colmap 9.1"
+    assert parameters["adapter_package"] == "usdbrdf_open3d 9.1"
 
 
 def test_scale_and_axis_are_the_users(installed, capture, monkeypatch):
     monkeypatch.syspath_prepend(installed)
     scan = read_scan(capture.folder, IngestOptions(meters_per_unit=0.01, up_axis="Y"))
-    assert (scan.adapter, scan.meters_per_unit, scan.up_axis) == ("colmap", 0.01, "Y")
-    assert not any("[colmap.scale]" in warning for warning in scan.warnings)
+    assert (scan.adapter, scan.meters_per_unit, scan.up_axis) == ("open3d", 0.01, "Y")
 
 
-def _bend(made):
-    path = made.folder / "sparse" / "0" / "cameras.txt"
-    path.write_text(path.read_text().replace("SIMPLE_RADIAL 32 24", "SIMPLE_RADIAL 32 24 1 "))
-
-
-def _images(change):
+def _document(change):
     def edit(made):
-        path = made.folder / "sparse" / "0" / "images.txt"
+        path = made.folder / "trajectory.json"
         path.write_text(change(path.read_text()))
 
     return edit
 
 
-def _binary(made):
-    for path in (made.folder / "sparse" / "0").glob("*.txt"):
-        path.rename(path.with_suffix(".bin"))
+def _without_inverse(text):
+    document = json.loads(text)
+    document["parameters"][2]["extrinsic"] = [0.0] * 16
+    return json.dumps(document)
 
 
 @pytest.mark.fault("C14")
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (_bend, ["cameras.txt: line 3", "image_undistorter", "[colmap.camera]"]),
-        (_images(lambda t: t.replace(" 7 0010", " 8 0010")), ["names camera 8", "[colmap.camera]"]),
-        (_images(lambda t: t[:60]), ["images.txt: line 2 is not IMAGE_ID", "[colmap.model]"]),
-        (_images(lambda t: t.replace("0010.exr", "../../x.exr")), ["x.exr", "[paths.outside]"]),
-        (_images(lambda t: t.replace("00", "99")), ["the image file does not exist"]),
-        (_binary, ["model_converter --output_type TXT", "[colmap.model]"]),
-        (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[colmap.mesh]"]),
+        (_document(lambda t: t[:60]), ["not a camera trajectory", "[open3d.trajectory]"]),
+        (_document(lambda t: "[]"), ["not a camera trajectory", "[open3d.trajectory]"]),
+        (_document(_without_inverse), ["camera 2", "[open3d.trajectory]"]),
+        (lambda made: made.folder.joinpath("images/0003.exr").unlink(), ["11 images", "12 cam"]),
+        (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[open3d.mesh]"]),
     ],
-    ids=["lens", "camera", "cut off", "outside", "no images", "binary", "no mesh"],
+    ids=["cut off", "list", "singular", "images", "no mesh"],
 )
 def test_what_is_refused(installed, capture, monkeypatch, edit, words):
     monkeypatch.syspath_prepend(installed)

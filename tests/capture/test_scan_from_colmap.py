@@ -1,0 +1,254 @@
+"""COLMAP captures, written by pycolmap itself."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
+from tests.scenes import edited, make_capture
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.formats import colmap
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.colmap_models import ColmapCamera
+
+pycolmap = pytest.importorskip("pycolmap")
+OPTIONS = IngestOptions(meters_per_unit=1.0, up_axis="Z")
+
+
+def reconstruction(made, cameras, names):
+    """pycolmap's model of a capture: image i, called names[i], by cameras[i % len(cameras)]."""
+    model = pycolmap.Reconstruction()
+    for k, camera in enumerate(cameras):
+        camera.camera_id = k + 1
+        model.add_camera_with_trivial_rig(camera)
+    for i, name in enumerate(names):
+        opencv = made.world_from_camera[i] @ np.diag([1.0, -1.0, -1.0, 1.0])
+        pose = pycolmap.Rigid3d(np.linalg.inv(opencv)[:3])
+        image = pycolmap.Image(
+            name=name, keypoints=np.array([[1.5, 2.5]]), camera_id=1 + i % len(cameras),
+            image_id=i + 1,
+        )  # fmt: skip
+        model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+def colmap_capture(folder, model="OPENCV", *, text=False, sparse="sparse/0", names=None):
+    """A capture through a lens as COLMAP leaves it; returns what it was made from."""
+    made = capture_through(folder, model)
+    names = names or [f"{i:04d}.exr" for i in range(10)]
+    for i, name in enumerate(names):
+        (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        made.image(i).rename(folder / "images" / name)
+    made.manifest.unlink()
+    write_model(folder / sparse, reconstruction(made, [camera_of(model)], names), text=text)
+    return made
+
+
+def write_model(folder, model, *, text=False):
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("model", "text"), [("PINHOLE", True), ("OPENCV", False), ("OPENCV_FISHEYE", True)]
+)
+def test_colmap_and_nerfstudio_give_one_scan(tmp_path, model, text):
+    made = colmap_capture(tmp_path / "colmap", model, text=text)
+    capture_through(tmp_path / "nerfstudio", model)
+    one = read_scan(made.folder, OPTIONS)
+    other = read_scan(tmp_path / "nerfstudio", IngestOptions())
+    assert (one.adapter, other.adapter) == ("colmap", "transforms")
+    size = np.ptp(made.points, axis=0).max()
+    difference = one.frames.world_from_camera - other.frames.world_from_camera
+    assert np.abs(difference).max() < 1e-4 * size
+    assert np.abs(one.frames.intrinsics - other.frames.intrinsics).max() < 0.05
+    assert one.frames.resolution.tolist() == other.frames.resolution.tolist()
+    assert len(one.views) == len(other.views) == (0 if model == "PINHOLE" else len(one.frames))
+    assert one.mesh.points.tobytes() == other.mesh.points.tobytes()
+    assert [o.label for o in one.objects] == [o.label for o in other.objects]
+
+
+def test_every_model_becomes_the_lens_that_pycolmap_has():
+    directions = np.random.default_rng(0).normal(size=(500, 3)) * (0.4, 0.3, 0) + (0, 0, 1)
+    for name in sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"}):
+        identifier = pycolmap.CameraModelId.__members__[name]
+        camera = pycolmap.Camera.create_from_model_id(1, identifier, 300.0, 640, 480)
+        numbers = np.array(camera.params)
+        numbers[camera.extra_params_idxs()] += 0.01 * (
+            1 + np.arange(len(camera.extra_params_idxs()))
+        )
+        if name != "EQUIRECTANGULAR":
+            numbers[camera.focal_length_idxs()] *= np.linspace(1, 1.1, 2)[
+                : len(camera.focal_length_idxs())
+            ]
+            numbers[camera.principal_point_idxs()] += (3, -5)
+        camera.params = numbers
+        ours = ColmapCamera(model=name, resolution=(640, 480), parameters=tuple(numbers))
+        lens, intrinsics = colmap.lens_of(ours)
+        found = lens.project(directions * (1, -1, -1), intrinsics)
+        np.testing.assert_allclose(found, camera.img_from_cam(directions), atol=1e-6, err_msg=name)
+
+
+def test_several_cameras_in_subfolders_with_missing_images(tmp_path):
+    made = make_capture(tmp_path / "room")
+    names = [f"{'left' if i % 2 else 'right é'}/{i // 2:02d}.exr" for i in range(12)]
+    for i, name in enumerate(names):
+        (made.folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        made.image(i).rename(made.folder / "images" / name)
+    made.manifest.unlink()
+    pinhole = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=list(made.intrinsics))
+    other = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=64, height=48, params=[2 * made.intrinsics[0], 32, 24]
+    )
+    write_model(made.folder / "sparse/0", reconstruction(made, [pinhole, other], names))
+    (made.folder / "images" / names[3]).unlink()
+    scan = read_scan(made.folder, OPTIONS)
+    order = sorted(set(range(12)) - {3}, key=lambda i: names[i])
+    assert [p.name for p in scan.frames.image_paths] == [names[i].split("/")[1] for i in order]
+    np.testing.assert_allclose(
+        scan.frames.world_from_camera, made.world_from_camera[order], atol=1e-9
+    )
+    np.testing.assert_allclose(scan.frames.intrinsics, np.tile(made.intrinsics, (11, 1)))
+    assert any("1 of 12 frames dropped, 'left/01.exr'" in w for w in scan.warnings)
+    assert any("scaled to the size" in w for w in scan.warnings)
+
+
+def undistorted_beside(made):
+    """dense/ with pinhole images, as image_undistorter leaves it."""
+    dense, camera = made.folder / "dense", camera_of("PINHOLE")
+    names = [f"{i:04d}.exr" for i in range(10)]
+    (dense / "images").mkdir(parents=True)
+    for i, name in enumerate(names):
+        write_exr(dense / "images" / name, seen_through(camera, made.world_from_camera[i], made))
+    write_model(dense / "sparse", reconstruction(made, [camera], names))
+    return dense
+
+
+def test_the_distorted_model_goes_with_distorted_images(tmp_path):
+    made = colmap_capture(tmp_path / "room")
+    undistorted_beside(made)
+    scan = read_scan(made.folder, OPTIONS)
+    assert {view.photograph.parent for view in scan.views} == {made.folder / "images"}
+
+
+def test_without_distorted_images_the_undistorted_model_is_taken(tmp_path):
+    made = colmap_capture(tmp_path / "room")
+    dense = undistorted_beside(made)
+    shutil.rmtree(made.folder / "images")
+    scan = read_scan(made.folder, OPTIONS)
+    assert scan.views == ()
+    assert {path.parent for path in scan.frames.image_paths} == {dense / "images"}
+    np.testing.assert_allclose(scan.frames.intrinsics[0], CAMERAS["PINHOLE"][2])
+
+
+@pytest.mark.parametrize("size", ["same", "other"])
+def test_undistorted_images_in_the_place_of_distorted_ones_are_not_undistorted_twice(
+    tmp_path, size
+):
+    made = colmap_capture(tmp_path / "room")
+    dense = undistorted_beside(made)
+    if size == "other":
+        model = reconstruction(made, [camera_of("PINHOLE")], [f"{i:04d}.exr" for i in range(10)])
+        for i in range(10):
+            path = dense / "images" / f"{i:04d}.exr"
+            write_exr(path, read_exr(path)[:30])
+        model.cameras[1].height = 30
+        write_model(dense / "sparse", model)
+    shutil.rmtree(made.folder / "images")
+    shutil.copytree(dense / "images", made.folder / "images")
+    scan = read_scan(made.folder, OPTIONS)
+    assert scan.views == ()
+    assert len(scan.frames) == 10
+
+
+def test_a_model_without_points_and_with_colmaps_own_mesh_and_masks(tmp_path):
+    made = colmap_capture(tmp_path / "room", "PINHOLE", sparse="sparse")
+    (made.folder / "sparse" / "points3D.bin").unlink()
+    (made.folder / "dense").mkdir()
+    (made.folder / "mesh.ply").rename(made.folder / "dense" / "meshed-poisson.ply")
+    (made.folder / "masks").mkdir()
+    shutil.copy(make_mask(tmp_path / "mask.png"), made.folder / "masks" / "0003.exr.png")
+    scan = read_scan(made.folder, IngestOptions())
+    assert [view is not None for view in scan.views] == [i == 3 for i in range(10)]
+    assert any("[colmap.scale]" in warning for warning in scan.warnings)
+    assert any("1 masks" in warning for warning in scan.warnings)
+
+
+def make_mask(path):
+    from usdbrdf.files.images import write_preview_png
+
+    write_preview_png(path, np.full((36, 48, 3), 255, np.uint8))
+    return path
+
+
+def test_the_larger_of_two_reconstructions_is_taken(tmp_path):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    few = reconstruction(made, [camera_of("PINHOLE")], ["0000.exr", "0001.exr"])
+    shutil.move(made.folder / "sparse/0", made.folder / "sparse/1")
+    write_model(made.folder / "sparse/0", few)
+    scan = read_scan(made.folder, OPTIONS)
+    assert len(scan.frames) == 10
+    assert any("2 COLMAP models" in w and "sparse/1" in w for w in scan.warnings)
+
+
+def test_nerfstudios_document_comes_first(tmp_path):
+    made = make_capture(tmp_path / "room")
+    write_model(
+        made.folder / "colmap/sparse/0",
+        reconstruction(made, [camera_of("PINHOLE")], ["0000.exr", "0001.exr"]),
+    )
+    assert choose_adapter(made.folder).name == "transforms"
+
+
+def _cut(made):
+    path = made.folder / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def _outside(made):
+    names = ["../../x.exr", *(f"{i:04d}.exr" for i in range(1, 10))]
+    write_model(made.folder / "sparse/0", reconstruction(made, [camera_of("PINHOLE")], names))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (_cut, ["sparse/0", "cannot read this model", "[colmap.model]"]),
+        (_outside, ["x.exr", "[paths.outside]"]),
+        (lambda made: shutil.rmtree(made.folder / "images"), ["none of", "[colmap.images]"]),
+        (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[mesh.missing]"]),
+    ],
+    ids=["cut off", "outside", "no images", "no mesh"],
+)
+def test_what_is_refused(tmp_path, edit, words):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    edit(made)
+    with pytest.raises(InputRefused) as refusal:
+        read_scan(made.folder, OPTIONS)
+    for word in words:
+        assert word in str(refusal.value)
+
+
+def test_without_pycolmap_one_sentence_says_what_to_install(tmp_path, monkeypatch):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    monkeypatch.setattr("usdbrdf.untrusted.colmap_models.find_spec", lambda name: None)
+    with pytest.raises(EnvironmentFailure, match=r"usdbrdf\[colmap\]"):
+        read_scan(made.folder, OPTIONS)
+
+
+def test_old_documents_of_nerfstudio_had_turned_the_world(tmp_path):
+    made = make_capture(tmp_path / "room")
+    legacy = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    with edited(made.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = (legacy @ frame["transform_matrix"]).tolist()
+    (made.folder / "colmap/sparse/0").mkdir(parents=True)
+    scan = read_scan(made.folder, replace(OPTIONS))
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
+    assert any("[capture.legacy]" in warning for warning in scan.warnings)

@@ -1,0 +1,300 @@
+"""COLMAP: a model, text or binary, its images, and a mesh beside.
+
+::
+
+    CAPTURE/
+      sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not
+      images/                                       as the model names them, in subfolders too
+      dense/ or dense/0/ ...: sparse/, images/      what image_undistorter writes: used where the
+                                                    distorted images are not there
+      mesh.ply, meshed-poisson.ply, ...             in one of these folders, or by --mesh
+
+A model's poses are camera from world, with a camera whose x points right, y down and z forward;
+its world has neither scale nor a direction up. Each model goes with the images beside it: the
+distorted model with undistorted images would bend them a second time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
+from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.parts import (
+    as_photographs,
+    geometry_from_file,
+    radiance_encoding,
+    scan_from_parts,
+)
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.images import image_size
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.colmap_models import ColmapCamera, ColmapModel, colmap_model, model_files
+
+NAME = "colmap"
+DESCRIPTION = DESCRIPTIONS[NAME]
+# Workspaces below the capture, as COLMAP and those who follow it lay them out; where the model lies
+# in a workspace; and where its images do.
+_WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap")
+_MODELS = ("", "sparse/0", "sparse")
+_IMAGES = ("images", "input", "")
+# The last two are what COLMAP's own meshers write; fused.ply is a point cloud.
+_MESHES = (
+    "mesh.ply", "mesh.obj", "mesh.glb", "mesh.usd", "mesh.usda", "mesh.usdc",
+    "textured.obj", "meshed-poisson.ply", "meshed-delaunay.ply",
+)  # fmt: skip
+_CURVES: dict[str, Curve] = {
+    "FOV": "fov", "SIMPLE_DIVISION": "division", "DIVISION": "division", "EUCM": "eucm",
+}  # fmt: skip
+
+
+def matches(path: Path) -> bool:
+    """A folder with a model in one of the usual places."""
+    return path.is_dir() and next(iter(_workspaces(path)), None) is not None
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    path = path.resolve()
+    findings = Findings()
+    chosen = _chosen(path, options, findings)
+    records = _records(path, chosen, options, findings)
+    photographs = refuse_photographs(
+        [record.image_path for record in records], assume_srgb=options.assume_srgb
+    )
+    encoding = radiance_encoding(options, photographs=photographs)
+    if photographs:
+        records = as_photographs(records, findings, path)
+    else:
+        findings.warn(
+            f"{path.name}: a COLMAP model says nothing of exposures, so clipped pixels pass for "
+            "radiance. [capture.saturation]"
+        )
+    if masks := sum(record.mask_path is not None for record in records):
+        findings.warn(
+            f"{path.name}: {masks} masks in masks/ are used; what is black there is not looked at. "
+            "[capture.mask]"
+        )
+    if options.meters_per_unit is None or options.up_axis is None:
+        findings.warn(
+            f"{path.name}: a COLMAP model has no scale and no direction up; taken are metres and "
+            "Z. State them with --meters-per-unit and --up-axis. [colmap.scale]"
+        )
+    objects = path_in_capture(path, "objects.json", options)
+    return scan_from_parts(
+        records,
+        lambda: geometry_from_file(
+            options.mesh or _mesh(path, options),
+            options.objects or (objects if objects.is_file() else None),
+            options,
+            findings,
+            capture_root=path,
+        ),
+        options,
+        findings,
+        name=path.name,
+        adapter=NAME,
+        source=path,
+        encoding=encoding,
+        radiometric=not photographs,
+    )
+
+
+def lens_of(camera: ColmapCamera) -> tuple[Lens, tuple[float, float, float, float]]:
+    """Our lens and intrinsics for a camera of any of COLMAP's models (its ``models.h``)."""
+    model, numbers = camera.model, camera.parameters
+    if model == "EQUIRECTANGULAR":
+        return Lens(curve="equirectangular"), whole_sphere(*camera.resolution)
+    one = model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE")
+    fx, *rest = numbers
+    fy, cx, cy, *k = [fx, *rest] if one else rest
+    curve: Curve = "fisheye" if model.endswith("FISHEYE") else "perspective"
+    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
+        lens = PINHOLE
+    elif model in _CURVES:
+        lens = Lens(curve=_CURVES[model], shape=tuple(k))
+    elif model in ("OPENCV", "FULL_OPENCV"):
+        lens = Lens(radial=(*k[:2], *k[4:5]), divisor=tuple(k[5:]), tangential=(k[2], k[3]))
+    elif model == "THIN_PRISM_FISHEYE":
+        lens = Lens(
+            curve="fisheye",
+            radial=(*k[:2], *k[4:6]),
+            tangential=(k[2], k[3]),
+            prism=(k[6], 0.0, k[7], 0.0),
+        )
+    elif model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        lens = Lens(
+            curve="fisheye",
+            radial=tuple(k[:6]),
+            tangential=(k[7], k[6]),
+            prism=(k[8], k[9], k[10], k[11]),
+            radial_first=True,
+        )
+    elif "RADIAL" in model or model.endswith("FISHEYE"):
+        lens = Lens(curve=curve, radial=tuple(k))
+    else:
+        raise InputRefused(
+            f"COLMAP's camera model {model} is not known here. Undistort the images with 'colmap "
+            "image_undistorter'. [capture.camera]"
+        )
+    return lens, (fx, fy, cx, cy)
+
+
+class _Workspace(NamedTuple):
+    """A model's folder, and where its images may lie: one of these folders, in this order."""
+
+    model: Path
+    images: tuple[str, ...]
+
+
+class _Chosen(NamedTuple):
+    """A model and the folder of its images, relative to the capture."""
+
+    model: ColmapModel
+    folder: Path
+    images: str
+
+
+def _workspaces(path: Path) -> list[_Workspace]:
+    """All that are there, the distorted before the undistorted."""
+    found = []
+    for workspace in _WORKSPACES:
+        folders = [path / workspace / name for name in _MODELS]
+        # Further reconstructions of images that would not go together.
+        folders += sorted((path / workspace / "sparse").glob("[1-9]*"))
+        base = f"{workspace}/" if workspace else ""
+        beside = [f"{base}{images}".rstrip("/") for images in _IMAGES]
+        if workspace == "colmap":  # as nerfstudio has it
+            beside += ["images"]
+        found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
+    return found
+
+
+def _chosen(path: Path, options: IngestOptions, findings: Findings) -> _Chosen:
+    """The first model that has images whose size its cameras are for, or the first with images."""
+    workspaces = _workspaces(path)
+    candidates: list[_Chosen] = []
+    for workspace in workspaces:
+        model = colmap_model(workspace.model)
+        if not model.names:
+            continue
+        counts = [
+            sum(path_in_capture(path, _joined(f, name), options).is_file() for name in model.names)
+            for f in workspace.images
+        ]
+        if max(counts):
+            images = workspace.images[counts.index(max(counts))]
+            candidates.append(_Chosen(model, workspace.model, images))
+    if not candidates:
+        where = f"{path}: none of the images that the COLMAP model names is there"
+        if not workspaces:
+            where = f"{path}: no COLMAP model (cameras and images, .bin or .txt)"
+        raise InputRefused(
+            f"{where}. Put the model in sparse/0 and the images in images/. [colmap.images]"
+        )
+    fitting = [c for c in candidates if _images_fit(path, c, candidates, options)]
+    chosen = (fitting or candidates)[0]
+    parts = [c for c in candidates if c.images == chosen.images]
+    largest = max(parts, key=lambda c: len(c.model.names))
+    if len(parts) > 1:
+        findings.warn(
+            f"{path.name}: {len(parts)} COLMAP models of the same images; taken is "
+            f"{largest.folder.relative_to(path).as_posix()} with most of them, "
+            f"{len(largest.model.names)}. [colmap.model]"
+        )
+    return largest
+
+
+def _images_fit(
+    path: Path, one: _Chosen, others: Sequence[_Chosen], options: IngestOptions
+) -> bool:
+    """Whether the first image that is there has the shape that its camera is for, and is not what
+    another model, one of pinholes, calls its own."""
+    for k, name in enumerate(one.model.names):
+        image = path_in_capture(path, _joined(one.images, name), options)
+        if not image.is_file():
+            continue
+        camera = one.model.cameras[int(one.model.camera_of_image[k])]
+        try:
+            width, height, _ = image_size(image)
+        except ImageRefused:
+            continue
+        across, down = camera.resolution
+        if abs(width * down - height * across) >= across:
+            return False
+        if not lens_of(camera)[0].bends:
+            return True
+        for other in others:
+            if name in other.model.names and other.images != one.images:
+                undistorted = path_in_capture(path, _joined(other.images, name), options)
+                theirs = other.model.cameras[0]
+                same = undistorted.is_file() and sha256_of(undistorted) == sha256_of(image)
+                if same and not lens_of(theirs)[0].bends:
+                    return False
+        return True
+    return False
+
+
+def _joined(folder: str, name: str) -> str:
+    name = name.replace("\\", "/")
+    return f"{folder}/{name}" if folder else name
+
+
+def _records(
+    path: Path, chosen: _Chosen, options: IngestOptions, findings: Findings
+) -> list[FrameRecord]:
+    records = []
+    for k, name in enumerate(chosen.model.names):
+        file = path_in_capture(path, _joined(chosen.images, name), options)
+        if not file.is_file():
+            findings.drop(name, "the image file does not exist", "capture.file")
+            continue
+        camera = chosen.model.cameras[int(chosen.model.camera_of_image[k])]
+        lens, intrinsics = lens_of(camera)
+        records.append(
+            FrameRecord(
+                name=name,
+                image_path=file,
+                world_from_camera=_world_from_camera(chosen.model.camera_from_world[k]),
+                intrinsics=intrinsics,
+                resolution=camera.resolution,
+                lens=lens,
+                mask_path=_mask(path, name, options),
+            )
+        )
+    return records
+
+
+def _mask(path: Path, name: str, options: IngestOptions) -> Path | None:
+    """COLMAP's own masks: masks/NAME.png, black where no feature is to be taken."""
+    mask = path_in_capture(path, f"masks/{name}.png", options)
+    return mask if mask.is_file() else None
+
+
+def _world_from_camera(camera_from_world: Double) -> Double:
+    """The inverse, y and z of the camera turned round."""
+    rotation, translation = camera_from_world[:, :3], camera_from_world[:, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T * (1.0, -1.0, -1.0)
+    pose[:3, 3] = -rotation.T @ translation
+    return pose
+
+
+def _mesh(path: Path, options: IngestOptions) -> Path:
+    for workspace in _WORKSPACES:
+        for name in _MESHES:
+            mesh = path_in_capture(path, _joined(workspace, name), options)
+            if mesh.is_file():
+                return mesh
+    raise InputRefused(
+        f"{path}: no mesh beside the COLMAP model ({', '.join(_MESHES)}). Make one with 'colmap "
+        "poisson_mesher', or name one with --mesh. [mesh.missing]"
+    )

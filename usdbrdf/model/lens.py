@@ -1,0 +1,178 @@
+"""Lenses that bend light: where a camera images a direction, for every model that common tools
+write. A pinhole is a lens that bends nothing; cameras after ingest are pinholes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, get_args
+
+import numpy as np
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.model.arrays import Double
+
+Curve = Literal["perspective", "fisheye", "fov", "division", "eucm", "equirectangular"]
+# Parameters of each curve, by the names of those who proposed it.
+_SHAPE = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
+_MOST_RADIAL = 8
+# Angles between 0 and a half turn at which a curve is looked at for where it turns back.
+_ANGLES = 20_001
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """From directions to a plane without unit; ``intrinsics`` fx, fy, cx, cy go on to pixels.
+
+    A direction at the angle t off the axis comes to lie at the radius r in the direction's own
+    azimuth; then the point (x, y) = r (cos a, sin a), x right and y down, is distorted:
+
+        x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4 + b y'
+        y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4
+        R  = (1 + k1 r^2 + k2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
+        pixel = (cx + fx x', cy + fy y')
+
+    curve       perspective: r = tan t; fisheye (equidistant): r = t;
+                fov (Devernay and Faugeras 2001): r = atan(2 tan t tan(omega/2)) / omega;
+                division (Fitzgibbon 2001): r / (1 + k r^2) = tan t;
+                eucm (Khomutenko et al. 2016): r = sin t / (alpha e + (1 - alpha) cos t) with
+                e^2 = beta sin^2 t + cos^2 t;
+                equirectangular: x is the longitude, y minus the latitude, in radians: fx is the
+                width / 2 pi, fy the height / pi (see ``whole_sphere``)
+    shape       what the curve has beside t: (omega,), (k,), (alpha, beta)
+    radial      k1, k2, ... as many as there are
+    divisor     d1, d2, ...; OpenCV calls its three k4, k5, k6
+    tangential  p1, p2 in OpenCV's order (Metashape's and Aria's are the other way round)
+    prism       s1, s2, s3, s4
+    skew        b: Metashape's B2 / fx
+    radial_first   tangential and prism terms are taken of (x R, y R) instead of (x, y)
+    """
+
+    curve: Curve = "perspective"
+    shape: tuple[float, ...] = ()
+    radial: tuple[float, ...] = ()
+    divisor: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    skew: float = 0.0
+    radial_first: bool = False
+
+    def __post_init__(self) -> None:
+        numbers = (
+            *self.shape, *self.radial, *self.divisor, *self.tangential, *self.prism, self.skew
+        )  # fmt: skip
+        if (
+            self.curve not in get_args(Curve)
+            or len(self.shape) != len(_SHAPE.get(self.curve, ()))
+            or max(len(self.radial), len(self.divisor)) > _MOST_RADIAL
+            or not np.isfinite(numbers).all()
+        ):
+            raise InputRefused(f"{self}: this is no lens. Correct its numbers. [camera.lens]")
+
+    def described(self, intrinsics: tuple[float, float, float, float]) -> str:
+        """All of its numbers that are not 0, in words, such as
+        ``fisheye fx 790.2 fy 790.3 cx 876.1 cy 584.9 k1 -0.03 k2 -0.006``."""
+        numbered = [
+            *zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True),
+            *zip(_SHAPE.get(self.curve, ()), self.shape, strict=True),
+            *((f"k{i + 1}", k) for i, k in enumerate(self.radial)),
+            *((f"d{i + 1}", d) for i, d in enumerate(self.divisor)),
+            *((f"p{i + 1}", p) for i, p in enumerate(self.tangential)),
+            *((f"s{i + 1}", s) for i, s in enumerate(self.prism)),
+            ("b", self.skew),
+        ]
+        words = [f"{name} {float(number)!r}" for name, number in numbered if number]
+        return " ".join([self.curve, *words, *(["radial first"] if self.radial_first else [])])
+
+    @property
+    def bends(self) -> bool:
+        """False for a pinhole."""
+        numbers = (*self.radial, *self.divisor, *self.tangential, *self.prism, self.skew)
+        plain = self.curve == "division" and not any(self.shape)
+        return bool(any(numbers) or not (self.curve == "perspective" or plain))
+
+    def project(self, directions: Double, intrinsics: tuple[float, float, float, float]) -> Double:
+        """Pixel coordinates (..., 2) of directions (..., 3) of any length in the camera, whose x
+        points right, y up, and which looks down -z; NaN where the lens images nothing, or where its
+        polynomial has turned back and would image a second time."""
+        x, y, z = directions[..., 0], -directions[..., 1], -directions[..., 2]
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        if self.curve == "equirectangular":
+            plane = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
+        else:
+            # At the axis the azimuth does not matter, nor does 0 / 0.
+            azimuth = np.stack([x, y], axis=-1) / np.maximum(across, _TINY)[..., None]
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                plane = self._distorted(azimuth * self._radius(angle)[..., None])
+        fx, fy, cx, cy = intrinsics
+        pixels = plane * (fx, fy) + (cx, cy)
+        pixels[angle > self.widest_angle] = np.nan
+        return pixels
+
+    @property
+    def widest_angle(self) -> float:
+        """Radians off the axis up to which a larger angle means a larger radius."""
+        return _widest_angle(self)
+
+    def _radius(self, angle: Double) -> Double:
+        """r of t; NaN where the curve ends."""
+        sine, cosine = np.sin(angle), np.cos(angle)
+        if self.curve == "fisheye":
+            return angle
+        if self.curve == "eucm":
+            alpha, beta = self.shape
+            depth = alpha * np.sqrt(beta * sine**2 + cosine**2) + (1 - alpha) * cosine
+            return np.asarray(np.where(depth > 0, sine / depth, np.nan))
+        tangent = np.where(cosine > 0, sine / np.maximum(cosine, _TINY), np.nan)
+        if self.curve == "fov":
+            (omega,) = self.shape
+            if abs(omega) < 1e-6:  # its limit is a pinhole
+                return tangent
+            return np.asarray(np.arctan(2 * tangent * np.tan(omega / 2)) / omega)
+        if self.curve == "division":
+            (k,) = self.shape
+            # The root of k tan(t) r^2 - r + tan(t) = 0 that is tan(t) for k = 0.
+            root = np.sqrt(1 - 4 * k * tangent**2)
+            return np.asarray(2 * tangent / (1 + root))
+        return tangent
+
+    def _stretch(self, squared: Double) -> Double:
+        """R of r^2."""
+        above = np.polyval((*self.radial[::-1], 1.0), squared)
+        return np.asarray(above / np.polyval((*self.divisor[::-1], 1.0), squared))
+
+    def _distorted(self, plane: Double) -> Double:
+        """(x', y') of (x, y)."""
+        stretched = plane * self._stretch((plane**2).sum(axis=-1))[..., None]
+        base = stretched if self.radial_first else plane
+        x, y = base[..., 0], base[..., 1]
+        squared = x**2 + y**2
+        p1, p2 = self.tangential
+        s1, s2, s3, s4 = self.prism
+        across = 2 * p1 * x * y + p2 * (squared + 2 * x**2) + (s1 + s2 * squared) * squared
+        down = p1 * (squared + 2 * y**2) + 2 * p2 * x * y + (s3 + s4 * squared) * squared
+        down = stretched[..., 1] + down
+        return np.stack([stretched[..., 0] + across + self.skew * down, down], axis=-1)
+
+
+PINHOLE = Lens()
+
+
+@lru_cache(maxsize=256)
+def _widest_angle(lens: Lens) -> float:
+    if lens.curve == "equirectangular":
+        return float(np.pi)
+    angles = np.linspace(0, np.pi, _ANGLES)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        radius = lens._radius(angles)
+        radius = radius * lens._stretch(radius**2)
+    # NaN is no step outwards either.
+    inwards = np.flatnonzero(~(np.diff(radius) > 0))
+    return float(angles[inwards[0] if len(inwards) else -1])
+
+
+def whole_sphere(width: float, height: float) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of an equirectangular picture: straight ahead lies in its middle."""
+    return width / (2 * np.pi), height / np.pi, width / 2, height / 2

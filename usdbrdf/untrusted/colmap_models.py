@@ -1,0 +1,106 @@
+"""COLMAP's models, text or binary, of any version, by COLMAP's own reader: cameras and poses."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.job.child import scratch_folder
+from usdbrdf.model.arrays import Double, Int
+from usdbrdf.untrusted.bounds import read_in_child, refuse_large
+
+_SUFFIXES = (".bin", ".txt")  # COLMAP prefers the first
+_NEEDED, _NEWER = ("cameras", "images"), ("rigs", "frames")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapCamera:
+    """model and parameters as COLMAP names and orders them; resolution is width, height."""
+
+    model: str
+    resolution: tuple[int, int]
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapModel:
+    """N registered images, by name.
+
+    camera_of_image    (N,) int32 into ``cameras``
+    camera_from_world  (N, 3, 4) float64; the camera's x points right, y down, z forward
+    """
+
+    names: tuple[str, ...]
+    camera_of_image: Int
+    camera_from_world: Double
+    cameras: tuple[ColmapCamera, ...]
+
+
+def model_files(folder: Path) -> tuple[Path, ...]:
+    """The files of the model that lies in a folder, cameras and images first; () if none does."""
+    for suffix in _SUFFIXES:
+        files = [folder / f"{name}{suffix}" for name in (*_NEEDED, *_NEWER)]
+        if all(file.is_file() for file in files[: len(_NEEDED)]):
+            return tuple(file for file in files if file.is_file())
+    return ()
+
+
+def colmap_model(folder: Path) -> ColmapModel:
+    """The model in a folder, without its points; InputRefused where it cannot be read."""
+    if find_spec("pycolmap") is None:
+        raise EnvironmentFailure(
+            f"{folder}: COLMAP's models are read with pycolmap, which is not installed. Install "
+            "it with: pip install 'usdbrdf[colmap]'. [environment.pycolmap]"
+        )
+    files = model_files(folder)
+    for file in files:
+        refuse_large("model", file)
+    return read_in_child(
+        "model", f"{__name__}:read_here", files[1], ColmapModel, parts=(ColmapCamera,)
+    )
+
+
+def read_here(images: Path) -> ColmapModel:
+    """``colmap_model`` in this process, which is to be a child."""
+    import pycolmap
+
+    folder = images.parent
+    with scratch_folder() as scratch:
+        # The points may be many, and are not there in all captures.
+        for file in model_files(folder):
+            (scratch / file.name).symlink_to(file)
+        no_points = struct.pack("<Q", 0) if images.suffix == ".bin" else b"# none\n"
+        (scratch / f"points3D{images.suffix}").write_bytes(no_points)
+        try:
+            model = pycolmap.Reconstruction(str(scratch))
+            found = sorted(
+                (image for image in model.images.values() if image.has_pose), key=lambda i: i.name
+            )
+            names = tuple(str(image.name) for image in found)
+            poses = [image.cam_from_world().matrix() for image in found]
+        # COLMAP says what it stumbles over in its own terms, by exceptions of several kinds.
+        except Exception as error:
+            said = " ".join(str(error).split()).replace(str(scratch), str(folder))[:200]
+            raise InputRefused(
+                f"{folder}: COLMAP cannot read this model ({said}). Export it again. [colmap.model]"
+            ) from error
+    identifiers = sorted(model.cameras)
+    cameras = tuple(
+        ColmapCamera(
+            model=str(camera.model_name),
+            resolution=(int(camera.width), int(camera.height)),
+            parameters=tuple(float(number) for number in camera.params),
+        )
+        for camera in (model.cameras[i] for i in identifiers)
+    )
+    return ColmapModel(
+        names=names,
+        camera_of_image=np.array([identifiers.index(image.camera_id) for image in found], np.int32),
+        camera_from_world=np.array(poses, np.float64).reshape(-1, 3, 4),
+        cameras=cameras,
+    )
