@@ -181,6 +181,7 @@ ENGINEERING: dict[str, str] = {
     "_MOSTLY_OPEN": "from here on a warning is printed",
     "_MOST_ACROSS": "time",
     "_MOST_EFFECTS": "memory",
+    "_MOST_MEASURED": "time",
     "_MOST_PASSES": "time",
     "_MOST_SAMPLES": "time",
     "_MOST_SOURCES": "memory",

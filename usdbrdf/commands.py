@@ -71,17 +71,38 @@ class _Run(_Talking):
         return status
 
 
-class _RunOnCapture(_Run):
+class _OnCapture(_Talking):
     capture: Path = option("SCAN", REQUIRED)
     "capture folder or its main file"
-    output: Path = option("-o --output ASSET", REQUIRED)
-    "asset folder, made if it is not there"
     adapter: str | None = option(
         "--adapter NAME", None, unset="recognised by its content", shared="ingest"
     )
     "capture format"
     plugins: bool = option("--no-plugins", True, shared="ingest")
     "use our own adapters only"
+
+
+class _RunOnCapture(_OnCapture, _Run):
+    output: Path = option("-o --output ASSET", REQUIRED)
+    "asset folder, made if it is not there"
+
+
+class Inspect(_OnCapture):
+    """Say what a capture holds and what convert would refuse; nothing is written."""
+
+    inspect: options.InspectOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.inspection import inspect
+        found = inspect(self.capture, self.inspect, self.adapter, plugins=self.plugins)
+        if self.json:
+            show(json.dumps(found.summary(), indent=2), whole=True)
+        else:
+            show("\n".join(printable(line) for line in found.lines()))
+        if found.refusals:
+            raise found.refusals[0]
+        return 0
 
 
 class Convert(EditOptions, _RunOnCapture):
@@ -299,7 +320,7 @@ class PluginPath(Command):
         return 0
 
 
-_TASKS: tuple[type[Command], ...] = (Convert, Ingest, Texture, Shade, Fit)
+_TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (Evaluate, Compare, Relight, Package, Validate, Rules, Adapters, PluginPath)
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command

@@ -223,6 +223,22 @@ class IngestOptions(Options):
     up_axis: Literal["Y", "Z"] | None = option("--up-axis", None, unset="as the format says")
     "axis that points up"
 
+    @property
+    def looked_at(self) -> int | None:
+        """How many frames have their pixels looked at; None: all."""
+        return None
+
+
+class InspectOptions(IngestOptions):
+    """What a user may say about a capture that is only looked at."""
+
+    frames: int = option("--frames N", 24, (2, 2**31 - 1))
+    """look at the pixels of so many frames, evenly spread, as long as all of these can be used"""
+
+    @property
+    def looked_at(self) -> int | None:
+        return self.frames
+
 
 class TextureOptions(Options):
     """How frames become the lit diffuse texture L_d."""

@@ -19,7 +19,7 @@ from usdbrdf.geometry.sides import Sides
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
+from usdbrdf.model.mesh import ScanGeometry, ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
 
 
@@ -84,12 +84,19 @@ class DroppedFrame(NamedTuple):
 
 
 class Findings:
-    """Collected along one ingest; ends in ``Scan.warnings`` and ``Scan.counts``."""
+    """Collected along one ingest; ends in ``Scan.warnings`` and ``Scan.counts``.
+
+    frames, geometry  as far as they were read, for who is told why a capture was refused
+    looked_at         the frames whose pixels were checked, by number
+    """
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
         self.counts: dict[str, int] = {}
         self.dropped: list[DroppedFrame] = []
+        self.frames: Frames | None = None
+        self.geometry: ScanGeometry | None = None
+        self.looked_at: list[int] = []
 
     def warn(self, sentence: str) -> None:
         """Keep a sentence for the user. It is published, so it names files without their folder."""
@@ -313,13 +320,52 @@ def at_image_size(
 
 
 def check_frames(
-    frames: Frames, names: Sequence[str], findings: Findings, *, max_nonfinite: float
+    frames: Frames,
+    names: Sequence[str],
+    findings: Findings,
+    *,
+    max_nonfinite: float,
+    most: int | None = None,
 ) -> list[int]:
     """Indices of the frames that can be used; the others are noted in ``findings`` by their
-    ``names``. max_nonfinite is the share of unknown pixels above which a frame is dropped."""
+    ``names``.
+
+    max_nonfinite  share of unknown pixels above which a frame is dropped
+    most           look at so many frames alone, evenly spread, as long as all of these can be used
+    """
+    some = spread_evenly(len(frames), most)
+    if len(some) < len(frames) and not _any_twice(frames.image_paths):
+        glance = Findings()
+        _looked_through(frames, names, some, glance, max_nonfinite)
+        if not glance.dropped:
+            findings.looked_at = some
+            for name, number in glance.counts.items():
+                findings.count(name, number)
+            return list(range(len(frames)))
+    findings.looked_at = list(range(len(frames)))
+    return _looked_through(frames, names, findings.looked_at, findings, max_nonfinite)
+
+
+def _any_twice(paths: Sequence[Path]) -> bool:
+    """Whether two files hold the same bytes."""
+    of_size: dict[int, list[Path]] = {}
+    for path in paths:
+        of_size.setdefault(path.stat().st_size, []).append(path)
+    alike = [path for same in of_size.values() if len(same) > 1 for path in same]
+    return len({sha256_of(path) for path in alike}) < len(alike)
+
+
+def _looked_through(
+    frames: Frames,
+    names: Sequence[str],
+    which: Sequence[int],
+    findings: Findings,
+    max_nonfinite: float,
+) -> list[int]:
+    """Of the frames ``which`` those that can be used, as ``check_frames``."""
     usable: list[int] = []
     name_of: dict[str, str] = {}
-    for i in progress(range(len(frames)), total=len(frames), label="images", unit="frames"):
+    for i in progress(which, total=len(which), label="images", unit="frames"):
         path = frames.image_paths[i]
         try:
             pixels = read_frame(frames, i)
@@ -340,6 +386,13 @@ def check_frames(
         findings.count("pixels_negative_clamped", pixels.num_clamped)
         findings.count("pixels_clipped", int(pixels.clipped.sum()))
     return usable
+
+
+def spread_evenly(count: int, most: int | None) -> list[int]:
+    """``most`` of the numbers below ``count`` (None: all), with the first and the last."""
+    if most is None or most >= count:
+        return list(range(count))
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, most).round())]
 
 
 def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from usdbrdf.capture.checks import (
     refuse_without_parallax,
     rigid_records,
 )
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
@@ -37,6 +39,7 @@ from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
+P = ParamSpec("P")
 _MAX_OBJECTS = 65_535
 
 
@@ -236,6 +239,21 @@ def geometry_from_file(
     )
 
 
+def _recalling(read: Callable[P, Scan]) -> Callable[P, Scan]:
+    """What was found of a capture goes with the sentence that refuses it."""
+
+    @wraps(read)
+    def reading(*given: P.args, **named: P.kwargs) -> Scan:
+        try:
+            return read(*given, **named)
+        except UsdBrdfError as error:
+            error.found = signature(read).bind(*given, **named).arguments["findings"]
+            raise
+
+    return reading
+
+
+@_recalling
 def scan_from_parts(
     records: Sequence[FrameRecord],
     read_geometry: Callable[[], ScanGeometry],
@@ -258,6 +276,7 @@ def scan_from_parts(
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
+    findings.frames = frames_from_records(records, encoding=encoding, radiometric=radiometric)
     known: set[Path] = set()
     for record in records:
         if record.image_path in known:
@@ -271,13 +290,20 @@ def scan_from_parts(
     findings.refuse_too_few_frames(source, total)
     geometry = read_geometry()
     frames = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
+    findings.frames, findings.geometry = frames, geometry
     refuse_without_parallax(frames, geometry.mesh, source)
     hit_share = refuse_rays_that_miss(frames, geometry.mesh, source)
     usable = check_frames(
-        frames, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
+        frames,
+        [r.name for r in rigid],
+        findings,
+        max_nonfinite=options.max_nonfinite,
+        most=options.looked_at,
     )
     findings.refuse_too_few_frames(source, total)
     findings.count("rays_hit_percent", round(100 * hit_share))
+    if options.looked_at is not None:
+        findings.count("frames_looked_at", len(findings.looked_at))
     frames, used = frames_at(frames, usable), [rigid[i].name for i in usable]
     sides, frames = _sides(geometry, frames, used, findings)
     findings.refuse_too_few_frames(source, total)

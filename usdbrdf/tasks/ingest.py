@@ -15,8 +15,7 @@ from usdbrdf.asset.layers.scan_layer import (
     write_scan_layer,
 )
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
-from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.errors import InputRefused
+from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
@@ -86,8 +85,7 @@ def _inputs(
     lie, seen from scan.usdc, which names photographs and USD geometry by such paths: what is moved
     must be read anew."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
-    if not capture.exists():
-        raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
+    refuse_missing(capture)
     outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
     inputs = {
         label: hash_of_files(files_below(place, without=asset.folder), place)
