@@ -142,6 +142,7 @@ ENGINEERING: dict[str, str] = {
     "_DARKEST": "numerics",
     "_DIFFUSE_RAYS": "rays: noise against time",
     "_DIRECTIONS": "discretisation of the search",
+    "_EXACT": "numerics: of float64",
     "_FARTHEST_CENTRE": "limit of what is refused",
     "_FEWEST": "memory",
     "_FINER": "steps of a search",

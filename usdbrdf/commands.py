@@ -129,13 +129,22 @@ class Convert(EditOptions, _RunOnCapture):
 class Ingest(_RunOnCapture):
     """Read a capture into the layer scan.usdc."""
 
+    write_capture: Path | None = option("--write-capture DIR", None)
+    "write what was read as a capture of our own format too, into a new folder"
     ingest: options.IngestOptions
 
     def run(self) -> int:
         with loading():
             from usdbrdf.pipeline import ingest
         with self.working_on(self.output) as asset:
-            done = ingest(self.capture, asset, self.ingest, self.adapter, plugins=self.plugins)
+            done = ingest(
+                self.capture,
+                asset,
+                self.ingest,
+                self.adapter,
+                plugins=self.plugins,
+                copy_to=self.write_capture,
+            )
         return self.report({"ingest": done}, self.output)
 
 

@@ -153,6 +153,8 @@ PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _MIN_USEFUL_SHARE = 0.001
 # Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
 _MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
+# What is so near stays as it is, and so do poses that were made rigid before.
+_EXACT = 1e-14
 # Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
 # of the image.
 LARGEST_OF_POSE = 1e9
@@ -226,8 +228,10 @@ def rigid_records(
             axes = pose[:3, :3] / (pose_scale or 1.0)
             worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
             rigid = pose.copy()
-            left, _, right = np.linalg.svd(axes)
-            rigid[:3, :3], rigid[3] = left @ right, (0, 0, 0, 1)
+            if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
+                left, _, right = np.linalg.svd(axes)
+                axes = left @ right
+            rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
             kept.append(replace(record, world_from_camera=rigid))
     if worst > _ROUNDING:
         findings.warn(

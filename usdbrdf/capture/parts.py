@@ -380,9 +380,13 @@ def as_photographs(
     ]
 
 
-def radiance_encoding(options: IngestOptions, *, photographs: bool) -> str:
-    """Colour space of the images; UsageError where the options contradict them."""
-    encoding = options.encoding or (PHOTOGRAPH_ENCODING if photographs else "lin_rec709_scene")
+def radiance_encoding(
+    options: IngestOptions, *, photographs: bool, stated: str | None = None
+) -> str:
+    """Colour space of the images: the options', that which the capture states (one of
+    ``known_encodings``), or the usual one; UsageError where the options contradict the images."""
+    usual = PHOTOGRAPH_ENCODING if photographs else "lin_rec709_scene"
+    encoding = options.encoding or stated or usual
     if encoding not in known_encodings():
         raise UsageError(
             f"--encoding {encoding!r}: not known. Use one of {', '.join(known_encodings())}. "

@@ -16,6 +16,7 @@ from usdbrdf.asset.layers.scan_layer import (
 )
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
+from usdbrdf.capture.native import refuse_taken, write_capture
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
@@ -31,9 +32,13 @@ def ingest(
     adapter: str | None = None,
     *,
     plugins: bool = True,
+    copy_to: Path | None = None,
 ) -> TaskResult:
-    """Read and check a capture and write it as the weakest layer of ``asset``. Raises InputRefused
-    for a capture that cannot be used; nothing is published then."""
+    """Read and check a capture and write it as the weakest layer of ``asset``, and as a capture of
+    our own format into the new folder ``copy_to``. Raises InputRefused for a capture that cannot be
+    used, OwnershipConflict where ``copy_to`` is taken; nothing is published then."""
+    if copy_to is not None:
+        refuse_taken(copy_to, capture)
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -55,6 +60,8 @@ def ingest(
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         warnings = warned(scan.warnings)
+        if copy_to is not None:
+            write_capture(scan, copy_to)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
@@ -74,7 +81,10 @@ def ingest(
             "warnings": warnings,
         }
 
-    return task.run(work)
+    result = task.run(work)
+    if copy_to is not None and not result.reran:
+        write_capture(read_with(chosen, capture, options), copy_to)
+    return result
 
 
 def _inputs(
