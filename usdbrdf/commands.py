@@ -148,6 +148,29 @@ class Ingest(_RunOnCapture):
         return self.report({"ingest": done}, self.output)
 
 
+class MergeBrackets(_Talking):
+    """Merge brackets of 8-bit photographs into a capture of radiance."""
+
+    capture: Path = option("SCAN", REQUIRED)
+    "folder with transforms.json, whose frames have brackets or share a transform_matrix"
+    output: Path = option("-o --output DIR", REQUIRED)
+    "new folder for the capture of one EXR for each view"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.bracketed import merge_brackets
+            from usdbrdf.capture.native import refuse_taken
+        refuse_taken(self.output, self.capture)
+        found = merge_brackets(self.capture, self.output)
+        told = (
+            f"{self.output}: written, {found['brackets']} frames of {found['photographs']} "
+            f"photographs over {found['stops']:.1f} stops; radiometric up to one scale; clipped in "
+            f"all {found['clipped_share']:.2%}, contradicting each other "
+            f"{found['contradicting_share']:.2%} of the pixels"
+        )
+        return self.told({"capture": str(self.output), **found}, told)
+
+
 class _RunOnAsset(_Run):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder made by ingest"
@@ -330,7 +353,17 @@ class PluginPath(Command):
 
 
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
-_OTHERS = (Evaluate, Compare, Relight, Package, Validate, Rules, Adapters, PluginPath)
+_OTHERS = (
+    MergeBrackets,
+    Evaluate,
+    Compare,
+    Relight,
+    Package,
+    Validate,
+    Rules,
+    Adapters,
+    PluginPath,
+)
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
     for command in (*_TASKS, *_OTHERS)

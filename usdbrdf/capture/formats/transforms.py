@@ -188,6 +188,12 @@ def _captured(
 
 def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
     """One frame, or None where its pose or its file is missing."""
+    if "brackets" in frame:
+        raise capture.refuse(
+            "its frames are brackets of photographs. Make one frame of radiance of each with "
+            "`usdbrdf merge-brackets`, and convert what that writes.",
+            "capture.brackets",
+        )
     name = frame.get("file_path")
     if not isinstance(name, str):
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
