@@ -209,6 +209,9 @@ class IngestOptions(Options):
     "accept 8-bit photographs as sRGB; the result is then not radiometric"
     encoding: str | None = option("--encoding NAME", None, unset="as the format says")
     "colour space of the images by its OpenColorIO name, e.g. lin_ap1_scene"
+    exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
+    """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
+    or darker than the others do of the same surfaces is divided out"""
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )

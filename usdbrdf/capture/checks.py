@@ -167,13 +167,22 @@ _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+def _transposed(pose: Double) -> Double:
+    turned = pose.copy()
+    turned[:3, :3] = pose[:3, :3].T
+    return turned
+
+
 # Mix-ups of conventions that are tried where the poses do not fit the mesh.
-_CONVENTIONS: dict[str, Callable[[Double], Double]] = {
+CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
     "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
     "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
         lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
     ),
+    "rotations transposed (transpose them, keep the positions)": _transposed,
     "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
     "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
     "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
@@ -443,7 +452,7 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
     share = _hit_share(scene, frames, lambda pose: pose)
     if share >= _MIN_HIT_SHARE:
         return share
-    tried = {name: _hit_share(scene, frames, read) for name, read in _CONVENTIONS.items()}
+    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
     better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= _MIN_HIT_SHARE]
     if better:
         cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"

@@ -56,6 +56,8 @@ class Inspection:
     mesh, objects         in the capture's unit, meters_per_unit and up_axis those of a Scan
     dropped               frames that cannot be used
     looked_at             frames whose pixels were checked
+    agreement             by how much frames that show the same points differ, as a share of what
+                          any two pixels do
     granted               options that were taken as given to read on after a refusal
     refusals              what convert would refuse, in the order in which it would find it
     """
@@ -73,8 +75,14 @@ class Inspection:
     looked_at: int = 0
     counts: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    agreement: float | None = None
     granted: tuple[str, ...] = ()
     refusals: tuple[UsdBrdfError, ...] = ()
+
+    @property
+    def could_be_read(self) -> bool:
+        """Whether all of it is there, if only with what was granted."""
+        return len(self.refusals) == len(self.granted)
 
     def missing(self) -> list[str]:
         """What the capture does not say, each with what that means."""
@@ -106,6 +114,7 @@ class Inspection:
             "radiance": self.radiance and vars(self.radiance),
             "mesh": self.mesh and self._mesh_summary(self.mesh),
             "objects": [vars(label) for label in self.objects],
+            "agreement": self.agreement,
             "counts": self.counts,
             "missing": self.missing(),
             "warnings": list(self.warnings),
@@ -143,6 +152,12 @@ class Inspection:
             names = [label.label for label in self.objects]
             more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
             yield "objects", f"{len(names)}: {', '.join(names[:_LISTED])}{more}"
+        if self.agreement is not None:
+            yield (
+                "agreement",
+                f"frames that show the same points of the mesh differ by {self.agreement:.0%} of "
+                "what any two pixels do",
+            )
         yield from (("missing", lack) for lack in self.missing())
         yield from (("warning", warning) for warning in self.warnings)
         yield from (("granted", f"the rest is read as with {o}") for o in self.granted)

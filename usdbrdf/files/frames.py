@@ -65,6 +65,8 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         # the saturation; unlike a median of exposure times it stays when frames are left out.
         scale = np.float32(frames.saturation_radiance[i] / PHOTOGRAPH_SATURATION)
         recorded = to_working_space(recorded, frames.encoding) * scale
+    elif frames.gain is not None:
+        recorded = recorded / np.float32(frames.gain[i])
     unknown = _in_any_channel(~np.isfinite(recorded))
     ringing = ~unknown & _in_any_channel(recorded < 0)
     if ringing.any():

@@ -26,6 +26,8 @@ class Frames:
     encoding              colour space of the stored images, in OpenColorIO's names:
                           "lin_rec709_scene", "lin_ap1_scene" or "srgb_rec709_scene"
     radiometric           False where the images are low dynamic range photographs
+    gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
+                          by, to be divided out; the limits above are those of what is left
     """
 
     image_paths: tuple[Path, ...]
@@ -37,6 +39,7 @@ class Frames:
     noise_floor_radiance: Double
     encoding: str = "lin_rec709_scene"
     radiometric: bool = True
+    gain: Double | None = None
 
     def __len__(self) -> int:
         return len(self.image_paths)

@@ -21,6 +21,7 @@ from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
@@ -60,12 +61,13 @@ def ingest(
     def work(run: TaskRun) -> dict[str, Any]:
         scan = read_with(chosen, capture, options)
         warnings = warned(scan.warnings)
+        asked, told = asked_of_its_pixels(scan, options)
         if copy_to is not None:
             write_capture(scan, copy_to)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
+        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         for role in ROLES[1:]:
@@ -79,6 +81,7 @@ def ingest(
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
             "warnings": warnings,
+            **told,
         }
 
     result = task.run(work)

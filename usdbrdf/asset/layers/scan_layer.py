@@ -248,6 +248,8 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
     images = [storable_path(path, folder) for path in frames.image_paths]
     stored = {name: getattr(frames, name) for name, _ in facts_of(Photographs) if name != "image"}
+    if frames.gain is None:
+        stored["gain"] = np.ones(len(frames))
     plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in stored.items()}
     plates = [Sdf.AssetPath(image) for image in images]
     for fact, value in known_facts(Photographs(image=images, **plain)):
