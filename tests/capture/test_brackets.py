@@ -247,3 +247,25 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     }[fault]
     assert capsys.readouterr().err.endswith(f"{rule}\n")
     assert not (tmp_path / "merged").exists()
+
+
+def test_photographs_of_several_exposures_get_one_scale_by_their_exif_data(tmp_path):
+    capture = make_capture(tmp_path / "scan")
+    radiance = {}
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            time = (1 / 20, 1 / 80)[i % 2]
+            light = read_exr(capture.image(i)) * time * 16
+            srgb = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+            frame["file_path"] = f"frames/{i}.png"
+            codes = np.round(255 * np.clip(srgb, 0, 1)).astype(np.uint8)
+            _write_photograph(capture.folder / frame["file_path"], codes, time=time)
+            del frame["exposure_time"]
+            radiance[i] = read_exr(capture.image(i))
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert any("EXIF data are divided out (2.0 stops)" in warning for warning in scan.warnings)
+    ratios = []
+    for i in range(12):
+        pixels = read_frame(scan.frames, i)
+        ratios.append(np.median((pixels.radiance / radiance[i])[pixels.valid]))
+    np.testing.assert_allclose(ratios, ratios[0], rtol=0.03)

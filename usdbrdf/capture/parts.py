@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
 from inspect import signature
@@ -22,10 +24,11 @@ from usdbrdf.capture.checks import (
     refuse_without_parallax,
     rigid_records,
 )
-from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
+from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
+from usdbrdf.files.images import exif_exposure
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
@@ -368,16 +371,34 @@ def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
 def as_photographs(
     records: Sequence[FrameRecord], findings: Findings, source: Path
 ) -> list[FrameRecord]:
-    """8-bit sRGB records with the limits of such images, brought to one exposure."""
+    """8-bit sRGB records with the limits of such images, brought to one exposure: the stated one,
+    else that of all images' EXIF data."""
+    told = ""
+    if all(record.exposure_time == 1 for record in records):
+        given = [_exposure_of_file(record.image_path) for record in records]
+        known = [exposure for exposure in given if exposure is not None]
+        if known and len(known) == len(records):
+            records = [
+                replace(record, exposure_time=exposure)
+                for record, exposure in zip(records, known, strict=True)
+            ]
+            stops = math.log2(max(known) / min(known))
+            told = f" The exposures of their EXIF data are divided out ({stops:.1f} stops)."
     findings.warn(
         f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
-        "colours and relative brightness only. [capture.ldr]"
+        f"colours and relative brightness only.{told} [capture.ldr]"
     )
     saturation, noise_floor = photograph_limits(np.array([r.exposure_time for r in records]))
     return [
         replace(r, saturation_radiance=float(high), noise_floor_radiance=float(low))
         for r, high, low in zip(records, saturation, noise_floor, strict=True)
     ]
+
+
+def _exposure_of_file(path: Path) -> float | None:
+    with suppress(ImageRefused):  # of which the reader of its pixels will tell
+        return exif_exposure(path)
+    return None
 
 
 def radiance_encoding(
