@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
@@ -164,29 +165,6 @@ _MIN_HIT_SHARE = 0.2
 _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-
-
-def _transposed(pose: Double) -> Double:
-    turned = pose.copy()
-    turned[:3, :3] = pose[:3, :3].T
-    return turned
-
-
-# Mix-ups of conventions that are tried where the poses do not fit the mesh.
-CONVENTIONS: dict[str, Callable[[Double], Double]] = {
-    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
-    "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
-    "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
-        lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
-    ),
-    "rotations transposed (transpose them, keep the positions)": _transposed,
-    "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
-    "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
-    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
-}
 
 
 def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.capture.checks import CONVENTIONS, spread_evenly
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
@@ -89,19 +90,17 @@ def agreement_of_frames(mesh: ScanMesh, frames: Frames, source: Path) -> Agreeme
 def estimated_exposures(scan: Scan) -> tuple[Scan, dict[str, float]]:
     """The scan with its frames exposed as their pixels say; image and gain of those that
     contradicted the others by much, of which the user is told."""
-    frames = scan.frames
-    surface = points_of_surface(scan.mesh)
-    rays = RayScene(scan.mesh.points, scan.mesh.triangles)
+    frames, mesh = scan.frames, scan.mesh
+    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
     images = read_frames(partial(read_frame, frames), range(len(frames)))
     seen = progress(images, total=len(frames), label="exposures", unit="frames")
     columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]
     frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1))
     if off:
-        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in list(off.items())[:6])
-        more = f" and {len(off) - 6} more" if len(off) > 6 else ""
+        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in off.items())
         warn(
             f"{scan.source.name}: {len(off)} of {len(frames)} frames contradicted the others, "
-            f"{named}{more}; what all are off by was divided out. [capture.exposure]"
+            f"{named}; what all are off by was divided out. [capture.exposure]"
         )
     return replace(scan, frames=frames), off
 
