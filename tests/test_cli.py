@@ -30,7 +30,7 @@ from usdbrdf.options import BEFORE_FILTER, ConvertOptions
 COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 NAMES = (
     *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare", "relight"),
-    *("package", "validate", "rules", "adapters", "plugin-path"),
+    *("package", "validate", "rules", "adapters", "plugin-path", "inspect", "merge-brackets"),
 )
 
 

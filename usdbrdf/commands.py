@@ -71,17 +71,38 @@ class _Run(_Talking):
         return status
 
 
-class _RunOnCapture(_Run):
+class _OnCapture(_Talking):
     capture: Path = option("SCAN", REQUIRED)
     "capture folder or its main file"
-    output: Path = option("-o --output ASSET", REQUIRED)
-    "asset folder, made if it is not there"
     adapter: str | None = option(
         "--adapter NAME", None, unset="recognised by its content", shared="ingest"
     )
     "capture format"
     plugins: bool = option("--no-plugins", True, shared="ingest")
     "use our own adapters only"
+
+
+class _RunOnCapture(_OnCapture, _Run):
+    output: Path = option("-o --output ASSET", REQUIRED)
+    "asset folder, made if it is not there"
+
+
+class Inspect(_OnCapture):
+    """Say what a capture holds and what convert would refuse; nothing is written."""
+
+    inspect: options.InspectOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.tasks.photometry import inspect
+        found = inspect(self.capture, self.inspect, self.adapter, plugins=self.plugins)
+        if self.json:
+            show(json.dumps(found.summary(), indent=2), whole=True)
+        else:
+            show("\n".join(printable(line) for line in found.lines()))
+        if found.refusals:
+            raise found.refusals[0]
+        return 0
 
 
 class Convert(EditOptions, _RunOnCapture):
@@ -108,14 +129,46 @@ class Convert(EditOptions, _RunOnCapture):
 class Ingest(_RunOnCapture):
     """Read a capture into the layer scan.usdc."""
 
+    write_capture: Path | None = option("--write-capture DIR", None)
+    "write what was read as a capture of our own format too, into a new folder"
     ingest: options.IngestOptions
 
     def run(self) -> int:
         with loading():
             from usdbrdf.pipeline import ingest
         with self.working_on(self.output) as asset:
-            done = ingest(self.capture, asset, self.ingest, self.adapter, plugins=self.plugins)
+            done = ingest(
+                self.capture,
+                asset,
+                self.ingest,
+                self.adapter,
+                plugins=self.plugins,
+                copy_to=self.write_capture,
+            )
         return self.report({"ingest": done}, self.output)
+
+
+class MergeBrackets(_Talking):
+    """Merge brackets of 8-bit photographs into a capture of radiance."""
+
+    capture: Path = option("SCAN", REQUIRED)
+    "folder with transforms.json, whose frames have brackets or share a transform_matrix"
+    output: Path = option("-o --output DIR", REQUIRED)
+    "new folder for the capture of one EXR for each view"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.bracketed import merge_brackets
+            from usdbrdf.capture.native import refuse_taken
+        refuse_taken(self.output, self.capture)
+        found = merge_brackets(self.capture, self.output)
+        told = (
+            f"{self.output}: written, {found['brackets']} frames of {found['photographs']} "
+            f"photographs over {found['stops']:.1f} stops; radiometric up to one scale; clipped in "
+            f"all {found['clipped_share']:.2%}, contradicting each other "
+            f"{found['contradicting_share']:.2%} of the pixels"
+        )
+        return self.told({"capture": str(self.output), **found}, told)
 
 
 class _RunOnAsset(_Run):
@@ -299,8 +352,18 @@ class PluginPath(Command):
         return 0
 
 
-_TASKS: tuple[type[Command], ...] = (Convert, Ingest, Texture, Shade, Fit)
-_OTHERS = (Evaluate, Compare, Relight, Package, Validate, Rules, Adapters, PluginPath)
+_TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
+_OTHERS = (
+    MergeBrackets,
+    Evaluate,
+    Compare,
+    Relight,
+    Package,
+    Validate,
+    Rules,
+    Adapters,
+    PluginPath,
+)
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
     for command in (*_TASKS, *_OTHERS)

@@ -5,11 +5,17 @@ Every message is one sentence or two: what was looked at, what was found, what t
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class UsdBrdfError(Exception):
-    """Root of everything that is raised on purpose; ``exit_code`` is the command line's status."""
+    """Root of everything that is raised on purpose; ``exit_code`` is the command line's status.
+
+    found  what an adapter had found of the capture that it refuses (``capture.checks.Findings``)
+    """
 
     exit_code = 1
+    found: Any = None
 
 
 class UsageError(UsdBrdfError):

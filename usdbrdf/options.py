@@ -209,6 +209,9 @@ class IngestOptions(Options):
     "accept 8-bit photographs as sRGB; the result is then not radiometric"
     encoding: str | None = option("--encoding NAME", None, unset="as the format says")
     "colour space of the images by its OpenColorIO name, e.g. lin_ap1_scene"
+    exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
+    """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
+    or darker than the others do of the same surfaces is divided out"""
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )
@@ -222,6 +225,22 @@ class IngestOptions(Options):
     "length of a scene unit in metres"
     up_axis: Literal["Y", "Z"] | None = option("--up-axis", None, unset="as the format says")
     "axis that points up"
+
+    @property
+    def looked_at(self) -> int | None:
+        """How many frames have their pixels looked at; None: all."""
+        return None
+
+
+class InspectOptions(IngestOptions):
+    """What a user may say about a capture that is only looked at."""
+
+    frames: int = option("--frames N", 24, (2, 2**31 - 1))
+    """look at the pixels of so many frames, evenly spread, as long as all of these can be used"""
+
+    @property
+    def looked_at(self) -> int | None:
+        return self.frames
 
 
 class TextureOptions(Options):

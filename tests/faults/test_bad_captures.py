@@ -17,9 +17,10 @@ import pytest
 
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.inspection import inspect
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.images import read_exr
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import IngestOptions, InspectOptions
 
 Recipe = Callable[[MadeCapture], Any]
 
@@ -390,6 +391,9 @@ def test_fault_is_refused(capture, fault):
     assert re.fullmatch(rf"[^\n]+: [^\n]+ \[{re.escape(rule)}\]", message), message
     assert [word for word in words if word not in message] == [], message
     assert str(capture.folder) in message
+    told = inspect(capture.folder, InspectOptions(frames=4))
+    assert str(told.refusals[-1]) == message
+    assert (told.refusals[0] is told.refusals[-1]) or told.granted
     assert _files(capture.folder.parent) == before
 
 

@@ -157,6 +157,10 @@ class Photographs:
         the first pixel is (0.5, 0.5).""", samples="changes")]
     resolution: Annotated[Sequence[Sequence[int]], Fact(CAPTURE, "resolution", "int2", (0, 0),
         "Width and height of the photograph in pixels.", samples="changes")]
+    gain: Annotated[Sequence[float], Fact(CAPTURE, "gain", "double", 1.0, """What the pixel values
+        of a radiometric photograph are too bright by, without unit: estimated from what others show
+        of the same surfaces, or 1. The other radiances are those after it is divided out.""",
+        samples="every", low=0)]
     encoding: Annotated[str, Fact(CAPTURE, "encoding", "token", "lin_rec709_scene", """Colour space
         in which the image files are stored, in OpenColorIO's names. The textures are always
         lin_rec709_scene.""")]

@@ -120,8 +120,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
         raise UsageError(
             f"adapter {name!r} is not installed. Use one of {known}. [adapter.unknown]"
         )
-    if not path.exists():
-        raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
+    refuse_missing(path)
     for adapter in sound:
         try:
             if adapter.module and adapter.module.matches(path):
@@ -135,6 +134,12 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
         f"{path}: not a capture that any adapter recognises ({known}). Name the folder that holds "
         "the capture, or choose with --adapter. [adapter.none]"
     )
+
+
+def refuse_missing(path: Path) -> None:
+    """InputRefused where nothing lies at the path of a capture."""
+    if not path.exists():
+        raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
 
 
 def _loaded(point: EntryPoint) -> Adapter:

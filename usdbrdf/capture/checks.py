@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
@@ -21,7 +22,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
+from usdbrdf.model.mesh import ScanGeometry, ScanMesh, face_normals_and_angles
 from usdbrdf.transport.rays import RayScene
 
 
@@ -94,12 +95,19 @@ class DroppedFrame(NamedTuple):
 
 
 class Findings:
-    """Collected along one ingest; ends in ``Scan.warnings`` and ``Scan.counts``."""
+    """Collected along one ingest; ends in ``Scan.warnings`` and ``Scan.counts``.
+
+    frames, geometry  as far as they were read, for who is told why a capture was refused
+    looked_at         the frames whose pixels were checked, by number
+    """
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
         self.counts: dict[str, int] = {}
         self.dropped: list[DroppedFrame] = []
+        self.frames: Frames | None = None
+        self.geometry: ScanGeometry | None = None
+        self.looked_at: list[int] = []
 
     def warn(self, sentence: str) -> None:
         """Keep a sentence for the user. It is published, so it names files without their folder."""
@@ -157,6 +165,8 @@ PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _MIN_USEFUL_SHARE = 0.001
 # Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
 _MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
+# What is so near stays as it is, and so do poses that were made rigid before.
+_EXACT = 1e-14
 # Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
 # of the image.
 LARGEST_OF_POSE = 1e9
@@ -166,20 +176,6 @@ _MIN_HIT_SHARE = 0.2
 _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-# Mix-ups of conventions that are tried where the poses do not fit the mesh.
-_CONVENTIONS: dict[str, Callable[[Double], Double]] = {
-    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
-    "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
-    "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
-        lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
-    ),
-    "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
-    "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
-    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
-}
 
 
 def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
@@ -231,8 +227,10 @@ def rigid_records(
             axes = pose[:3, :3] / (pose_scale or 1.0)
             worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
             rigid = pose.copy()
-            left, _, right = np.linalg.svd(axes)
-            rigid[:3, :3], rigid[3] = left @ right, (0, 0, 0, 1)
+            if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
+                left, _, right = np.linalg.svd(axes)
+                axes = left @ right
+            rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
             kept.append(replace(record, world_from_camera=rigid))
     if worst > _ROUNDING:
         findings.warn(
@@ -347,13 +345,52 @@ def at_image_size(
 
 
 def check_frames(
-    frames: Frames, names: Sequence[str], findings: Findings, *, max_nonfinite: float
+    frames: Frames,
+    names: Sequence[str],
+    findings: Findings,
+    *,
+    max_nonfinite: float,
+    most: int | None = None,
 ) -> list[int]:
     """Indices of the frames that can be used; the others are noted in ``findings`` by their
-    ``names``. max_nonfinite is the share of unknown pixels above which a frame is dropped."""
+    ``names``.
+
+    max_nonfinite  share of unknown pixels above which a frame is dropped
+    most           look at so many frames alone, evenly spread, as long as all of these can be used
+    """
+    some = spread_evenly(len(frames), most)
+    if len(some) < len(frames) and not _any_twice(frames.image_paths):
+        glance = Findings()
+        _looked_through(frames, names, some, glance, max_nonfinite)
+        if not glance.dropped:
+            findings.looked_at = some
+            for name, number in glance.counts.items():
+                findings.count(name, number)
+            return list(range(len(frames)))
+    findings.looked_at = list(range(len(frames)))
+    return _looked_through(frames, names, findings.looked_at, findings, max_nonfinite)
+
+
+def _any_twice(paths: Sequence[Path]) -> bool:
+    """Whether two files hold the same bytes."""
+    of_size: dict[int, list[Path]] = {}
+    for path in paths:
+        of_size.setdefault(path.stat().st_size, []).append(path)
+    alike = [path for same in of_size.values() if len(same) > 1 for path in same]
+    return len({sha256_of(path) for path in alike}) < len(alike)
+
+
+def _looked_through(
+    frames: Frames,
+    names: Sequence[str],
+    which: Sequence[int],
+    findings: Findings,
+    max_nonfinite: float,
+) -> list[int]:
+    """Of the frames ``which`` those that can be used, as ``check_frames``."""
     usable: list[int] = []
     name_of: dict[str, str] = {}
-    for i in progress(range(len(frames)), total=len(frames), label="images", unit="frames"):
+    for i in progress(which, total=len(which), label="images", unit="frames"):
         path = frames.image_paths[i]
         try:
             pixels = read_frame(frames, i)
@@ -374,6 +411,13 @@ def check_frames(
         findings.count("pixels_negative_clamped", pixels.num_clamped)
         findings.count("pixels_clipped", int(pixels.clipped.sum()))
     return usable
+
+
+def spread_evenly(count: int, most: int | None) -> list[int]:
+    """``most`` of the numbers below ``count`` (None: all), with the first and the last."""
+    if most is None or most >= count:
+        return list(range(count))
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, most).round())]
 
 
 def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] | None:
@@ -420,7 +464,7 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
     share = _hit_share(scene, frames, lambda pose: pose)
     if share >= _MIN_HIT_SHARE:
         return share
-    tried = {name: _hit_share(scene, frames, read) for name, read in _CONVENTIONS.items()}
+    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
     better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= _MIN_HIT_SHARE]
     if better:
         cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"

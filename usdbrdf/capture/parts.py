@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -22,10 +26,11 @@ from usdbrdf.capture.checks import (
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
+from usdbrdf.files.images import exif_exposure
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
@@ -39,6 +44,7 @@ from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
+P = ParamSpec("P")
 _MAX_OBJECTS = 65_535
 
 
@@ -238,6 +244,21 @@ def geometry_from_file(
     )
 
 
+def _recalling(read: Callable[P, Scan]) -> Callable[P, Scan]:
+    """What was found of a capture goes with the sentence that refuses it."""
+
+    @wraps(read)
+    def reading(*given: P.args, **named: P.kwargs) -> Scan:
+        try:
+            return read(*given, **named)
+        except UsdBrdfError as error:
+            error.found = signature(read).bind(*given, **named).arguments["findings"]
+            raise
+
+    return reading
+
+
+@_recalling
 def scan_from_parts(
     records: Sequence[FrameRecord],
     read_geometry: Callable[[], ScanGeometry],
@@ -260,6 +281,7 @@ def scan_from_parts(
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
+    findings.frames = frames_from_records(records, encoding=encoding, radiometric=radiometric)
     known: set[Path] = set()
     for record in records:
         if record.image_path in known:
@@ -274,15 +296,22 @@ def scan_from_parts(
     frames, views, photograph_of = frames_of_photographs(photographs, rigid)
     findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
+    findings.frames, findings.geometry = photographs, geometry
     if not any(r.lens.curve == "equirectangular" for r in rigid):
         refuse_without_parallax(frames, geometry.mesh, source)
     hit_share = refuse_rays_that_miss(frames, geometry.mesh, source)
     usable = check_frames(
-        photographs, [r.name for r in rigid], findings, max_nonfinite=options.max_nonfinite
+        photographs,
+        [r.name for r in rigid],
+        findings,
+        max_nonfinite=options.max_nonfinite,
+        most=options.looked_at,
     )
     kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
     findings.refuse_too_few_frames(source, total, views=len(kept))
     findings.count("rays_hit_percent", round(100 * hit_share))
+    if options.looked_at is not None:
+        findings.count("frames_looked_at", len(findings.looked_at))
     # From here on the faces of a photograph count one by one.
     total += len(kept) - len(usable)
     frames, used = frames_at(frames, kept), [rigid[photograph_of[i]].name for i in kept]
@@ -353,10 +382,22 @@ def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
 def as_photographs(
     records: Sequence[FrameRecord], findings: Findings, source: Path
 ) -> list[FrameRecord]:
-    """8-bit sRGB records with the limits of such images, brought to one exposure."""
+    """8-bit sRGB records with the limits of such images, brought to one exposure: the stated one,
+    else that of all images' EXIF data."""
+    told = ""
+    if all(record.exposure_time == 1 for record in records):
+        given = [_exposure_of_file(record.image_path) for record in records]
+        known = [exposure for exposure in given if exposure is not None]
+        if known and len(known) == len(records):
+            records = [
+                replace(record, exposure_time=exposure)
+                for record, exposure in zip(records, known, strict=True)
+            ]
+            stops = math.log2(max(known) / min(known))
+            told = f" The exposures of their EXIF data are divided out ({stops:.1f} stops)."
     findings.warn(
         f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
-        "colours and relative brightness only. [capture.ldr]"
+        f"colours and relative brightness only.{told} [capture.ldr]"
     )
     saturation, noise_floor = photograph_limits(np.array([r.exposure_time for r in records]))
     return [
@@ -365,9 +406,19 @@ def as_photographs(
     ]
 
 
-def radiance_encoding(options: IngestOptions, *, photographs: bool) -> str:
-    """Colour space of the images; UsageError where the options contradict them."""
-    encoding = options.encoding or (PHOTOGRAPH_ENCODING if photographs else "lin_rec709_scene")
+def _exposure_of_file(path: Path) -> float | None:
+    with suppress(ImageRefused):  # of which the reader of its pixels will tell
+        return exif_exposure(path)
+    return None
+
+
+def radiance_encoding(
+    options: IngestOptions, *, photographs: bool, stated: str | None = None
+) -> str:
+    """Colour space of the images: the options', that which the capture states (one of
+    ``known_encodings``), or the usual one; UsageError where the options contradict the images."""
+    usual = PHOTOGRAPH_ENCODING if photographs else "lin_rec709_scene"
+    encoding = options.encoding or stated or usual
     if encoding not in known_encodings():
         raise UsageError(
             f"--encoding {encoding!r}: not known. Use one of {', '.join(known_encodings())}. "

@@ -10,6 +10,7 @@ import errno
 import hashlib
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -75,6 +76,24 @@ def temporary_beside(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             staged.unlink()
+
+
+@contextmanager
+def whole_folder(final: Path) -> Iterator[Path]:
+    """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
+    final.parent.mkdir(parents=True, exist_ok=True)
+    staged = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
+    staged.mkdir()
+    try:
+        yield staged
+        for file in staged.rglob("*"):
+            if file.is_file():
+                with file.open("rb") as written:
+                    os.fsync(written.fileno())
+        os.replace(staged, final)
+        flush_folder(final.parent)
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
 
 
 @contextmanager

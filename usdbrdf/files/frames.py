@@ -61,8 +61,9 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     primaries change.
     """
     saturation = float(frames.saturation_radiance[i])
+    gain = 1.0 if frames.gain is None else float(frames.gain[i])
     recorded, unknown, num_clamped = read_recorded(
-        frames.image_paths[i], frames.encoding, saturation
+        frames.image_paths[i], frames.encoding, saturation, gain
     )
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
@@ -78,12 +79,15 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     )
 
 
-def read_recorded(path: Path, encoding: str, saturation: float) -> tuple[Float, Bool, int]:
+def read_recorded(
+    path: Path, encoding: str, saturation: float, gain: float = 1.0
+) -> tuple[Float, Bool, int]:
     """The radiance (H, W, 3) that an image records, in its own primaries, NaN where it is unknown;
     where that is (H, W): some channel is NaN, infinite or clearly negative; and how many pixels had
     a channel a little below zero.
 
-    Channels down to -1e-3 of the frame's median are ringing and become 0.
+    saturation, gain: of the frame, see ``Frames``. Channels down to -1e-3 of the frame's median are
+    ringing and become 0.
     """
     recorded = read_radiance(path)
     if encoding == PHOTOGRAPH_ENCODING:
@@ -91,6 +95,8 @@ def read_recorded(path: Path, encoding: str, saturation: float) -> tuple[Float, 
         # the saturation; unlike a median of exposure times it stays when frames are left out.
         scale = np.float32(saturation / PHOTOGRAPH_SATURATION)
         recorded = to_working_space(recorded, encoding) * scale
+    elif gain != 1:
+        recorded = recorded / np.float32(gain)
     unknown = _in_any_channel(~np.isfinite(recorded))
     ringing = ~unknown & _in_any_channel(recorded < 0)
     if ringing.any():

@@ -90,6 +90,19 @@ def is_eight_bit(path: Path) -> bool:
     return str(_open(path, MAX_SIDE).spec().format) == "uint8"
 
 
+def exif_exposure(path: Path) -> float | None:
+    """How much light a photograph was given, from its EXIF data: exposure time in seconds times
+    ISO / 100, over the square of the f-number; what is not told counts as ISO 100 and f/1. None
+    without an exposure time."""
+    spec = _open(path, MAX_SIDE).spec()
+    time = spec.getattribute("ExposureTime")
+    number, speed = spec.getattribute("FNumber"), spec.getattribute("Exif:PhotographicSensitivity")
+    given = [v if isinstance(v, int | float) and v > 0 else None for v in (time, number, speed)]
+    if given[0] is None:
+        return None
+    return float(given[0] * (given[2] or 100) / 100 / (given[1] or 1) ** 2)
+
+
 def write_exr(
     path: Path,
     pixels: Float,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from usdbrdf.model.arrays import Bool, Double, Int
@@ -31,6 +31,8 @@ class Frames:
                           is the photograph itself; () where all are
     masks                 whose black pixels these images do not have, in the same way
     lenses                the lenses of these photographs in words, "" where there is none
+    gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
+                          by, to be divided out; the limits above are those of what is left
     """
 
     image_paths: tuple[Path, ...]
@@ -45,6 +47,7 @@ class Frames:
     photographs: tuple[Path | None, ...] = ()
     masks: tuple[Path | None, ...] = ()
     lenses: tuple[str, ...] = ()
+    gain: Double | None = None
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -54,6 +57,12 @@ class Frames:
         sources = self.photographs or (None,) * len(self)
         found = [s or path for s, path in zip(sources, self.image_paths, strict=True)]
         return list(dict.fromkeys([*found, *filter(None, self.masks)]))
+
+    def as_recorded(self) -> Frames:
+        """With the photographs for images, of which the cameras are not: for their pixels alone."""
+        given = self.photographs or (None,) * len(self)
+        images = tuple(p or image for p, image in zip(given, self.image_paths, strict=True))
+        return replace(self, image_paths=images)
 
     def camera(self, i: int) -> Camera:
         """The camera of frame i, named after its image."""

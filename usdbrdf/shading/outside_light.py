@@ -105,7 +105,7 @@ def _solved_channel(
     effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
 
     def by_segment(values: Double) -> Double:
-        return np.bincount(asked.segment, values, num_segments)
+        return np.bincount(asked.segment, values, num_segments).astype(np.float64)
 
     for _ in range(iterations):
         parts = np.exp(g)[:, None] * sources.share

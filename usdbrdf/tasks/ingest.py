@@ -15,13 +15,14 @@ from usdbrdf.asset.layers.scan_layer import (
     write_scan_layer,
 )
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
-from usdbrdf.capture.adapters import choose_adapter, read_with
+from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
 from usdbrdf.capture.develop import developed
-from usdbrdf.errors import InputRefused
+from usdbrdf.capture.native import refuse_taken, write_capture
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
@@ -33,9 +34,13 @@ def ingest(
     adapter: str | None = None,
     *,
     plugins: bool = True,
+    copy_to: Path | None = None,
 ) -> TaskResult:
-    """Read and check a capture and write it as the weakest layer of ``asset``. Raises InputRefused
-    for a capture that cannot be used; nothing is published then."""
+    """Read and check a capture and write it as the weakest layer of ``asset``, and as a capture of
+    our own format into the new folder ``copy_to``. Raises InputRefused for a capture that cannot be
+    used, OwnershipConflict where ``copy_to`` is taken; nothing is published then."""
+    if copy_to is not None:
+        refuse_taken(copy_to, capture)
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -60,9 +65,14 @@ def ingest(
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
         # Photographs through lenses become frames last, when nothing else can be refused.
+        places = [str(path) for path in scan.frames.image_paths]
         scan = replace(scan, frames=developed(scan, asset.folder, run.output_kept))
+        images = [run.kept.get(place, Path(place)) for place in places]
+        asked, told = asked_of_its_pixels(scan, images, options)
+        if copy_to is not None:
+            write_capture(scan, images, copy_to)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
+        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         for role in ROLES[1:]:
@@ -76,9 +86,15 @@ def ingest(
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
             "warnings": warnings,
+            **told,
         }
 
-    return task.run(work)
+    result = task.run(work)
+    if copy_to is not None and not result.reran:
+        scan = read_with(chosen, capture, options)
+        scan = replace(scan, frames=developed(scan, asset.folder, lambda *_: None))
+        write_capture(scan, scan.frames.image_paths, copy_to)
+    return result
 
 
 def _inputs(
@@ -89,8 +105,7 @@ def _inputs(
     lie, seen from scan.usdc, which names photographs and USD geometry by such paths: what is moved
     must be read anew."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
-    if not capture.exists():
-        raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
+    refuse_missing(capture)
     outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
     inputs = {
         label: hash_of_files(files_below(place, without=asset.folder), place)

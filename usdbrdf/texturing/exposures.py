@@ -10,6 +10,7 @@ cannot be known; their median is 0.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
-from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
@@ -118,18 +119,40 @@ def _mean(value: Double, weight: Double) -> Double:
     return np.asarray((weight * value).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
+def with_estimated_exposures(frames: Frames, logarithm: Float) -> tuple[Frames, dict[str, float]]:
+    """The frames as if each had been exposed as its pixels say, and image and gain of those that
+    contradicted the others. Frames that share too little with others stay as they are.
+
+    logarithm  (P, N) as in ``Probes``
+    """
+    found = gains_of_frames(logarithm)
+    known = found.samples >= _FEWEST
+    gain = np.where(known, np.exp(found.logarithm), 1.0)
+    off = np.flatnonzero(known & _contradict(found))
+    changed = replace(
+        frames,
+        exposure_time=frames.exposure_time * gain,
+        saturation_radiance=frames.saturation_radiance / gain,
+        noise_floor_radiance=frames.noise_floor_radiance / gain,
+        gain=gain * (1.0 if frames.gain is None else frames.gain) if frames.radiometric else None,
+    )
+    return changed, {frames.image_paths[i].name: round(float(gain[i]), 2) for i in off}
+
+
+def _contradict(gains: Gains) -> Bool:
+    size = np.abs(gains.logarithm)
+    return np.asarray((size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter), np.bool_)
+
+
 def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
     """Image and gain of the frames that show the same texels brighter or darker than the others do,
-    by half a stop or more; the user is told.
+    by a quarter of a stop or more; the user is told.
 
     Raises InputRefused where more than a fifth do and the images are said to be radiance.
     """
     gains = gains_of_frames(logarithm)
     compared = gains.samples >= _FEWEST
-    size = np.abs(gains.logarithm)
-    off = np.flatnonzero(
-        compared & (size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter)
-    )
+    off = np.flatnonzero(compared & _contradict(gains))
     factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
     if not factor:
         return {}
@@ -144,8 +167,12 @@ def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
     )
     if frames.radiometric and len(off) > _MOST * compared.sum():
         raise InputRefused(
-            f"{what} (limits: half a stop, {_MOST:.0%} of the frames). {cause}. "
-            "Export radiance in one unit for all frames. [texturing.exposure]"
+            f"{what} (limits: a quarter of a stop, {_MOST:.0%} of the frames). {cause}. "
+            "Export radiance in one unit for all frames, or run ingest with --exposure estimate. "
+            "[texturing.exposure]"
         )
-    warn(f"{what}. {cause}. Correct them or leave them out. [texturing.exposure]")
+    warn(
+        f"{what}. {cause}. Correct them, leave them out, or use --exposure estimate. "
+        "[texturing.exposure]"
+    )
     return factor

@@ -253,7 +253,11 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
         said[name] = [storable_path(file, folder) if file else "" for file in files]
     for name, _ in facts_of(Photographs):
         if name not in said:
-            value = getattr(frames, name)
+            value = (
+                np.ones(len(frames))
+                if name == "gain" and frames.gain is None
+                else getattr(frames, name)
+            )
             said[name] = value.tolist() if isinstance(value, np.ndarray) else value
     plates = [Sdf.AssetPath(image) for image in images]
     for fact, value in known_facts(Photographs(**said)):

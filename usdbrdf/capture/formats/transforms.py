@@ -28,7 +28,9 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.colour import known_encodings
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.frames import PHOTOGRAPH_ENCODING
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
@@ -83,7 +85,12 @@ def read(path: Path, options: IngestOptions) -> Scan:
     photographs = refuse_photographs(
         [r.image_path for r in records], assume_srgb=options.assume_srgb
     )
-    encoding = radiance_encoding(options, photographs=photographs)
+    stated = _stated(capture, "encoding", known_encodings())
+    if stated is not None and photographs != (stated == PHOTOGRAPH_ENCODING):
+        kind = "8-bit photographs" if photographs else "scene-linear images"
+        said = f"encoding is {stated!r}, but the images are {kind}. Remove or correct it."
+        raise capture.refuse(said, "capture.format")
+    encoding = radiance_encoding(options, photographs=photographs, stated=stated)
     if photographs:
         records = as_photographs(records, findings, source)
     elif unknown := sum(math.isinf(r.saturation_radiance) for r in records):
@@ -99,6 +106,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
             options,
             findings,
             capture_root=source.parent,
+            meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         ),
         options,
         findings,
@@ -107,6 +115,8 @@ def read(path: Path, options: IngestOptions) -> Scan:
         source=source,
         encoding=encoding,
         radiometric=not photographs,
+        meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
+        up_axis=_stated(capture, "up_axis", ("Y", "Z")) or "Z",
     )
 
 
@@ -204,6 +214,12 @@ def _captured(
 
 def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
     """One frame, or None where its pose or its file is missing."""
+    if "brackets" in frame:
+        raise capture.refuse(
+            "its frames are brackets of photographs. Make one frame of radiance of each with "
+            "`usdbrdf merge-brackets`, and convert what that writes.",
+            "capture.brackets",
+        )
     name = frame.get("file_path")
     if not isinstance(name, str):
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
@@ -411,6 +427,15 @@ def _beside(capture: _Capture, key: str, usual: str) -> Path:
     if not isinstance(name, str):
         raise capture.refuse(f"{key} is not a file name. Correct it.", "capture.format")
     return path_in_capture(capture.source.parent, name, capture.options)
+
+
+def _stated(capture: _Capture, key: str, known: tuple[str, ...]) -> str | None:
+    """A word of the document that is one of the known ones, None where it has none."""
+    word = capture.document.get(key)
+    if word is not None and word not in known:
+        said = f"{key} is {str(word)[:40]!r}, none of {', '.join(known)}. Correct it."
+        raise capture.refuse(said, "capture.format")
+    return word
 
 
 def _objects(capture: _Capture) -> Path | None:

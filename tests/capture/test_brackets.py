@@ -1,0 +1,271 @@
+"""Radiance from brackets of a camera whose response, noise and scene are made up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from tests.scenes import MadeCapture, edited, make_capture
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.brackets import aligned, merge, response_from_brackets
+from usdbrdf.cli import main
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.frames import read_frame
+from usdbrdf.files.images import read_exr, write_preview_png
+from usdbrdf.options import IngestOptions
+
+EXPOSURES = 16 * 4.0 ** -np.arange(9.0)
+
+
+def _develop(exposure: np.ndarray) -> np.ndarray:
+    """A film-like response: a toe, a shoulder, a different one for each channel."""
+    gamma = np.array([2.4, 2.2, 1.9])
+    bent = exposure ** (1 / gamma)
+    return np.clip((bent + 0.25 * bent**2) / 1.25, 0, 1)
+
+
+def _scene(shape: tuple[int, int] = (160, 240), *, decades: float = 5, seed: int = 0) -> np.ndarray:
+    """(H, W, 3) radiance from 1 to 10^decades, patches of all levels side by side."""
+    rng = np.random.default_rng(seed)
+    level = rng.uniform(0, decades, (shape[0] // 10, shape[1] // 10)).repeat(10, 0).repeat(10, 1)
+    tint = rng.uniform(0.5, 1, (shape[0] // 10, shape[1] // 10, 3)).repeat(10, 0).repeat(10, 1)
+    shade = 1 + 0.1 * np.sin(np.arange(shape[1]) / 3)[None, :, None]
+    return 10 ** level[..., None] * tint * shade
+
+
+def _photograph(shape: tuple[int, int], *, decades: float, seed: int = 0) -> np.ndarray:
+    """(H, W, 3) radiance with detail of all sizes, as photographs have."""
+    rng = np.random.default_rng(seed)
+    level = sum(
+        s * gaussian_filter(rng.standard_normal(shape), s, mode="wrap") for s in (2, 5, 15, 40)
+    )
+    level = (level - level.min()) / np.ptp(level)
+    return 10 ** (decades * level[..., None]) * np.array([0.7, 1, 0.8])
+
+
+def _shoot(scene: np.ndarray, exposures: np.ndarray, *, seed: int = 1) -> np.ndarray:
+    """(K, H, W, 3) codes: shot noise of 20,000 electrons at white, read noise of 5, 8 bits."""
+    rng = np.random.default_rng(seed)
+    full = 20_000
+    pictures = []
+    for exposure in exposures:
+        electrons = np.minimum(scene * exposure / 100, 4) * full
+        noisy = electrons + np.sqrt(electrons + 25) * rng.standard_normal(scene.shape)
+        pictures.append(np.round(255 * _develop(np.clip(noisy / full, 0, 1))))
+    return np.array(pictures).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def bracket():
+    scene = _scene()
+    codes = _shoot(scene, EXPOSURES)
+    return scene, codes, response_from_brackets([codes], [EXPOSURES])
+
+
+def test_the_response_is_the_cameras(bracket):
+    response = bracket[2].logarithm
+    assert (np.diff(response, axis=1) >= 0).all()
+    exposure = np.linspace(0, 1, 200_001)
+    codes = 255 * _develop(exposure[:, None].repeat(3, 1))
+    for channel in range(3):
+        inside = np.arange(24, 245)
+        true = np.log(np.interp(inside, codes[:, channel], exposure))
+        found = response[channel, inside]
+        off = (found - true) - np.median(found - true)
+        assert np.abs(off).max() < 0.05
+        assert np.median(np.abs(off)) < 0.01
+
+
+def test_radiance_over_five_decades_is_true_to_two_per_cent(bracket):
+    scene, codes, response = bracket
+    merged = merge(codes, EXPOSURES, response)
+    known = np.isfinite(merged.radiance) & (merged.radiance < merged.saturation)
+    known &= merged.radiance >= merged.noise_floor
+    assert known.mean() > 0.97
+    assert merged.ghost < 0.03
+    ratio = np.where(known, merged.radiance / scene, np.nan)
+    ratio /= np.nanmedian(ratio, axis=(0, 1))
+    for decade in range(5):
+        own = (scene >= 10.0**decade) & (scene < 10.0 ** (decade + 1))
+        assert np.nanmedian(np.abs(ratio[own] - 1)) < 0.02, decade
+
+
+def test_what_clips_in_all_is_clipped_and_what_is_dark_in_all_is_dark(bracket):
+    scene, _, response = bracket
+    codes = _shoot(scene, EXPOSURES[:4])
+    merged = merge(codes, EXPOSURES[:4], response)
+    clipped = (codes > 250).all(axis=0)
+    assert clipped.mean() > 0.1
+    assert (merged.radiance[clipped] >= merged.saturation).all()
+    assert not np.isnan(merged.radiance[clipped]).any()
+    codes = _shoot(scene, EXPOSURES[6:])
+    merged = merge(codes, EXPOSURES[6:], response)
+    dark = (codes < 4).all(axis=0)
+    assert dark.mean() > 0.05
+    assert (merged.radiance[dark] < merged.noise_floor).all()
+
+
+def test_what_moved_between_the_exposures_is_unknown(bracket):
+    scene, codes, response = bracket
+    codes = codes.copy()
+    passer = np.full((60, 30, 3), 3000.0)
+    codes[3, 50:110, 100:130] = _shoot(passer, EXPOSURES[3:4])[0]
+    merged = merge(codes, EXPOSURES, response)
+    # Where the scene does not clip in that exposure, the passer, who does, stands out.
+    seen = (scene[51:109, 101:129] * EXPOSURES[3] / 100 < 0.3).all(axis=2)
+    assert seen.sum() > 400
+    assert np.isnan(merged.radiance[51:109, 101:129][seen]).all(axis=1).mean() > 0.95
+    outside = np.ones(scene.shape[:2], bool)
+    outside[50:110, 100:130] = False
+    assert np.isnan(merged.radiance[outside]).mean() < 0.03
+
+
+def test_one_exposure_tells_no_response():
+    codes = _shoot(_scene(), EXPOSURES[:1])
+    with pytest.raises(InputRefused, match=r"\[brackets\.response\]$"):
+        response_from_brackets([codes], [EXPOSURES[:1]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_shaken_brackets_are_shifted_back(seed):
+    rng = np.random.default_rng(seed)
+    scene, margin = _photograph((300, 400), decades=3, seed=seed), 40
+    offsets = rng.integers(-6, 7, (5, 2))
+    exposures = EXPOSURES[2:7]
+    views = [
+        scene[margin - a : 300 - margin - a, margin - b : 400 - margin - b] for a, b in offsets
+    ]
+    codes = np.array([_shoot(v, e[None])[0] for v, e in zip(views, exposures, strict=True)])
+    straight, shifts = aligned(codes, list("abcde"))
+    assert np.abs(shifts - (offsets[2] - offsets)).max() <= 1
+    whole = straight.any(axis=(0, 3))
+    assert whole.mean() > 0.6
+    response = response_from_brackets([straight], [exposures])
+    left = merge(straight, exposures, response).ghost
+    assert left < 0.06
+    assert merge(codes, exposures, response).ghost > 4 * left
+
+
+def test_still_brackets_stay_as_they_are():
+    codes = _shoot(_scene(), EXPOSURES)
+    straight, shifts = aligned(codes, list("abcdefghi"))
+    assert not shifts.any()
+    np.testing.assert_array_equal(straight, codes)
+
+
+def test_turned_brackets_are_refused():
+    scene = _photograph((300, 400), decades=3)
+    angle = np.radians(3)
+    y, x = np.mgrid[:300, :400] - np.array([150, 200])[:, None, None]
+    rows = np.clip((np.cos(angle) * y - np.sin(angle) * x + 150).astype(int), 0, 299)
+    columns = np.clip((np.sin(angle) * y + np.cos(angle) * x + 200).astype(int), 0, 399)
+    codes = np.concatenate([
+        _shoot(scene, EXPOSURES[2:3]), _shoot(scene[rows, columns], EXPOSURES[3:4])
+    ])  # fmt: skip
+    with pytest.raises(InputRefused, match=r"^a: its parts .* against b.*\[brackets\.moved\]$"):
+        aligned(codes, ["a", "b"])
+
+
+def _bracketed(folder: Path, *, same_poses: bool) -> MadeCapture:
+    """A capture of six exposures a view, as JPEG-like photographs of the made up camera."""
+    capture = make_capture(folder, size=(64, 48))
+    times = 4.0 ** -np.arange(6.0)
+    with edited(capture.manifest) as document:
+        frames = []
+        for i, frame in enumerate(document["frames"]):
+            scene = 400 * np.maximum(read_exr(capture.image(i)), 0.01).astype(np.float64)
+            capture.image(i).unlink()
+            files = [{"file_path": f"frames/{i}_{k}.png"} for k in range(6)]
+            for k, codes in enumerate(_shoot(scene, times, seed=i)):
+                _write_photograph(folder / files[k]["file_path"], codes, time=times[k])
+            whole = {k: v for k, v in frame.items() if k == "transform_matrix"}
+            if same_poses:
+                frames += [{**whole, **file} for file in files]
+            else:
+                shuffled = [files[k] for k in (3, 0, 5, 1, 4, 2)]
+                frames.append({**whole, "file_path": "frames/none.exr", "brackets": shuffled})
+        document["frames"] = frames
+    return capture
+
+
+def _write_photograph(path: Path, codes: np.ndarray, *, time: float) -> None:
+    """With its exposure in its EXIF data alone: at f/2 and ISO 400 it has the given time."""
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
+    spec.attribute("ExposureTime", float(time))
+    spec.attribute("FNumber", 2.0)
+    spec.attribute("Exif:PhotographicSensitivity", 400)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(codes)
+    assert output.close()
+
+
+@pytest.mark.parametrize("same_poses", [True, False])
+def test_a_capture_of_brackets_becomes_one_of_radiance(tmp_path, same_poses, capsys):
+    capture = _bracketed(tmp_path / "scan", same_poses=same_poses)
+    if not same_poses:
+        with pytest.raises(InputRefused, match=r"merge-brackets.*\[capture\.brackets\]$"):
+            read_scan(capture.folder, IngestOptions())
+    assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged"), "-q"]) == 0
+    scan = read_scan(tmp_path / "merged", IngestOptions())
+    assert (len(scan.frames), scan.frames.radiometric) == (12, True)
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera)
+    radiance = np.array([read_frame(scan.frames, i).radiance for i in range(12)])
+    fresh = make_capture(tmp_path / "again", size=(64, 48))
+    true = np.array([read_exr(fresh.image(i)) for i in range(12)])
+    plain = true.max(axis=3) < 1
+    ratio = (radiance / true)[plain]
+    ratio /= np.nanmedian(ratio, axis=0)
+    assert np.nanmedian(np.abs(ratio - 1)) < 0.02
+    assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged")]) == 6
+
+
+@pytest.mark.parametrize("fault", ["no exposure", "no brackets", "another size", "no file"])
+def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
+    capture = _bracketed(tmp_path / "scan", same_poses=False)
+    first = capture.folder / "frames/2_1.png"
+    if fault == "no exposure":
+        write_preview_png(first, np.zeros((48, 64, 3), np.uint8))
+    if fault == "another size":
+        _write_photograph(first, np.zeros((24, 64, 3), np.uint8), time=0.25)
+    if fault == "no file":
+        first.unlink()
+    if fault == "no brackets":
+        with edited(capture.manifest) as document:
+            for frame in document["frames"]:
+                frame["file_path"] = frame.pop("brackets")[0]["file_path"]
+    assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged")]) == 3
+    rule = {
+        "no exposure": "[brackets.exposure]",
+        "no brackets": "[brackets.none]",
+        "another size": "[brackets.size]",
+        "no file": "[capture.file]",
+    }[fault]
+    assert capsys.readouterr().err.endswith(f"{rule}\n")
+    assert not (tmp_path / "merged").exists()
+
+
+def test_photographs_of_several_exposures_get_one_scale_by_their_exif_data(tmp_path):
+    capture = make_capture(tmp_path / "scan")
+    radiance = {}
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            time = (1 / 20, 1 / 80)[i % 2]
+            light = read_exr(capture.image(i)) * time * 16
+            srgb = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+            frame["file_path"] = f"frames/{i}.png"
+            codes = np.round(255 * np.clip(srgb, 0, 1)).astype(np.uint8)
+            _write_photograph(capture.folder / frame["file_path"], codes, time=time)
+            del frame["exposure_time"]
+            radiance[i] = read_exr(capture.image(i))
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert any("EXIF data are divided out (2.0 stops)" in warning for warning in scan.warnings)
+    ratios = []
+    for i in range(12):
+        pixels = read_frame(scan.frames, i)
+        ratios.append(np.median((pixels.radiance / radiance[i])[pixels.valid]))
+    np.testing.assert_allclose(ratios, ratios[0], rtol=0.03)

@@ -1,0 +1,159 @@
+"""A capture whose frames are brackets becomes one of radiance, before anything else reads it.
+
+In transforms.json a frame has ``brackets``, a list of ``{"file_path", "exposure_time"}``, or
+several frames have one transform_matrix. All photographs are 8-bit ones of one camera with fixed
+settings but for the exposure, which where it is not stated is in their EXIF data.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from usdbrdf.capture.brackets import Response, aligned, merge, response_from_brackets
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.atomic import environment_failures, whole_folder
+from usdbrdf.files.documents import read_json, write_json
+from usdbrdf.files.images import exif_exposure, is_eight_bit, needs_float, read_radiance, write_exr
+from usdbrdf.files.paths import contained
+from usdbrdf.job.progress import progress
+from usdbrdf.model.arrays import Byte, Double
+
+# Brackets that the response is told by.
+_TELLING = 12
+
+
+class Bracket(NamedTuple):
+    """Of one view: the entry that the document has for it, the images by exposure, the longest
+    first, and their exposures (K,)."""
+
+    entry: Mapping[str, Any]
+    images: tuple[Path, ...]
+    exposures: Double
+
+
+def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
+    """Write the capture with one EXR of radiance for each bracket into the new ``folder``, and say
+    what was found: numbers of brackets and photographs, shares of clipped and contradicting pixels.
+
+    The unit is the same for all frames and has no other meaning: radiometric up to one scale.
+    Raises InputRefused for what makes no brackets.
+    """
+    source = capture / "transforms.json" if capture.is_dir() else capture
+    document = read_json(source, nonfinite_below=("transform_matrix",))
+    brackets = _brackets(source, document)
+    telling = [brackets[i] for i in spread_evenly(len(brackets), _TELLING)]
+    response = response_from_brackets(
+        [_codes(bracket) for bracket in telling], [bracket.exposures for bracket in telling]
+    )
+    frames, clipped, ghosts = [], [], []
+    with environment_failures(str(folder)), whole_folder(folder) as staged:
+        (staged / "frames").mkdir()
+        for i, bracket in enumerate(
+            progress(brackets, total=len(brackets), label="brackets", unit="brackets")
+        ):
+            name = f"frames/{i:05d}_{bracket.images[0].stem}.exr"
+            entry, shares = _merged(bracket, response, staged / name)
+            frames.append({**entry, "file_path": name})
+            clipped.append(shares[0])
+            ghosts.append(shares[1])
+        for key, usual in (("mesh", "mesh.ply"), ("objects", "objects.json")):
+            beside = contained(source.parent, str(document.get(key, usual)))
+            if beside.is_file():
+                place = contained(staged, str(document.get(key, usual)))
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(beside, place)
+        write_json(staged / "transforms.json", {**document, "frames": frames})
+    ranges = [float(b.exposures[0] / b.exposures[-1]) for b in brackets]
+    return {
+        "brackets": len(brackets),
+        "photographs": sum(len(bracket.images) for bracket in brackets),
+        "stops": float(np.log2(max(ranges))),
+        "clipped_share": float(np.mean(clipped)),
+        "contradicting_share": float(np.mean(ghosts)),
+        "contradicting_share_of_worst": float(np.max(ghosts)),
+    }
+
+
+def _merged(
+    bracket: Bracket, response: Response, place: Path
+) -> tuple[dict[str, Any], tuple[float, float]]:
+    """Writes the picture; the frame's entry, and the shares of clipped and contradicting pixels."""
+    found = merge(_codes(bracket), bracket.exposures, response)
+    # What is clearly negative is unknown to every reader of frames.
+    pixels = np.where(np.isnan(found.radiance), -np.float32(found.saturation), found.radiance)
+    write_exr(place, pixels, half=not needs_float(pixels))
+    entry = {k: v for k, v in bracket.entry.items() if k not in ("brackets", "exposure_time")}
+    entry.update(saturation_radiance=found.saturation, noise_floor_radiance=found.noise_floor)
+    return entry, (found.clipped, found.ghost)
+
+
+def _codes(bracket: Bracket) -> Byte:
+    """(K, H, W, 3), shifted onto each other."""
+    pictures = []
+    for path in bracket.images:
+        if not is_eight_bit(path):
+            raise InputRefused(
+                f"{path}: not an 8-bit image. Brackets are merged from JPEG or PNG; merge others "
+                "with the program that developed them. [brackets.format]"
+            )
+        pictures.append(np.round(255 * read_radiance(path)).astype(np.uint8))
+    sizes = {picture.shape for picture in pictures}
+    if len(sizes) > 1:
+        raise InputRefused(
+            f"{bracket.images[0]}: the images of this bracket have {len(sizes)} sizes. Export all "
+            "of them alike. [brackets.size]"
+        )
+    return aligned(np.array(pictures), [path.name for path in bracket.images])[0]
+
+
+def _brackets(source: Path, document: Any) -> list[Bracket]:
+    """The brackets of a document, in its order."""
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputRefused(
+            f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
+            "capture's own document. [capture.format]"
+        )
+    views: dict[str, tuple[Mapping[str, Any], list[Any]]] = {}
+    for frame in frames:
+        listed = frame.get("brackets")
+        images = listed if isinstance(listed, list) else [frame]
+        _, own = views.setdefault(str(frame.get("transform_matrix")), (frame, []))
+        own.extend(images)
+    found = [_bracket(source, entry, images) for entry, images in views.values()]
+    if not found or all(len(bracket.images) < 2 for bracket in found):
+        raise InputRefused(
+            f"{source}: no frame has brackets, and no two frames have one transform_matrix. List "
+            'the photographs of each view as "brackets", or convert the capture as it is. '
+            "[brackets.none]"
+        )
+    return found
+
+
+def _bracket(source: Path, entry: Mapping[str, Any], images: list[Any]) -> Bracket:
+    paths, exposures = [], []
+    for image in images:
+        name = image.get("file_path") if isinstance(image, dict) else None
+        if not isinstance(name, str):
+            raise InputRefused(f"{source}: a bracket without file_path. Name it. [brackets.format]")
+        path = contained(source.parent, name)
+        if not path.is_file():
+            raise InputRefused(f"{path}: no such file. Copy it or remove its entry. [capture.file]")
+        given = image.get("exposure_time")
+        if given is None:
+            given = exif_exposure(path)
+        if isinstance(given, bool) or not isinstance(given, int | float) or not given > 0:
+            raise InputRefused(
+                f"{path}: no exposure_time is stated, and its EXIF data has none. State the "
+                "exposure in seconds. [brackets.exposure]"
+            )
+        paths.append(path)
+        exposures.append(float(given))
+    order = np.argsort([-exposure for exposure in exposures], kind="stable")
+    return Bracket(entry, tuple(paths[i] for i in order), np.array(exposures)[order])

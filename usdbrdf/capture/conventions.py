@@ -1,0 +1,33 @@
+"""Readings of camera poses that are mixed up with ours: OpenGL axes, world from camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from usdbrdf.model.arrays import Double
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+def _transposed(pose: Double) -> Double:
+    turned = pose.copy()
+    turned[:3, :3] = pose[:3, :3].T
+    return turned
+
+
+# Mix-ups of conventions that are tried where the poses do not fit the mesh.
+CONVENTIONS: dict[str, Callable[[Double], Double]] = {
+    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
+    "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
+    "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
+        lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
+    ),
+    "rotations transposed (transpose them, keep the positions)": _transposed,
+    "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
+    "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
+    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
+}

@@ -1,0 +1,122 @@
+"""A Scan as a capture in our own format: transforms.json, frames, mesh.ply and objects.json.
+
+Read again with the same options it gives the same Scan. What the format cannot hold is what a USD
+mesh says beyond its triangles: its shading normals and the prims that it is referenced by.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.errors import OwnershipConflict
+from usdbrdf.files.atomic import environment_failures, whole_folder
+from usdbrdf.files.documents import write_json
+from usdbrdf.files.ply import write_ply
+from usdbrdf.job.progress import progress, warn
+from usdbrdf.model.arrays import Int
+from usdbrdf.model.capture import Frames, Scan
+
+
+def refuse_taken(folder: Path, capture: Path) -> None:
+    """OwnershipConflict where the folder of a capture to be written holds anything, or lies in the
+    capture that it is made of."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise OwnershipConflict(
+            f"{folder}: there is something already, and a capture is never written over. Name a "
+            "new folder. [ownership.taken]"
+        )
+    source = (capture if capture.is_dir() else capture.parent).resolve()
+    if folder.resolve().is_relative_to(source):
+        raise OwnershipConflict(
+            f"{folder}: lies inside the capture {source}, which would change by it. Name a folder "
+            "elsewhere. [ownership.inside]"
+        )
+
+
+def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
+    """Write a scan, whose frames lie in ``images`` now, as a capture that the adapter "transforms"
+    reads; it appears whole or not at all in the new or empty ``folder``.
+
+    Frames are copied as they are. Raises EnvironmentFailure where the disk does not take them.
+    """
+    if scan.usd_geometry is not None:
+        warn(
+            f"{folder}: mesh.ply holds the triangles and objects of {scan.usd_geometry.name}, not "
+            "its normals and texture coordinates. [capture.write]"
+        )
+    with environment_failures(str(folder)), whole_folder(folder) as staged:
+        (staged / "frames").mkdir()
+        names = _frame_names(scan.frames)
+        copies = zip(images, names, strict=True)
+        for image, name in progress(copies, total=len(names), label="frames", unit="files"):
+            shutil.copyfile(image, staged / name)
+        write_ply(staged / "mesh.ply", scan.mesh.points[: _own_points(scan)], *_faces(scan))
+        objects = [
+            {"id": i, "name": label.label, "class_name": label.class_name}
+            for i, label in enumerate(scan.objects)
+        ]
+        write_json(staged / "objects.json", {"objects": objects})
+        write_json(staged / "transforms.json", _document(scan, names))
+
+
+def _frame_names(frames: Frames) -> list[str]:
+    """Paths in the capture: the images' own names, numbered where two are alike."""
+    count = Counter(path.name.lower() for path in frames.image_paths)
+    alike = max(count.values(), default=0) > 1
+    numbered = (f"{i:05d}_" if alike else "" for i in range(len(frames)))
+    return [f"frames/{n}{path.name}" for n, path in zip(numbered, frames.image_paths, strict=True)]
+
+
+def _document(scan: Scan, names: list[str]) -> dict[str, Any]:
+    frames = scan.frames
+    return {
+        "camera_model": "PINHOLE",
+        "encoding": frames.encoding,
+        "meters_per_unit": scan.meters_per_unit,
+        "up_axis": scan.up_axis,
+        "mesh": "mesh.ply",
+        "objects": "objects.json",
+        "frames": [_entry(frames, i, name) for i, name in enumerate(names)],
+    }
+
+
+def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
+    width, height = frames.resolution[i].tolist()
+    intrinsics = zip(("fl_x", "fl_y", "cx", "cy"), frames.intrinsics[i].tolist(), strict=True)
+    entry: dict[str, Any] = {
+        "file_path": name,
+        "transform_matrix": frames.world_from_camera[i].tolist(),
+        "w": width,
+        "h": height,
+        **dict(intrinsics),
+        "exposure_time": float(frames.exposure_time[i]),
+    }
+    saturation = float(frames.saturation_radiance[i])
+    if frames.radiometric and math.isfinite(saturation):
+        entry["saturation_radiance"] = saturation
+    if frames.radiometric and frames.noise_floor_radiance[i] > 0:
+        entry["noise_floor_radiance"] = float(frames.noise_floor_radiance[i])
+    return entry
+
+
+def _own_faces(scan: Scan) -> int:
+    """How many faces the capture's own mesh has: second skins come after them."""
+    return len(scan.mesh.triangles) if scan.turned_faces is None else len(scan.turned_faces)
+
+
+def _own_points(scan: Scan) -> int:
+    """The same of its points: each face of a second skin has three of its own."""
+    return len(scan.mesh.points) - 3 * (len(scan.mesh.triangles) - _own_faces(scan))
+
+
+def _faces(scan: Scan) -> tuple[Int, Int]:
+    """Triangles (F, 3) as the capture winds them, and their objects (F,)."""
+    count = _own_faces(scan)
+    triangles = scan.mesh.triangles[:count].copy()
+    if scan.turned_faces is not None:
+        triangles[scan.turned_faces] = triangles[scan.turned_faces][:, [0, 2, 1]]
+    return triangles, scan.mesh.face_object[:count]

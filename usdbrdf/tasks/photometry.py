@@ -1,0 +1,129 @@
+"""What is asked of a scan's pixels before it is written: do its frames show the same things at the
+same points of the mesh, and how bright is each beside the others?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.capture.conventions import CONVENTIONS
+from usdbrdf.capture.inspection import Inspection
+from usdbrdf.capture.inspection import inspect as inspect_capture
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.frames import FramePixels, read_frame, read_frames
+from usdbrdf.job.progress import progress, warn
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.options import IngestOptions, InspectOptions
+from usdbrdf.texturing.agreement import (
+    Agreement,
+    agreement,
+    is_doubtful,
+    logarithms_in_frame,
+    other_convention,
+    points_of_surface,
+)
+from usdbrdf.texturing.exposures import with_estimated_exposures
+from usdbrdf.transport.rays import RayScene
+
+Read = Callable[[int], FramePixels]
+# Frames that are asked whether they agree.
+_ASKED = 16
+
+
+def asked_of_its_pixels(
+    scan: Scan, images: Sequence[Path], options: IngestOptions
+) -> tuple[Scan, dict[str, Any]]:
+    """The scan, whose frames lie in ``images`` now, its exposures estimated if that is wanted, and
+    what was found, for the record."""
+    read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
+    agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
+    told: dict[str, Any] = {"agreement": agrees and agrees.ratio}
+    if options.exposure == "estimate":
+        scan, told["estimated_exposures"] = estimated_exposures(scan, read)
+    return scan, told
+
+
+def agreement_of_frames(
+    mesh: ScanMesh, frames: Frames, read: Read, source: Path
+) -> Agreement | None:
+    """How far some frames agree; None where they see too few points in common.
+
+    Raises InputRefused, in the name of ``source``, where they hardly do and would under another
+    reading of the poses.
+    """
+    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+    asked = spread_evenly(len(frames), _ASKED)
+
+    def under(readings: Mapping[str, Callable[[Double], Double]]) -> dict[str, Agreement | None]:
+        found: dict[str, list[Float]] = {name: [] for name in readings}
+        images = read_frames(read, asked)
+        for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
+            camera = frames.camera(i)
+            for name, read in readings.items():
+                other = replace(camera, world_from_camera=read(camera.world_from_camera))
+                found[name].append(logarithms_in_frame(surface, rays, other, pixels))
+        return {name: agreement(np.stack(some, axis=1)) for name, some in found.items()}
+
+    given = under({"": lambda pose: pose})[""]
+    if not is_doubtful(given):
+        return given
+    found = under(CONVENTIONS)
+    name = other_convention(given, found)
+    better = found.get(name)
+    if better is not None:
+        differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "cannot"
+        raise InputRefused(
+            f"{source}: the frames do not show the same things at the same points of the mesh "
+            f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
+            "Convert the poses. [capture.convention]"
+        )
+    if given is not None:
+        warn(
+            f"{source}: frames that show the same points of the mesh differ by {given.ratio:.0%} "
+            "of what any two pixels do, under every usual reading of the poses. Check that poses, "
+            "mesh and images belong together. [capture.agreement]"
+        )
+    return given
+
+
+def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]:
+    """The scan with its frames exposed as their pixels say; image and gain of those that
+    contradicted the others by much, of which the user is told."""
+    frames, mesh = scan.frames, scan.mesh
+    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+    images = read_frames(read, range(len(frames)))
+    seen = progress(images, total=len(frames), label="exposures", unit="frames")
+    columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]
+    frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1))
+    if off:
+        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in off.items())
+        warn(
+            f"{scan.source.name}: {len(off)} of {len(frames)} frames contradicted the others, "
+            f"{named}; what all are off by was divided out. [capture.exposure]"
+        )
+    return replace(scan, frames=frames), off
+
+
+def inspect(
+    capture: Path, options: InspectOptions, adapter: str | None = None, *, plugins: bool = True
+) -> Inspection:
+    """``capture.inspection``, and whether poses, mesh and frames agree."""
+    found = inspect_capture(capture, options, adapter, plugins=plugins)
+    if found.mesh is None or found.frames is None or not found.could_be_read:
+        return found
+    if any(found.frames.photographs):  # not resampled out of these yet
+        return found
+    try:
+        read = partial(read_frame, found.frames)
+        agrees = agreement_of_frames(found.mesh, found.frames, read, capture)
+    except InputRefused as refusal:
+        return replace(found, refusals=(*found.refusals, refusal))
+    return replace(found, agreement=agrees and agrees.ratio)

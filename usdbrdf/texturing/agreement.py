@@ -1,0 +1,133 @@
+"""Do poses, mesh and frames agree? The same points of the surface, looked up in many frames.
+
+Cheap beside texturing: some thousand points, no atlas. What the frames show at one point differs by
+noise and highlights where all is well, and as much as any two pixels do where poses are wrong. It
+tells the frames' gains too, before hours are spent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.files.frames import FramePixels
+from usdbrdf.model.arrays import Bool, Double, Float, Long
+from usdbrdf.model.camera import Camera
+from usdbrdf.model.mesh import ScanMesh, across_triangles
+from usdbrdf.transport.rays import RayScene
+
+_MIN_COSINE = calibration.number("agreement.min_cosine")
+_AGREES = calibration.number("agreement.agrees")
+_BETTER = calibration.number("agreement.better")
+_POINTS, _SEED = 4096, 0
+# Samples of points that several frames see, without which nothing is said.
+_FEWEST = 500
+# How much nearer than a point another surface may lie that does not hide it, of its distance.
+_SLACK = 5e-3
+
+
+class SurfacePoints(NamedTuple):
+    """P points of a mesh, even by area: point, normal (P, 3) float64, in the capture's unit."""
+
+    point: Double
+    normal: Double
+
+
+def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> SurfacePoints:
+    """``count`` points, the same for equal meshes."""
+    rng = np.random.default_rng(_SEED)
+    across = across_triangles(mesh.points, mesh.triangles)
+    area = np.linalg.norm(across, axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (mesh.points[mesh.triangles[face, k]].astype(np.float64) for k in range(3))
+    return SurfacePoints(a + u * (b - a) + v * (c - a), across[face] / area[face, None])
+
+
+def logarithms_in_frame(
+    surface: SurfacePoints, rays: RayScene, camera: Camera, pixels: FramePixels
+) -> Float:
+    """(P,) float32 logarithm of what a frame shows at each point, the mean of R, G and B over 3 x 3
+    pixels; NaN where it shows nothing valid."""
+    found = np.full(len(surface.point), np.nan, np.float32)
+    seen, column, row = _seen(surface, rays, camera)
+    level = pixels.radiance.mean(axis=2)
+    level = np.where(pixels.valid & (level > 0), level, np.nan)
+    around = [level[row + down, column + right] for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    found[seen] = np.log(np.mean(around, axis=0))
+    return found
+
+
+def _seen(surface: SurfacePoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
+    """Which points (P,) a camera sees, from in front, and of these column and row."""
+    way = surface.point - camera.eye
+    distance = np.linalg.norm(way, axis=1)
+    before = way @ -camera.world_from_camera[:3, 2] > 1e-6 * distance
+    seen = before & ((surface.normal * way).sum(axis=1) < -_MIN_COSINE * distance)
+    place = np.full((len(way), 2), -1.0)
+    place[seen] = camera.project(surface.point[seen])
+    cell = np.floor(place)
+    limit = np.array([camera.width, camera.height]) - 2
+    seen &= ((cell >= 1) & (cell <= limit)).all(axis=1)
+    directions = np.ascontiguousarray(way[seen] / distance[seen, None], np.float32)
+    origins = np.broadcast_to(camera.eye, directions.shape)
+    if len(directions):
+        hits = rays.closest(np.ascontiguousarray(origins, np.float32), directions)
+        free = (hits.face < 0) | (hits.distance >= (1 - _SLACK) * distance[seen])
+        seen[np.flatnonzero(seen)[~free]] = False
+    column, row = cell[seen].astype(np.int64).T
+    return seen, column, row
+
+
+class Agreement(NamedTuple):
+    """How far frames agree about the same points.
+
+    scatter  mean difference of what one frame shows of a point and what the others do, as a natural
+             logarithm
+    ratio    as a share of how much all samples differ: about 0 where all is well, about 1 where the
+             poses tell nothing
+    samples  how many were compared
+    """
+
+    scatter: float
+    ratio: float
+    samples: int
+
+
+def agreement(logarithm: Float) -> Agreement | None:
+    """Of logarithms (P, N); None where too few points are seen by several frames."""
+    known = np.isfinite(logarithm)
+    known &= (known.sum(axis=1) > 1)[:, None]
+    samples = int(known.sum())
+    if samples < _FEWEST:
+        return None
+    rows = known.any(axis=1)
+    value = np.where(known, logarithm, np.nan)[rows].astype(np.float64)
+    off = value - np.nanmedian(value, axis=1, keepdims=True)
+    # A median of few is near each of them by itself: of n samples, by about (n - 1) / n.
+    number = known[rows].sum(axis=1, keepdims=True)
+    off *= np.sqrt(number / (number - 1))
+    # Means, for where most of a scene is one colour the median pixel fits any pose.
+    scatter = float(np.abs(off[known[rows]]).mean())
+    level = value[known[rows]]
+    spread = float(np.abs(level - np.median(level)).mean())
+    return Agreement(scatter, scatter / max(spread, 1e-6), samples)
+
+
+def other_convention(given: Agreement | None, others: Mapping[str, Agreement | None]) -> str:
+    """The one of ``others``, readings of the poses by name, under which frames clearly agree while
+    they hardly do as the poses are ``given``; "" where there is none."""
+    ratio, samples = (given.ratio, given.samples) if given else (1.0, _FEWEST)
+    # A reading under which few points are seen at all is no better one.
+    sound = {n: a.ratio for n, a in others.items() if a and 2 * a.samples >= samples}
+    best = min(sound, key=lambda name: sound[name], default="")
+    return best if best and sound[best] < min(_BETTER * ratio, _AGREES) else ""
+
+
+def is_doubtful(given: Agreement | None) -> bool:
+    """Whether other readings of the poses are worth trying."""
+    return given is None or given.ratio > _AGREES
