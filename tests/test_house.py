@@ -197,6 +197,7 @@ ENGINEERING: dict[str, str] = {
     "_MOST_PASSES": "time",
     "_MOST_SAMPLES": "time",
     "_MOST_SOURCES": "memory",
+    "_MOST_SQUEEZED": "limit of what is believed",
     "_MOST_TEXELS": "memory",
     "_NEAR": "steps of a search",
     "_NEIGHBOURS": "discretisation of the filling in",

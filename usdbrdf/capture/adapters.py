@@ -28,11 +28,13 @@ MODULES = {
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
+    "usd": "usdbrdf.capture.formats.usd_stage",
 }
 DESCRIPTIONS = {
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+    "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
 }
 
 
@@ -175,7 +177,7 @@ def _loaded(point: EntryPoint) -> Adapter:
 def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     """What a chosen adapter makes of a capture."""
     assert adapter.module is not None
-    for named in (path, options.mesh, options.objects):
+    for named in (path, options.mesh, options.objects, options.frames):
         refuse_nameless(named)
     try:
         return adapter.module.read(path, options)

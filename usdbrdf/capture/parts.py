@@ -156,9 +156,18 @@ def objects_with_faces(
 
 
 def geometry_from_usd(
-    path: Path, options: IngestOptions, findings: Findings, *, capture_root: Path
+    path: Path,
+    options: IngestOptions,
+    findings: Findings,
+    *,
+    capture_root: Path,
+    subsets: bool = False,
 ) -> ScanGeometry:
-    """Every mesh below the default prim is one object, by its display name or its own."""
+    """Every mesh below the default prim is one object, by its display name or its own.
+
+    subsets  where meshes have face subsets, these are the objects; the asset then holds the
+             geometry itself, because only whole meshes of another file can carry its textures
+    """
     if options.decimate is not None:
         raise UsageError(
             f"{path}: --decimate does not reduce geometry that is referenced from USD. Reduce it "
@@ -168,7 +177,8 @@ def geometry_from_usd(
         raise InputRefused(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
-    found = meshes_from_usd(path, allow=(capture_root, *options.allow_outside))
+    allow = (capture_root, *options.allow_outside)
+    found = meshes_from_usd(path, allow=allow, subsets=subsets)
     findings.warnings += found.warnings
     mesh = found.mesh
     missing = np.isnan(mesh.corner_normals[:, 0, 0])
@@ -176,7 +186,13 @@ def geometry_from_usd(
         mesh.corner_normals[missing] = corner_normals(
             mesh.points, mesh.triangles[missing], options.crease_angle_deg
         )
-    return replace(found, has_normals=~missing, usd_geometry=path.resolve())
+    if not found.object_prims:
+        findings.warn(
+            f"{path.name}: {len(found.objects)} objects have been made from face subsets, so the "
+            "asset holds the meshes itself instead of referring to them. [stage.subsets]"
+        )
+    whole = path.resolve() if found.object_prims else None
+    return replace(found, has_normals=~missing, usd_geometry=whole)
 
 
 def geometry_from_file(

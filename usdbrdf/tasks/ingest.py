@@ -40,7 +40,7 @@ def ingest(
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
-        if key not in ("mesh", "objects", "allow_outside")
+        if key not in ("mesh", "objects", "frames", "allow_outside")
     }
     inputs, places = _inputs(capture, options, asset)
     chosen = choose_adapter(capture, adapter, plugins=plugins)
@@ -87,13 +87,15 @@ def _inputs(
     capture: Path, options: IngestOptions, asset: Asset
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Hashes of all that ingest may read: the capture's folder and those that its documents may
-    point into, without the asset if that lies in one, and files named by options. And where these
+    point into, without the asset if that lies in one, and what options name. And where these
     lie, seen from scan.usdc, which names photographs and USD geometry by such paths: what is moved
     must be read anew."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     if not capture.exists():
         raise InputRefused(f"{capture}: no such file or folder. Check the path. [capture.missing]")
     outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
+    if options.frames is not None:
+        outside["frames"] = options.frames.resolve()
     inputs = {
         label: hash_of_files(files_below(place, without=asset.folder), place)
         for label, place in ({"capture": folder} | outside).items()

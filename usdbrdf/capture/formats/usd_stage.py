@@ -1,0 +1,203 @@
+"""Any USD stage as a capture: its cameras are the photographs, its meshes the surface.
+
+A camera that names a picture (a back plate) has that one. Others find theirs by name: one of many
+by its prim's name, one that moves by the number of each of its time samples.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
+from usdbrdf.capture.formats.named_pictures import (
+    Pictures,
+    drop_without_picture,
+    pictures_of,
+    refuse_without_pictures,
+    scan_of,
+)
+from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.images import image_size
+from usdbrdf.files.naming import identifier_from
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.mesh import ScanGeometry
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.usd_cameras import UsdCamera, cameras_from_usd
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES
+
+NAME = "usd"
+DESCRIPTION = DESCRIPTIONS[NAME]
+# Of pixels whose sides differ; beyond this an aperture was made for another shape of picture.
+_MOST_SQUEEZED = 0.05
+
+
+class _Shot(NamedTuple):
+    """A camera at one of its times."""
+
+    camera: UsdCamera
+    i: int
+
+    @property
+    def name(self) -> str:
+        time = self.camera.times[self.i]
+        return self.camera.path if math.isnan(time) else f"{self.camera.path} at {time:g}"
+
+
+def matches(path: Path) -> bool:
+    """A USD file, or a folder with one of them."""
+    return _stage_of(path) is not None
+
+
+def _stage_of(path: Path) -> Path | None:
+    if path.is_file():
+        return path if path.suffix.lower() in USD_SUFFIXES else None
+    inside = path.iterdir() if path.is_dir() else ()
+    files = [p for p in inside if p.suffix.lower() in USD_SUFFIXES and p.is_file()]
+    return files[0] if len(files) == 1 else None
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    stage = _stage_of(path.resolve())
+    if stage is None:
+        raise InputRefused(f"{path}: no USD file, or several. Name the file. [capture.format]")
+    folder, findings = stage.parent, Findings()
+    found = cameras_from_usd(stage, allow=options.allow_outside)
+    shots = [_Shot(camera, i) for camera in found.cameras for i in range(len(camera.times))]
+    records = list(_records(shots, stage, options, findings))
+
+    def geometry() -> ScanGeometry:
+        if options.mesh is not None:
+            unit = found.meters_per_unit
+            return geometry_from_file(
+                options.mesh,
+                options.objects,
+                options,
+                findings,
+                capture_root=folder,
+                meters_per_unit=unit,
+            )
+        return geometry_from_usd(stage, options, findings, capture_root=folder, subsets=True)
+
+    return scan_of(
+        records,
+        geometry,
+        options,
+        findings,
+        adapter=NAME,
+        source=stage,
+        folder=folder,
+        name=stage.stem,
+        meters_per_unit=found.meters_per_unit,
+        up_axis=found.up_axis,
+    )
+
+
+def _records(
+    shots: list[_Shot], stage: Path, options: IngestOptions, findings: Findings
+) -> Iterator[FrameRecord]:
+    pictures = None
+    if options.frames is not None or not any(s.camera.images[s.i] for s in shots):
+        pictures = pictures_of(stage.parent, options)
+        refuse_without_pictures(pictures, stage)
+    named = [(shot, _picture(shot, shots, stage, options, pictures)) for shot in shots]
+    if not any(image for _, image in named) and pictures is not None:
+        first = min(pictures.paths).name
+        raise InputRefused(
+            f"{stage}: none of {len(pictures.paths)} pictures, first {first!r}, belongs to any of "
+            f"{len(shots)} cameras, first {shots[0].name}. Name each picture as its camera, or end "
+            "its name with the number of the camera's time sample. [capture.frames]"
+        )
+    for shot, image in named:
+        if image is None and pictures is not None and not math.isnan(shot.camera.times[shot.i]):
+            # Animation runs on between the pictures that were kept.
+            findings.count("poses_without_photograph", 1)
+        elif image is None:
+            drop_without_picture(shot.name, findings)
+        elif not image.is_file():
+            findings.drop(shot.name, "the image file does not exist", "capture.file")
+        else:
+            yield from _record(shot, image, findings)
+
+
+def _picture(
+    shot: _Shot, shots: list[_Shot], stage: Path, options: IngestOptions, pictures: Pictures | None
+) -> Path | None:
+    """The picture of a camera at a time, or None."""
+    camera, time = shot.camera, shot.camera.times[shot.i]
+    if pictures is None:
+        return _plate_file(camera.images[shot.i], time, stage.parent, options)
+    if math.isnan(time):
+        own = {camera.label, camera.path.rpartition("/")[2]}
+        exact = [found for name in sorted(own) if (found := pictures.named(name))]
+        same = [p for p in pictures.paths if identifier_from(p.stem) in own]
+        return exact[0] if exact else same[0] if len(same) == 1 else None
+    if time != round(time):
+        return None
+    others = {each.camera.path for each in shots}
+    if len(others) == 1:
+        return pictures.numbered().get(round(time))
+    prim = camera.path.rpartition("/")[2]
+    own_pictures = [
+        p for p in pictures.paths if p.parent.name == prim or re.fullmatch(rf"{prim}\D?\d+", p.stem)
+    ]
+    return Pictures(folder=pictures.folder, paths=tuple(own_pictures)).numbered().get(round(time))
+
+
+def _plate_file(plate: str, time: float, folder: Path, options: IngestOptions) -> Path | None:
+    """The file of a back plate at a time, of a sequence too: plate.####.exr, plate.%04d.exr."""
+    if not plate:
+        return None
+    if not math.isnan(time):
+        number = f"{round(time)}"
+        plate = re.sub("#+", lambda m: number.zfill(len(m[0])), plate)
+        plate = re.sub(r"%0?(\d*)d", lambda m: number.zfill(int(m[1] or 1)), plate)
+    inside = Path(plate).is_relative_to(folder)
+    relative = Path(plate).relative_to(folder).as_posix() if inside else plate
+    return path_in_capture(folder, relative, options)
+
+
+def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecord]:
+    try:
+        width, height, _ = image_size(image)
+    except ImageRefused as error:
+        findings.drop(shot.name, clause_of(error, image), "capture.image")
+        return
+    pose = shot.camera.world_from_camera[shot.i]
+    # What a camera hangs on may scale it, which changes where it stands and not what it sees.
+    size = np.cbrt(abs(np.linalg.det(pose[:3, :3])))
+    if size > 0:
+        pose = pose @ np.diag([1 / size, 1 / size, 1 / size, 1])
+    yield FrameRecord(
+        name=shot.name,
+        image_path=image,
+        world_from_camera=pose,
+        intrinsics=pinhole_from_lens(shot.camera.lens[shot.i], width, height),
+        resolution=(width, height),
+        exposure_time=float(shot.camera.exposure[shot.i]),
+    )
+
+
+def pinhole_from_lens(lens: Double, width: int, height: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of a UsdGeomCamera's lens, see ``UsdCamera``, for a picture.
+
+    A vertical aperture that is not authored (NaN), or far from the picture's shape, says nothing:
+    pixels are square then.
+    """
+    focal, across, up, offset_x, offset_y = lens.tolist()
+    if not (focal > 0 and across > 0):
+        return 0.0, 0.0, 0.0, 0.0  # no lens: the frame is dropped where lenses are checked
+    square = across * height / width
+    if not abs(up / square - 1) <= _MOST_SQUEEZED:
+        up = square
+    fx, fy = focal / across * width, focal / up * height
+    return fx, fy, width * (0.5 - offset_x / across), height * (0.5 + offset_y / up)
