@@ -28,12 +28,16 @@ MODULES = {
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
+    "nice-slam": "usdbrdf.capture.formats.nice_slam",
+    "replica": "usdbrdf.capture.formats.replica",
     "usd": "usdbrdf.capture.formats.usd_stage",
 }
 DESCRIPTIONS = {
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+    "nice-slam": "NICE-SLAM's renders of Replica (traj.txt and results/)",
+    "replica": "Replica scene with frames (mesh.ply, habitat/, traj.txt)",
     "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
 }
 
@@ -172,6 +176,13 @@ def _loaded(point: EntryPoint) -> Adapter:
         problem=problem,
         package=package,
     )
+
+
+def files_beside(adapter: Adapter, path: Path) -> list[Path]:
+    """What an adapter reads outside of the capture's folder, as its ``beside(path)`` says; most
+    have none."""
+    beside = getattr(adapter.module, "beside", None)
+    return sorted(beside(path)) if beside is not None else []
 
 
 def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:

@@ -197,7 +197,7 @@ def geometry_from_usd(
 
 def geometry_from_file(
     mesh_path: Path,
-    objects_path: Path | None,
+    objects: Path | Callable[[FileMesh], LabelTable] | None,
     options: IngestOptions,
     findings: Findings,
     *,
@@ -206,7 +206,8 @@ def geometry_from_file(
 ) -> ScanGeometry:
     """Read, check, segment and clean a mesh.
 
-    objects_path     objects.json, or None
+    objects          objects.json; or what knows the objects of the mesh that was read, an id for
+                     each of its triangles; or None
     capture_root     folder inside which a USD file may refer to others
     meters_per_unit  of the adapter, for areas in square metres; the options' comes first
     """
@@ -220,7 +221,11 @@ def geometry_from_file(
             f"{mesh_path.name}: {broken} of {len(mesh.kept)} faces had NaN corners or pointed to "
             "vertices that do not exist, and have been removed. [mesh.broken]"
         )
+    objects_path = objects if isinstance(objects, Path) else None
     table = label_table(objects_path) if objects_path is not None else None
+    if objects is not None and not isinstance(objects, Path):
+        table = objects(mesh)
+        mesh, table = replace(mesh, face_label=table.face_id), table._replace(face_id=None)
     split = segmentation(
         mesh,
         table,

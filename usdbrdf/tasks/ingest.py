@@ -17,6 +17,7 @@ from usdbrdf.asset.layers.scan_layer import (
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.capture.adapters import choose_adapter, read_with
 from usdbrdf.capture.develop import developed
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn
@@ -42,8 +43,10 @@ def ingest(
         for key, value in asdict(options).items()
         if key not in ("mesh", "objects", "frames", "allow_outside")
     }
-    inputs, places = _inputs(capture, options, asset)
     chosen = choose_adapter(capture, adapter, plugins=plugins)
+    inputs, places = _inputs(capture, options, asset)
+    if beside := files_beside(chosen, capture):
+        inputs["beside"] = hash_of_files(beside)
     if chosen.package:
         # Our own adapters change with the version of the code, which every stamp holds.
         parameters["adapter_package"] = chosen.package

@@ -15,6 +15,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.formats.transforms import path_in_capture
 from usdbrdf.capture.parts import (
+    LabelTable,
     as_photographs,
     geometry_from_file,
     radiance_encoding,
@@ -26,6 +27,7 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.mesh_files import FileMesh
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
@@ -171,9 +173,11 @@ def scan_of(
     up_axis: str = "Z",
     encoding: str | None = None,
     name: str = "",
+    objects: Callable[[FileMesh], LabelTable] | None = None,
 ) -> Scan:
     """The capture of these frames and this mesh (a file, or what reads it).
 
+    objects   what knows the objects of the mesh; ``--objects`` comes first
     source    the document that messages name; ``folder``, the capture's own, absolute
     encoding  of images that hold radiance, where the format says; the user's comes first
     """
@@ -195,7 +199,7 @@ def scan_of(
             return geometry()
         return geometry_from_file(
             geometry,
-            options.objects,
+            options.objects or objects,
             options,
             findings,
             capture_root=folder,
