@@ -28,16 +28,24 @@ MODULES = {
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
+    "metashape": "usdbrdf.capture.formats.metashape",
+    "realityscan": "usdbrdf.capture.formats.realityscan",
     "nice-slam": "usdbrdf.capture.formats.nice_slam",
     "replica": "usdbrdf.capture.formats.replica",
+    "fipt": "usdbrdf.capture.formats.fipt",
+    "llff": "usdbrdf.capture.formats.llff",
     "usd": "usdbrdf.capture.formats.usd_stage",
 }
 DESCRIPTIONS = {
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+    "metashape": "cameras that Metashape exports (XML), pictures, model",
+    "realityscan": "cameras that RealityScan (RealityCapture) exports (CSV, XMP), pictures, model",
     "nice-slam": "NICE-SLAM's renders of Replica (traj.txt and results/)",
     "replica": "Replica scene with frames (mesh.ply, habitat/, traj.txt)",
+    "fipt": "HDR room of FIPT, photographed (cam.txt, K_list.txt) or rendered (train/, val/)",
+    "llff": "pictures with LLFF's poses_bounds.npy, and a mesh",
     "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
 }
 

@@ -18,6 +18,17 @@ from usdbrdf.model.arrays import Array, Double
 Element = ElementTree.Element
 
 
+def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:
+    """A file's first bytes, for a glance at what it is; none where there is no file to read."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as file:
+            return file.read(num_bytes)
+    except OSError:
+        return b""
+
+
 def number_rows(path: Path) -> tuple[Double, ...]:
     """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any and
     those that begin with # are passed over. NaN and infinities are for the caller to judge."""
