@@ -132,7 +132,7 @@ def test_nothing_recognised_lists_what_would_be(tmp_path):
         read_scan(tmp_path, IngestOptions())
     with pytest.raises(InputRefused, match=r"no such file.*\[capture.missing\]"):
         read_scan(tmp_path / "nowhere", IngestOptions())
-    with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of transforms"):
+    with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of eyeful-tower"):
         read_scan(tmp_path, IngestOptions(), "opensfm")
 
 

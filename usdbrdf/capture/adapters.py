@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from usdbrdf.options import IngestOptions
 
 
+# In the order in which they are asked: those whose folders hold other formats too come first.
 MODULES = {
+    "eyeful-tower": "usdbrdf.capture.formats.eyeful_tower",
+    "scannetpp": "usdbrdf.capture.formats.scannetpp",
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
@@ -35,8 +38,11 @@ MODULES = {
     "fipt": "usdbrdf.capture.formats.fipt",
     "llff": "usdbrdf.capture.formats.llff",
     "usd": "usdbrdf.capture.formats.usd_stage",
+    "alembic": "usdbrdf.capture.formats.alembic",
 }
 DESCRIPTIONS = {
+    "eyeful-tower": "room of Eyeful Tower (cameras.json, images-2k/, mesh.obj)",
+    "scannetpp": "scene of ScanNet++ (dslr/, scans/)",
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
@@ -47,6 +53,7 @@ DESCRIPTIONS = {
     "fipt": "HDR room of FIPT, photographed (cam.txt, K_list.txt) or rendered (train/, val/)",
     "llff": "pictures with LLFF's poses_bounds.npy, and a mesh",
     "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
+    "alembic": "Alembic cameras: not read, says how to convert them",
 }
 
 

@@ -246,7 +246,7 @@ def geometry_from_file(
     )
     for name, number in clean.counts.items():
         findings.count(name, number)
-    face_object, objects = objects_with_faces(clean.face_object, split.labels)
+    face_object, labelled = objects_with_faces(clean.face_object, split.labels)
     return ScanGeometry(
         mesh=ScanMesh(
             points=clean.points,
@@ -254,7 +254,7 @@ def geometry_from_file(
             corner_normals=corner_normals(clean.points, clean.triangles, options.crease_angle_deg),
             face_object=face_object,
         ),
-        objects=objects,
+        objects=labelled,
     )
 
 

@@ -7,6 +7,7 @@ import csv
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -72,8 +73,8 @@ def read_xml(path: Path) -> Element:
             f"{path}: an XML document with a document type, which none of the formats read here "
             "has. Export it again. [document.xml]"
         )
-    parser = ElementTree.XMLPullParser(("start", "end"))
-    depth, root = 0, None
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    depth, root = 0, cast(Element | None, None)
     try:
         for start in range(0, len(text), 1 << 16):
             parser.feed(text[start : start + (1 << 16)])

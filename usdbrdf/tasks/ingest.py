@@ -15,9 +15,8 @@ from usdbrdf.asset.layers.scan_layer import (
     write_scan_layer,
 )
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
-from usdbrdf.capture.adapters import choose_adapter, read_with
-from usdbrdf.capture.develop import developed
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
+from usdbrdf.capture.develop import developed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.progress import warn

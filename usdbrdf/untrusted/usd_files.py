@@ -135,10 +135,9 @@ def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
         which = _subset_of_triangles(mesh, own, parts[i][3], time)
         face_object[face_object == i] = len(owners) + np.where(which < 0, len(own), which)
         owners += [*(subset.GetPrim() for subset in own), prims[i]]
-    used, numbered = np.unique(face_object, return_inverse=True)
-    if not any(split):  # a mesh without an area is an object too: others refer to it
-        used, numbered = np.arange(len(owners)), face_object
-    owners = [owners[i] for i in used.tolist()]
+    if any(split):  # a whole mesh is an object even without an area: the asset refers to it
+        used, numbered = np.unique(face_object, return_inverse=True)
+        owners, face_object = [owners[i] for i in used.tolist()], numbered.astype(np.int32)
     labels = [prim.GetDisplayName() or prim.GetName() for prim in owners]
     identifiers = unique_identifiers(labels)
     return ScanGeometry(
@@ -146,7 +145,7 @@ def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
             points=points,
             triangles=triangles,
             corner_normals=np.concatenate([part[2] for part in parts]),
-            face_object=numbered.astype(np.int32),
+            face_object=face_object,
         ),
         objects=tuple(
             ObjectLabel(identifier=identifier, label=label, class_name=_class_of(prim))

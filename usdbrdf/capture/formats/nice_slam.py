@@ -113,13 +113,13 @@ def _camera(folder: Path, findings: Findings) -> dict[str, float]:
         return dict(_PUBLISHED)
     document: Any = read_json(path)
     camera = document.get("camera", document) if isinstance(document, dict) else None
-    values = {key: camera.get(key) for key in _KEYS} if isinstance(camera, dict) else {}
-    if not values or not all(type(v) in (int, float) for v in values.values()):
+    numbers: list[Any] = [camera.get(key) for key in _KEYS] if isinstance(camera, dict) else [None]
+    if not all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):
         raise InputRefused(
             f"{path}: no camera with the numbers {', '.join(_KEYS)}. Bring the file of the "
             "dataset. [capture.camera]"
         )
-    return {key: float(value) for key, value in values.items()}
+    return dict(zip(_KEYS, map(float, numbers), strict=True))
 
 
 def _mesh(folder: Path, options: IngestOptions) -> Path:

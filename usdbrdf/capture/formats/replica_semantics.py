@@ -53,7 +53,7 @@ def semantics_beside(mesh: Path) -> Callable[[FileMesh], LabelTable] | None:
 
 def _entries(info: Path) -> dict[int, tuple[str, str]]:
     document: Any = read_json(info)
-    rows = document.get("objects") if isinstance(document, dict) else None
+    rows: Any = document.get("objects") if isinstance(document, dict) else None
     sound = isinstance(rows, list) and all(
         isinstance(row, dict) and type(row.get("id")) is int for row in rows
     )
@@ -112,4 +112,4 @@ def _inside(points: Double, border: Double, normal: Double) -> Bool:
         if ay != by:
             between = (ay > y) != (by > y)
             crossings += between & (x < ax + (y - ay) / (by - ay) * (bx - ax))
-    return crossings % 2 == 1
+    return np.asarray(crossings % 2 == 1)
