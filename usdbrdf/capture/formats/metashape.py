@@ -182,10 +182,10 @@ def _sensor(sensor: Element, source: Path) -> _Sensor | None:
     """A sensor that is calibrated (or needs no calibration, because it sees a whole sphere)."""
     kind = sensor.get("type", "frame")
     calibrations = {c.get("class", ""): c for c in sensor.iterfind("calibration")}
-    calibration = calibrations.get("adjusted", next(iter(calibrations.values()), None))
+    adjusted = calibrations.get("adjusted", next(iter(calibrations.values()), None))
     size = sensor.find("resolution")
-    if calibration is not None and calibration.find("resolution") is not None:
-        size = calibration.find("resolution")
+    if adjusted is not None and adjusted.find("resolution") is not None:
+        size = adjusted.find("resolution")
     rotation = numbers_of(sensor.find("rotation"), 9)
     location = numbers_of(sensor.find("location"), 3)
     offset = rigid_pose(
@@ -208,16 +208,16 @@ def _sensor(sensor: Element, source: Path) -> _Sensor | None:
             lens=Lens(curve="equirectangular"),
             master_from_sensor=offset,
         )
-    if calibration is None:
+    if adjusted is None:
         return None
-    kind = calibration.get("type", kind)
+    kind = adjusted.get("type", kind)
     if kind not in _CURVES:
         raise InputRefused(
             f"{source}: the sensor {sensor.get('label', '')!r} is a {kind!r} camera (known: "
             f"{', '.join(_CURVES)}, spherical). Undistort the pictures in Metashape and export the "
             "cameras again. [capture.camera]"
         )
-    said = {name: _number(calibration, name) for name in _NUMBERS}
+    said = {name: _number(adjusted, name) for name in _NUMBERS}
     focal = said["f"]
     if not focal > 0 or said["p3"] or said["p4"]:
         raise InputRefused(
@@ -244,7 +244,7 @@ def _sensor(sensor: Element, source: Path) -> _Sensor | None:
 _NUMBERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 
-def _number(calibration: Element, name: str) -> float:
+def _number(adjusted: Element, name: str) -> float:
     """A number of a calibration; what is not there is 0."""
-    value = numbers_of(calibration.find(name), 1)
+    value = numbers_of(adjusted.find(name), 1)
     return 0.0 if value is None else float(value[0])
