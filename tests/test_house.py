@@ -91,6 +91,7 @@ IMPORTERS: dict[str, set[str]] = {
     "psutil": {"job/memory.py"},
     "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
     "pycolmap": {"untrusted/"},
+    "pye57": {"untrusted/"},
     "pymeshlab": {"geometry/mesh_filters.py"},
     "PyOpenColorIO": {"files/colour.py"},
     "pyoidn": {"transport/denoise.py"},

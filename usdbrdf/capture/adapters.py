@@ -37,6 +37,7 @@ MODULES = {
     "replica": "usdbrdf.capture.formats.replica",
     "fipt": "usdbrdf.capture.formats.fipt",
     "llff": "usdbrdf.capture.formats.llff",
+    "e57": "usdbrdf.capture.formats.e57",
     "usd": "usdbrdf.capture.formats.usd_stage",
     "alembic": "usdbrdf.capture.formats.alembic",
 }
@@ -44,14 +45,15 @@ DESCRIPTIONS = {
     "eyeful-tower": "room of Eyeful Tower (cameras.json, images-2k/, mesh.obj)",
     "scannetpp": "scene of ScanNet++ (dslr/, scans/)",
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
-    "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+    "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "metashape": "cameras that Metashape exports (XML), pictures, model",
     "realityscan": "cameras that RealityScan (RealityCapture) exports (CSV, XMP), pictures, model",
     "nice-slam": "NICE-SLAM's renders of Replica (traj.txt and results/)",
     "replica": "Replica scene with frames (mesh.ply, habitat/, traj.txt)",
     "fipt": "HDR room of FIPT, photographed (cam.txt, K_list.txt) or rendered (train/, val/)",
     "llff": "pictures with LLFF's poses_bounds.npy, and a mesh",
+    "e57": "E57 with the stations of pictures, the pictures extracted beside it, and a mesh",
     "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
     "alembic": "Alembic cameras: not read, says how to convert them",
 }
@@ -206,7 +208,7 @@ def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     for named in (path, options.mesh, options.objects, options.frames):
         refuse_nameless(named)
     try:
-        return adapter.module.read(path, options)
+        scan = adapter.module.read(path, options)
     except UsdBrdfError:
         raise
     except Exception as error:
@@ -216,3 +218,18 @@ def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
             f"{path}: adapter {adapter.name!r} ({adapter.origin}) failed: {error!r}. Report it to "
             "its authors. [adapter.read]"
         ) from error
+    if options.frames is not None:
+        _refuse_unused(options.frames, scan, adapter)
+    return scan
+
+
+def _refuse_unused(frames: Path, scan: Scan, adapter: Adapter) -> None:
+    """UsageError where no picture comes from the folder that the user named."""
+    views = scan.views or [None] * len(scan.frames)
+    pairs = zip(views, scan.frames.image_paths, strict=True)
+    photographs = [path if view is None else view.photograph for view, path in pairs]
+    if not any(photograph.is_relative_to(frames.resolve()) for photograph in photographs):
+        raise UsageError(
+            f"--frames {frames}: no picture of this capture lies there; the format "
+            f"{adapter.name!r} says itself where they are. Leave the option out. [usage.option]"
+        )
