@@ -10,9 +10,11 @@ import pytest
 
 from tests.format_truth import FRAMES, HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
+from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.ingest import ingest
 
 OPTIONS = IngestOptions(assume_srgb=True)
 
@@ -86,14 +88,19 @@ def test_the_mesh_and_the_camera_lie_beside_the_scene(scene, room):
     assert (scan.adapter, scan.up_axis, scan.frames.radiometric) == ("nice-slam", "Z", False)
 
 
-def test_every_other_frame_keeps_its_pose(scene, room):
-    """And a changed file beside the folder is an input too."""
+def test_what_lies_beside_the_folder_is_an_input(scene, room, tmp_path):
+    asset = Asset(tmp_path / "asset", "room0")
+    assert ingest(scene, asset, OPTIONS).reran
+    assert not ingest(scene, asset, OPTIONS).reran
+    write_ply(scene.parent / "room0_mesh.ply", room.points, room.triangles[::-1])
+    assert ingest(scene, asset, OPTIONS).reran
+
+
+def test_the_other_frames_keep_their_poses(scene, room):
     for i in range(1, FRAMES, 10):
         (scene / "results" / f"frame{i:06d}.jpg").unlink()
     scan = read_scan(scene, OPTIONS)
     assert_same(scan, room, poses=np.delete(room.world_from_camera, [1], axis=0))
-    beside = choose_adapter(scene).module.beside(scene)
-    assert [path.name for path in beside] == ["cam_params.json", "room0_mesh.ply"]
 
 
 def test_labels_come_by_the_nearest_face_and_panes_are_objects(scene, room):

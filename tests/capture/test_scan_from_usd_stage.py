@@ -7,9 +7,14 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, Vt
 
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from tests.scenes import make_capture
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_weaker
+from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
 from usdbrdf.capture.adapters import choose_adapter, read_scan
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.ingest import ingest
 
 
 @pytest.fixture
@@ -236,3 +241,30 @@ def test_refusals(tmp_path, room, damage, sentence):
     stage.Save()
     with pytest.raises(InputRefused, match=sentence):
         read_scan(folder, IngestOptions())
+
+
+def test_pictures_in_another_place_are_inputs_and_the_stage_is_referenced(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    _moving_camera(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "plates" / f"plate.{101 + i}.exr", image)
+    asset = Asset(tmp_path / "asset", "room")
+    options = IngestOptions(frames=tmp_path / "plates")
+    assert ingest(tmp_path / "shot" / "room.usda", asset, options).summary["adapter"] == "usd"
+    composed = open_weaker(asset, "texturing")
+    np.testing.assert_allclose(
+        frames_from_stage(composed).world_from_camera, room.world_from_camera, atol=1e-6
+    )
+    assert len(scene_from_stage(composed).objects) == len(room.names)
+    assert not ingest(tmp_path / "shot" / "room.usda", asset, options).reran
+    write_image(tmp_path / "plates" / "plate.103.exr", room.images[2] * 0.5)
+    assert ingest(tmp_path / "shot" / "room.usda", asset, options).reran
+
+
+def test_frames_that_a_format_does_not_ask_for_are_refused(tmp_path):
+    made = make_capture(tmp_path / "room")
+    with pytest.raises(UsageError, match=r"'transforms' says itself.*\[usage.option\]"):
+        read_scan(made.folder, IngestOptions(frames=tmp_path / "frames"))
+    with pytest.raises(UsageError, match=r"no picture of this capture lies there"):
+        read_scan(made.folder, IngestOptions(frames=tmp_path / "elsewhere"))
