@@ -45,6 +45,17 @@ def test_poses_are_read(capture, room):
     assert (scan.adapter, len(scan.objects)) == ("llff", len(room.names))
 
 
+@pytest.mark.parametrize("name", ["IMG_0004.png", "IMG_0004.jpg.png", "IMG_0004_mask.png"])
+def test_masks_are_found_by_the_pictures_names(capture, name):
+    hidden = np.ones((HEIGHT, WIDTH, 3))
+    hidden[:, : WIDTH // 2] = 0
+    write_image(capture / "masks" / name, hidden)
+    scan = read_scan(capture, OPTIONS)
+    masks = [view.mask for view in scan.views if view is not None and view.mask]
+    assert masks == [capture / "masks" / name]
+    assert any("1 masks are used" in warning for warning in scan.warnings)
+
+
 def _no_mesh(capture):
     (capture / "surface.ply").unlink()
 

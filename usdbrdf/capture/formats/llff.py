@@ -14,6 +14,7 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
+    mask_beside,
     mesh_beside,
     pictures_of,
     refuse_without_pictures,
@@ -69,6 +70,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
                 world_from_camera=rigid_pose(np.stack([right, -down, back], axis=1), centre),
                 intrinsics=(focal, focal, width / 2, height / 2),
                 resolution=(int(width), int(height)),
+                mask_path=mask_beside(folder, image),
             )
         )
     mesh = mesh_beside(

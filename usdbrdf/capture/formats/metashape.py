@@ -17,6 +17,7 @@ from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
+    mask_beside,
     mesh_beside,
     opengl_from_opencv,
     pictures_of,
@@ -157,6 +158,7 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
                 intrinsics=sensor.intrinsics,
                 resolution=sensor.resolution,
                 lens=sensor.lens,
+                mask_path=mask_beside(source.parent, image),
             )
         )
     return sorted(records, key=lambda record: record.image_path)

@@ -138,6 +138,17 @@ def _below(folder: Path, *, deep: bool) -> Pictures:
     return Pictures(folder=folder, paths=tuple(sorted(paths)))
 
 
+def mask_beside(folder: Path, image: Path) -> Path | None:
+    """The mask of a picture in masks/: of its name, with or without its suffix, as programs have
+    it; black is what is not to be looked at."""
+    for name in (image.name, image.stem, f"{image.stem}_mask", f"{image.name}.mask"):
+        for suffix in (".png", ".jpg"):
+            if (folder / "masks" / f"{name}{suffix}").is_file():
+                return contained(folder, f"masks/{name}{suffix}")
+    same = folder / "masks" / image.name
+    return contained(folder, f"masks/{image.name}") if same.is_file() else None
+
+
 def drop_without_picture(label: str, findings: Findings) -> None:
     """Leave out a camera whose picture was not found."""
     findings.drop(label, "no picture, or more than one, has this name", "capture.file")
@@ -189,6 +200,11 @@ def scan_of(
     source    the document that messages name; ``folder``, the capture's own, absolute
     encoding  of images that hold radiance, where the format says; the user's comes first
     """
+    if masks := sum(record.mask_path is not None for record in records):
+        findings.warn(
+            f"{source.name}: {masks} masks are used; what is black there is not looked at. "
+            "[capture.mask]"
+        )
     photographs = refuse_photographs(
         [r.image_path for r in records], assume_srgb=options.assume_srgb
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
+    mask_beside,
     mesh_beside,
     opengl_from_opencv,
     pictures_of,
@@ -87,6 +89,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
         records = list(records_of_table(source, pictures, findings))
     else:
         records = list(records_of_sidecars(_sidecars(path), pictures, findings))
+    records = [replace(r, mask_path=mask_beside(folder, r.image_path)) for r in records]
     records.sort(key=lambda record: record.image_path)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     mesh = mesh_beside(
