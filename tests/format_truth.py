@@ -4,7 +4,9 @@ proof that what was read is that room: mesh, cameras, objects."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import OpenImageIO as oiio
@@ -50,9 +52,12 @@ class Truth:
         return replace(self, intrinsics=intrinsics)
 
 
-def truth(folder: Path) -> Truth:
-    """The room; ``folder`` is for what is made on the way."""
-    made = make_capture(folder, frames=FRAMES, size=(WIDTH, HEIGHT), subdivisions=2)
+@cache
+def truth() -> Truth:
+    """The room, made once per process; nobody changes it."""
+    with TemporaryDirectory() as folder:
+        made = make_capture(Path(folder), frames=FRAMES, size=(WIDTH, HEIGHT), subdivisions=2)
+        images = [read_exr(made.image(i)) for i in range(FRAMES)]
     return Truth(
         points=made.points,
         triangles=made.triangles,
@@ -60,7 +65,7 @@ def truth(folder: Path) -> Truth:
         names=made.names,
         world_from_camera=ring_of_poses(FRAMES),
         intrinsics=np.tile(np.array(INTRINSICS), (FRAMES, 1)),
-        images=[read_exr(made.image(i)) for i in range(FRAMES)],
+        images=images,
     )
 
 

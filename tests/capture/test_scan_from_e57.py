@@ -68,8 +68,8 @@ def _pinholes(room):
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ _FULL = 4  # times the size of the pictures
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 @pytest.fixture

@@ -31,8 +31,8 @@ def _write_segmentation(folder, room, i, name):
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ OPTIONS = IngestOptions(assume_srgb=True)
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made").centred()
+def room():
+    return truth().centred()
 
 
 @pytest.fixture

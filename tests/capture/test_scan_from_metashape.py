@@ -76,8 +76,8 @@ def _lens(room):
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 def _write(folder, document, room, suffix=".jpg"):
@@ -182,6 +182,20 @@ def test_a_spherical_sensor_needs_no_calibration(tmp_path, room):
     assert record.lens.curve == "equirectangular"
     ahead = record.lens.project(np.array([[0.0, 0, -1], [1, 0, 0]]), record.intrinsics)
     np.testing.assert_allclose(ahead, [[WIDTH / 2, HEIGHT / 2], [0.75 * WIDTH, HEIGHT / 2]])
+
+
+def test_undistorted_pictures_do_not_go_with_the_lens(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, **_lens(room), k1=-0.1)
+    for i, pose in enumerate(room.opencv):
+        camera = _child(cameras, "camera", id=str(i), sensor_id="0", label=f"DSC{i:04d}")
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    folder = _write(tmp_path / "project", document, room)
+    (folder / "model.jpg").write_bytes(b"a texture")  # before model.obj, and no mesh
+    assert len(read_scan(folder, OPTIONS).views) == len(room.images)
+    (folder / "images").rename(folder / "undistorted")
+    with pytest.raises(InputRefused, match=r"has been undistorted.*\[capture.camera\]"):
+        read_scan(folder, OPTIONS)
 
 
 def _edit(change):

@@ -20,8 +20,8 @@ _NEWER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made").square()
+def room():
+    return truth().square()
 
 
 def _pictures(folder, room):

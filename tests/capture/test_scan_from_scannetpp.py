@@ -19,8 +19,8 @@ OPTIONS = IngestOptions(assume_srgb=True)
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 @pytest.fixture

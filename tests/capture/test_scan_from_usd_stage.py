@@ -18,8 +18,8 @@ from usdbrdf.tasks.ingest import ingest
 
 
 @pytest.fixture
-def room(tmp_path):
-    return truth(tmp_path / "made")
+def room():
+    return truth()
 
 
 def _stage(path, room, *, parts=True, unit=1.0):
@@ -77,6 +77,7 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "shot" / "images" / f"IMG-{i:03d}.exr", image)
+        write_image(tmp_path / "shot" / "images" / "thumbnails" / f"{i:03d}.png", image)
     assert choose_adapter(tmp_path / "shot").name == "usd"
     scan = read_scan(tmp_path / "shot" / "room.usda", IngestOptions())
     poses = room.world_from_camera.copy()

@@ -28,12 +28,15 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # Where programs put the pictures, beside what they say of them.
 _FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+_MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 # OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -169,10 +172,10 @@ def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> 
     if options.mesh is not None:
         return options.mesh
     for pattern in usual:
-        found = sorted(folder.glob(pattern))
+        found = [p for p in sorted(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
         if found:
             return contained(folder, found[0].relative_to(folder).as_posix())
-    others = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".ply", ".obj", ".glb")]
+    others = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
     if len(others) == 1:
         return contained(folder, others[0].name)
     said = f"{len(others)} meshes" if others else "no mesh"
@@ -200,6 +203,13 @@ def scan_of(
     source    the document that messages name; ``folder``, the capture's own, absolute
     encoding  of images that hold radiance, where the format says; the user's comes first
     """
+    for record in records:
+        if record.lens.bends and "undistort" in record.image_path.parent.name.lower():
+            raise InputRefused(
+                f"{record.image_path}: a picture that has been undistorted, but the lens of "
+                f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
+                "the cameras that were exported for these. [capture.camera]"
+            )
     if masks := sum(record.mask_path is not None for record in records):
         findings.warn(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "

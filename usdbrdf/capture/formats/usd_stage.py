@@ -139,7 +139,7 @@ def _picture(
     if math.isnan(time):
         own = {camera.label, camera.path.rpartition("/")[2]}
         exact = [found for name in sorted(own) if (found := pictures.named(name))]
-        same = [p for p in pictures.paths if identifier_from(p.stem) in own]
+        same = [p for p in pictures.paths if own & _identifiers(p.stem)]
         return exact[0] if exact else same[0] if len(same) == 1 else None
     if time != round(time):
         return None
@@ -151,6 +151,11 @@ def _picture(
         p for p in pictures.paths if p.parent.name == prim or re.fullmatch(rf"{prim}\D?\d+", p.stem)
     ]
     return Pictures(folder=pictures.folder, paths=tuple(own_pictures)).numbered().get(round(time))
+
+
+def _identifiers(stem: str) -> set[str]:
+    """What exporters make of a picture's name, as that of a prim: ours, and USD's own way."""
+    return {identifier_from(stem), re.sub(r"\W|^\d", "_", stem, flags=re.ASCII)}
 
 
 def _plate_file(plate: str, time: float, folder: Path, options: IngestOptions) -> Path | None:
