@@ -198,6 +198,23 @@ def test_undistorted_pictures_do_not_go_with_the_lens(tmp_path, room):
         read_scan(folder, OPTIONS)
 
 
+def test_groups_tell_pictures_of_one_name_apart(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, **_lens(room))
+    for side in range(2):
+        group = _child(cameras, "group", id=str(side), label=f"camera {side}", type="folder")
+        for i, pose in list(enumerate(room.opencv))[side::2]:
+            camera = _child(group, "camera", id=str(i), sensor_id="0", label=f"{i // 2}")
+            _child(camera, "transform", _text(_in_chunk(pose)))
+    folder = _write(tmp_path / "project", document, room)
+    for i in range(len(room.images)):
+        place = folder / "images" / f"camera {i % 2}" / f"{i // 2}.jpg"
+        place.parent.mkdir(exist_ok=True)
+        (folder / "images" / f"DSC{i:04d}.jpg").rename(place)
+    scan = read_scan(folder, OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[[*range(0, 10, 2), *range(1, 10, 2)]])
+
+
 def _edit(change):
     def damage(project):
         tree = ET.parse(project / "cameras.xml")
@@ -254,7 +271,7 @@ def _entities(project):
         (_edit(_not_aligned), r"only 6 of 10 frames.*not been aligned.*\[capture.pose\]"),
         (_edit(_not_calibrated), r"only 0 of 10.*sensor is not calibrated.*\[capture.pose\]"),
         (_edit(_cylindrical), r"a 'cylindrical' camera.*\[capture.camera\]"),
-        (_edit(_higher_terms), r"higher tangential terms.*\[capture.camera\]"),
+        (_edit(_higher_terms), r"'camera 0' has .*higher tangential terms.*\[capture.camera\]"),
         (_edit(_without_cameras), r"no chunk with sensors and cameras.*\[capture.format\]"),
         (_entities, r"document type.*\[document.xml\]"),
     ],

@@ -7,6 +7,7 @@ their sensors say, seen from the master's. Principal points are offsets from the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,12 +32,16 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
-from usdbrdf.model.lens import PINHOLE, Lens, whole_sphere
+from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
 from usdbrdf.options import IngestOptions
 
 NAME = "metashape"
 DESCRIPTION = DESCRIPTIONS[NAME]
-_CURVES = {"frame": "perspective", "fisheye": "fisheye", "equidistant_fisheye": "fisheye"}
+_CURVES: dict[str, Curve] = {
+    "frame": "perspective",
+    "fisheye": "fisheye",
+    "equidistant_fisheye": "fisheye",
+}
 
 
 def matches(path: Path) -> bool:
@@ -116,21 +121,11 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
             f"{source}: no chunk with sensors and cameras. Export the cameras again. "
             "[capture.format]"
         )
-    sensors = {
-        s.get("id", ""): found
-        for s in chunk.iterfind("sensors/sensor")
-        if (found := _sensor(s, source))
-    }
-    own = _place(chunk.find("transform"))
-    components = {
-        c.get("id", ""): _place(c.find("transform")) for c in chunk.iterfind("components/component")
-    }
-    if own is None and not any(components.values()):
-        findings.warn(
-            f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "
-            "--meters-per-unit. [capture.unit]"
-        )
+    sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
+    place_of = _places(chunk, source, findings)
     cameras = list(chunk.iterfind("cameras//camera"))
+    # Pictures of one name in several folders are told apart by the groups that they are in.
+    group_of = {c: g.get("label", "") for g in chunk.iterfind("cameras/group") for c in g}
     chunk_from_camera = {c.get("id", ""): numbers_of(c.find("transform"), 16) for c in cameras}
     records = []
     for camera in cameras:
@@ -144,12 +139,11 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
             why = "its sensor is not calibrated" if sensor is None else "it has not been aligned"
             findings.drop(label, why, "capture.pose")
             continue
-        image = pictures.named(label)
+        image = pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
         if image is None:
             drop_without_picture(label, findings)
             continue
-        place = own or components.get(camera.get("component_id", "")) or _UNPLACED
-        pose = place.pose(master.reshape(4, 4) @ sensor.master_from_sensor)
+        pose = place_of(camera).pose(master.reshape(4, 4) @ sensor.master_from_sensor)
         records.append(
             FrameRecord(
                 name=label,
@@ -162,6 +156,19 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
             )
         )
     return sorted(records, key=lambda record: record.image_path)
+
+
+def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place]:
+    """Where what is in a camera's chunk stands: as the chunk says, else the camera's component."""
+    own = _place(chunk.find("transform"))
+    parts = chunk.iterfind("components/component")
+    components = {part.get("id", ""): _place(part.find("transform")) for part in parts}
+    if own is None and not any(components.values()):
+        findings.warn(
+            f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "
+            "--meters-per-unit. [capture.unit]"
+        )
+    return lambda camera: own or components.get(camera.get("component_id", "")) or _UNPLACED
 
 
 _UNPLACED = _Place(rotation=np.eye(3), translation=np.zeros(3), scale=1.0)
@@ -182,67 +189,69 @@ def _place(transform: Element | None) -> _Place | None:
 
 def _sensor(sensor: Element, source: Path) -> _Sensor | None:
     """A sensor that is calibrated (or needs no calibration, because it sees a whole sphere)."""
-    kind = sensor.get("type", "frame")
     calibrations = {c.get("class", ""): c for c in sensor.iterfind("calibration")}
     adjusted = calibrations.get("adjusted", next(iter(calibrations.values()), None))
-    size = sensor.find("resolution")
-    if adjusted is not None and adjusted.find("resolution") is not None:
-        size = adjusted.find("resolution")
-    rotation = numbers_of(sensor.find("rotation"), 9)
-    location = numbers_of(sensor.find("location"), 3)
-    offset = rigid_pose(
-        np.eye(3) if rotation is None else rotation.reshape(3, 3),
-        np.zeros(3) if location is None else location,
-    )
-    # A master stands where its cameras do, even where its own offset is written down.
-    if sensor.get("master_id") is None:
-        offset = np.eye(4)
-    sides = (
-        [number_in(size.attrib, side) for side in ("width", "height")] if size is not None else []
-    )
-    if not all(side and side >= 1 for side in sides):
+    resolution = _resolution(adjusted) or _resolution(sensor)
+    if resolution is None:
         return None
-    width, height = (int(side or 0) for side in sides)
-    if kind == "spherical":
+    if sensor.get("type") == "spherical":
         return _Sensor(
-            intrinsics=whole_sphere(width, height),
-            resolution=(width, height),
+            intrinsics=whole_sphere(*resolution),
+            resolution=resolution,
             lens=Lens(curve="equirectangular"),
-            master_from_sensor=offset,
+            master_from_sensor=_offset(sensor),
         )
     if adjusted is None:
         return None
-    kind = adjusted.get("type", kind)
+    named = f"{source}: the sensor {sensor.get('label', '')!r}"
+    kind = adjusted.get("type", sensor.get("type", "frame"))
     if kind not in _CURVES:
         raise InputRefused(
-            f"{source}: the sensor {sensor.get('label', '')!r} is a {kind!r} camera (known: "
-            f"{', '.join(_CURVES)}, spherical). Undistort the pictures in Metashape and export the "
-            "cameras again. [capture.camera]"
+            f"{named} is a {kind!r} camera (known: {', '.join(_CURVES)}, spherical). Undistort the "
+            "pictures in Metashape and export the cameras again. [capture.camera]"
         )
     said = {name: _number(adjusted, name) for name in _NUMBERS}
-    focal = said["f"]
-    if not focal > 0 or said["p3"] or said["p4"]:
+    focal, across = said["f"], said["f"] + said["b1"]
+    if not min(focal, across) > 0 or said["p3"] or said["p4"]:
         raise InputRefused(
-            f"{source}: the calibration of sensor {sensor.get('label', '')!r} has no focal length, "
-            "or higher tangential terms (P3, P4), which are not read. Correct it, or optimise the "
-            "cameras without these. [capture.camera]"
+            f"{named} has no focal length, or higher tangential terms (P3, P4), which are not "
+            "read. Correct it, or optimise the cameras without these. [capture.camera]"
         )
-    across = focal + said["b1"]
-    radial = tuple(said[f"k{i}"] for i in range(1, 5))
     lens = Lens(
-        curve="fisheye" if _CURVES[kind] == "fisheye" else "perspective",
-        radial=radial,
+        curve=_CURVES[kind],
+        radial=tuple(said[f"k{i}"] for i in range(1, 5)),
         tangential=(said["p2"], said["p1"]),  # the other way round than OpenCV
         skew=said["b2"] / across,
     )
+    middle = resolution[0] / 2, resolution[1] / 2
     return _Sensor(
-        intrinsics=(across, focal, width / 2 + said["cx"], height / 2 + said["cy"]),
-        resolution=(width, height),
+        intrinsics=(across, focal, middle[0] + said["cx"], middle[1] + said["cy"]),
+        resolution=resolution,
         lens=lens if lens.bends else PINHOLE,
-        master_from_sensor=offset,
+        master_from_sensor=_offset(sensor),
     )
 
 
+def _resolution(holder: Element | None) -> tuple[int, int] | None:
+    size = holder.find("resolution") if holder is not None else None
+    width, height = (number_in(size.attrib if size is not None else {}, s) for s in _SIDES)
+    return (int(width), int(height)) if width and height and min(width, height) >= 1 else None
+
+
+def _offset(sensor: Element) -> Double:
+    """(4, 4) from the sensor to its rig's master. A master stands where its cameras do, even where
+    an offset of its own is written down."""
+    rotation = numbers_of(sensor.find("rotation"), 9)
+    location = numbers_of(sensor.find("location"), 3)
+    if sensor.get("master_id") is None:
+        return np.eye(4)
+    return rigid_pose(
+        np.eye(3) if rotation is None else rotation.reshape(3, 3),
+        np.zeros(3) if location is None else location,
+    )
+
+
+_SIDES = ("width", "height")
 _NUMBERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 
