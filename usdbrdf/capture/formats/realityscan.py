@@ -200,14 +200,9 @@ def _record(
     except ImageRefused as error:
         findings.drop(name, clause_of(error, image), "capture.image")
         return
-    if any(terms[4:]) and "tangential_distortions" not in findings.counts:
-        findings.warn(
-            f"{name}: tangential distortion (t1, t2) is read in OpenCV's order, which this program "
-            "does not document. [capture.camera]"
-        )
-    findings.count("tangential_distortions", int(any(terms[4:])))
     longer = max(width, height)
-    lens = Lens(radial=tuple(terms[:4]), tangential=(terms[4], terms[5]))
+    # Its own template for OpenCV writes k1, k2, t2, t1: the other way round.
+    lens = Lens(radial=tuple(terms[:4]), tangential=(terms[5], terms[4]))
     yield FrameRecord(
         name=name,
         image_path=image,
