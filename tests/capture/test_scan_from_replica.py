@@ -97,10 +97,10 @@ def test_what_lies_beside_the_folder_is_an_input(scene, room, tmp_path):
 
 
 def test_the_other_frames_keep_their_poses(scene, room):
-    for i in range(1, FRAMES, 10):
+    for i in range(0, FRAMES, 6):
         (scene / "results" / f"frame{i:06d}.jpg").unlink()
     scan = read_scan(scene, OPTIONS)
-    assert_same(scan, room, poses=np.delete(room.world_from_camera, [1], axis=0))
+    assert_same(scan, room, poses=np.delete(room.world_from_camera, [0, 6], axis=0))
 
 
 def test_labels_come_by_the_nearest_face_and_panes_are_objects(scene, room):
@@ -160,7 +160,7 @@ def _no_camera(scene):
     [
         (_no_mesh, r"room0_mesh.ply.*--mesh\. \[mesh.missing\]"),
         (_short_rows, r"a line of 12 numbers.*\[capture.format\]"),
-        (_few_poses, r"5 poses for pictures numbered 0 to 9.*\[capture.frames\]"),
+        (_few_poses, r"5 poses for pictures numbered up to 9.*\[capture.frames\]"),
         (_no_frames, r"no pictures below.*\[capture.frames\]"),
         (_no_camera, r"no camera with the numbers.*\[capture.camera\]"),
     ],

@@ -82,13 +82,18 @@ def _picture(image: Any) -> StationPicture:
         name=str(image["name"].value()) if image.isDefined("name") else "",
         kind=kind.removesuffix("Representation"),
         numbers=tuple(_number(shown, name) for name in _KINDS.get(kind, ())),
-        resolution=(int(_number(shown, "imageWidth")), int(_number(shown, "imageHeight"))),
+        resolution=(_whole(shown, "imageWidth"), _whole(shown, "imageHeight")),
         world_from_camera=pose,
     )
 
 
 def _number(node: Any, name: str) -> float:
     return float(node[name].value()) if node is not None and node.isDefined(name) else 0.0
+
+
+def _whole(node: Any, name: str) -> int:
+    number = _number(node, name)
+    return int(number) if np.isfinite(number) else 0
 
 
 def _numbers(node: Any, name: str, otherwise: Mapping[str, float]) -> Double:

@@ -60,7 +60,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
     for row, image in zip(rows.astype(np.float64), pictures.paths, strict=True):
         down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
         sound = np.isfinite(row[:15]).all() and min(width, height) >= 1
-        if not sound or max(width, height) != round(max(width, height)):
+        if not sound or (width, height) != (round(width), round(height)):
             findings.drop(image.name, "its row holds no finite pose and size", "capture.pose")
             continue
         records.append(

@@ -61,11 +61,13 @@ def read(path: Path, options: IngestOptions) -> Scan:
     refuse_without_pictures(pictures, source)
     camera = _camera(folder, findings)
     numbered = pictures.numbered()
-    first = min(numbered, default=0)
-    if max(numbered, default=0) - first >= len(poses):
+    # Frames count from 0; where one has the number of poses, from 1.
+    last = max(numbered, default=0)
+    first = int(last == len(poses) and 0 not in numbered)
+    if last - first >= len(poses):
         raise InputRefused(
-            f"{source}: {len(poses)} poses for pictures numbered {first} to {max(numbered)}. Bring "
-            "the trajectory of these pictures. [capture.frames]"
+            f"{source}: {len(poses)} poses for pictures numbered up to {last}. Bring the "
+            "trajectory of these pictures. [capture.frames]"
         )
     records = []
     for number, image in sorted(numbered.items()):

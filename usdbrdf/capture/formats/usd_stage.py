@@ -177,7 +177,7 @@ def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecor
     except ImageRefused as error:
         findings.drop(shot.name, clause_of(error, image), "capture.image")
         return
-    pose = shot.camera.world_from_camera[shot.i]
+    pose, exposure = shot.camera.world_from_camera[shot.i], float(shot.camera.exposure[shot.i])
     # What a camera hangs on may scale it, which changes where it stands and not what it sees.
     size = np.cbrt(abs(np.linalg.det(pose[:3, :3])))
     if size > 0:
@@ -188,7 +188,7 @@ def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecor
         world_from_camera=pose,
         intrinsics=pinhole_from_lens(shot.camera.lens[shot.i], width, height),
         resolution=(width, height),
-        exposure_time=float(shot.camera.exposure[shot.i]),
+        exposure_time=exposure if 0 < exposure < math.inf else 1.0,
     )
 
 
