@@ -104,10 +104,25 @@ def _moving_camera(stage, room, names=None):
 def test_a_moving_camera_has_its_back_plates(tmp_path, room):
     stage = _stage(tmp_path / "shot" / "room.usdc", room)
     _moving_camera(stage, room, [f"./plates/{9 - i}.exr" for i in range(10)])
+    for i in range(5):
+        UsdGeom.Camera.Define(stage, f"/cameras/view_{i}")  # of the artist
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", image)
     assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, names=room.names)
+
+
+@pytest.mark.parametrize("plate", ["plates/p.####.exr", "plates/p.%04d.exr"])
+def test_a_sequence_is_one_name_for_all_plates(tmp_path, room, plate):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    _moving_camera(stage, room)
+    prim = stage.GetPrimAtPath("/room/camera")
+    image = prim.CreateAttribute("houdini:backgroundimage", Sdf.ValueTypeNames.Asset)
+    image.Set(Sdf.AssetPath(plate))
+    stage.Save()
+    for i, pixels in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"p.{101 + i:04d}.exr", pixels)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
 
 
 def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, room):
@@ -119,6 +134,28 @@ def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, roo
     scan = read_scan(tmp_path / "shot", IngestOptions(frames=tmp_path / "plates"))
     assert_same(scan, room, poses=room.world_from_camera[:-1])
     assert scan.counts["poses_without_photograph"] == 1
+
+
+def test_cameras_of_a_rig_have_pictures_by_their_names_and_numbers(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    rig = UsdGeom.Xform.Define(stage, "/rig")
+    moves = rig.AddTransformOp()
+    for i in range(5):
+        moves.Set(Gf.Matrix4d(room.world_from_camera[i].T.tolist()), 1 + i)
+    offset = np.eye(4)
+    offset[:3, 3] = 0.1, 0, 0.05
+    poses = []
+    for name, pose in (("left", np.eye(4)), ("right", offset)):
+        camera = UsdGeom.Camera.Define(stage, f"/rig/{name}")
+        camera.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        _set_lens(camera, room.intrinsics[0])
+        poses += [room.world_from_camera[i] @ pose for i in range(5)]
+    stage.Save()
+    for i in range(5):
+        write_image(tmp_path / "shot" / "images" / "left" / f"{i + 1:04d}.exr", room.images[i])
+        name = f"right_{i + 1:04d}.exr"
+        write_image(tmp_path / "shot" / "images" / name, room.images[5 + i])
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, poses=np.array(poses))
 
 
 def test_subsets_with_labels_are_objects(tmp_path, room):

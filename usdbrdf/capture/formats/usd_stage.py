@@ -48,9 +48,14 @@ class _Shot(NamedTuple):
     i: int
 
     @property
+    def time(self) -> float:
+        """NaN where nothing changes."""
+        return float(self.camera.times[self.i])
+
+    @property
     def name(self) -> str:
-        time = self.camera.times[self.i]
-        return self.camera.path if math.isnan(time) else f"{self.camera.path} at {time:g}"
+        path = self.camera.path
+        return path if math.isnan(self.time) else f"{path} at {self.time:g}"
 
 
 def matches(path: Path) -> bool:
@@ -105,21 +110,23 @@ def read(path: Path, options: IngestOptions) -> Scan:
 def _records(
     shots: list[_Shot], stage: Path, options: IngestOptions, findings: Findings
 ) -> Iterator[FrameRecord]:
-    pictures = None
-    if options.frames is not None or not any(s.camera.images[s.i] for s in shots):
+    by_plate = options.frames is None and any(s.camera.images[s.i] for s in shots)
+    if by_plate:
+        named = [(shot, _plate_file(shot, stage.parent, options)) for shot in shots]
+    else:
         pictures = pictures_of(stage.parent, options)
         refuse_without_pictures(pictures, stage)
-    named = [(shot, _picture(shot, shots, stage, options, pictures)) for shot in shots]
-    if not any(image for _, image in named) and pictures is not None:
-        first = min(pictures.paths).name
-        raise InputRefused(
-            f"{stage}: none of {len(pictures.paths)} pictures, first {first!r}, belongs to any of "
-            f"{len(shots)} cameras, first {shots[0].name}. Name each picture as its camera, or end "
-            "its name with the number of the camera's time sample. [capture.frames]"
-        )
+        named = _by_name(shots, pictures)
+        if not any(image for _, image in named):
+            first = min(pictures.paths).name
+            raise InputRefused(
+                f"{stage}: none of {len(pictures.paths)} pictures, first {first!r}, belongs to any "
+                f"of {len(shots)} cameras, first {shots[0].name}. Name each picture as its camera, "
+                "or end its name with the number of the camera's time sample. [capture.frames]"
+            )
     for shot, image in named:
-        if image is None and pictures is not None and not math.isnan(shot.camera.times[shot.i]):
-            # Animation runs on between the pictures that were kept.
+        if image is None and (by_plate or not math.isnan(shot.time)):
+            # Other cameras, and animation that runs on between the pictures that were kept.
             findings.count("poses_without_photograph", 1)
         elif image is None:
             drop_without_picture(shot.name, findings)
@@ -129,28 +136,30 @@ def _records(
             yield from _record(shot, image, findings)
 
 
-def _picture(
-    shot: _Shot, shots: list[_Shot], stage: Path, options: IngestOptions, pictures: Pictures | None
-) -> Path | None:
-    """The picture of a camera at a time, or None."""
-    camera, time = shot.camera, shot.camera.times[shot.i]
-    if pictures is None:
-        return _plate_file(camera.images[shot.i], time, stage.parent, options)
-    if math.isnan(time):
-        own = {camera.label, camera.path.rpartition("/")[2]}
-        exact = [found for name in sorted(own) if (found := pictures.named(name))]
-        same = [p for p in pictures.paths if own & _identifiers(p.stem)]
-        return exact[0] if exact else same[0] if len(same) == 1 else None
-    if time != round(time):
-        return None
-    others = {each.camera.path for each in shots}
-    if len(others) == 1:
-        return pictures.numbered().get(round(time))
-    prim = camera.path.rpartition("/")[2]
-    own_pictures = [
-        p for p in pictures.paths if p.parent.name == prim or re.fullmatch(rf"{prim}\D?\d+", p.stem)
-    ]
-    return Pictures(folder=pictures.folder, paths=tuple(own_pictures)).numbered().get(round(time))
+def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path | None]]:
+    """Each camera's picture: by its own name if it stands still, else by the number of its time,
+    among those in a folder of its name, or whose names begin with it, if it is not alone."""
+    by_identifier: dict[str, list[Path]] = {}
+    for path in pictures.paths:
+        for identifier in _identifiers(path.stem):
+            by_identifier.setdefault(identifier, []).append(path)
+    alone = len({shot.camera.path for shot in shots}) == 1
+    numbered: dict[str, dict[int, Path]] = {}
+
+    def found(shot: _Shot) -> Path | None:
+        prim = shot.camera.path.rpartition("/")[2]
+        if math.isnan(shot.time):
+            same = by_identifier.get(prim, [])
+            exact = pictures.named(prim) or pictures.named(shot.camera.label)
+            return exact or (same[0] if len(same) == 1 else None)
+        if prim not in numbered:
+            starts = re.compile(rf"{prim}\D?\d+")
+            own = (p for p in pictures.paths if p.parent.name == prim or starts.fullmatch(p.stem))
+            paths = pictures.paths if alone else tuple(own)
+            numbered[prim] = Pictures(folder=pictures.folder, paths=paths).numbered()
+        return numbered[prim].get(round(shot.time)) if shot.time == round(shot.time) else None
+
+    return [(shot, found(shot)) for shot in shots]
 
 
 def _identifiers(stem: str) -> set[str]:
@@ -158,14 +167,15 @@ def _identifiers(stem: str) -> set[str]:
     return {identifier_from(stem), re.sub(r"\W|^\d", "_", stem, flags=re.ASCII)}
 
 
-def _plate_file(plate: str, time: float, folder: Path, options: IngestOptions) -> Path | None:
-    """The file of a back plate at a time, of a sequence too: plate.####.exr, plate.%04d.exr."""
+def _plate_file(shot: _Shot, folder: Path, options: IngestOptions) -> Path | None:
+    """The file of a back plate, of a sequence too: plate.####.exr, plate.%04d.exr."""
+    plate = shot.camera.images[shot.i]
     if not plate:
         return None
-    if not math.isnan(time):
-        number = f"{round(time)}"
+    if not math.isnan(shot.time):
+        number = f"{round(shot.time)}"
         plate = re.sub("#+", lambda m: number.zfill(len(m[0])), plate)
-        plate = re.sub(r"%0?(\d*)d", lambda m: number.zfill(int(m[1] or 1)), plate)
+        plate = re.sub(r"%0?(\d?)d", lambda m: number.zfill(int(m[1] or 1)), plate)
     inside = Path(plate).is_relative_to(folder)
     relative = Path(plate).relative_to(folder).as_posix() if inside else plate
     return path_in_capture(folder, relative, options)
