@@ -137,7 +137,7 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
         master = chunk_from_camera.get(camera.get("master_id", camera.get("id", "")))
         if sensor is None or master is None:
             why = "its sensor is not calibrated" if sensor is None else "it has not been aligned"
-            findings.drop(label, why, "capture.pose")
+            findings.drop(label, why, "capture.alignment")
             continue
         image = pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
         if image is None:
