@@ -268,7 +268,7 @@ def _entities(project):
     [
         (_no_model, r"no mesh\. Export the model .*--mesh\. \[mesh.missing\]"),
         (_no_pictures, r"no pictures below.*--frames\. \[capture.frames\]"),
-        (_edit(_not_aligned), r"only 6 of 10 frames.*not been aligned.*Align and.*\[capture.alignment\]"),
+        (_edit(_not_aligned), r"only 6 of 10.*not been aligned.*Align and.*\[capture.alignment\]"),
         (_edit(_not_calibrated), r"only 0 of 10.*sensor is not calibrated.*\[capture.alignment\]"),
         (_edit(_cylindrical), r"a 'cylindrical' camera.*\[capture.camera\]"),
         (_edit(_higher_terms), r"'camera 0' has .*higher tangential terms.*\[capture.camera\]"),
