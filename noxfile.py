@@ -56,9 +56,8 @@ def room(session: nox.Session) -> None:
 @nox.session
 def everything(session: nox.Session) -> None:
     """All tests, as they run before a change is accepted."""
-    install(
-        session, "test,dcc,denoise,render,e57" if sys.version_info < (3, 13) else "test,denoise"
-    )
+    readers = "test,colmap,e57,denoise"
+    install(session, f"{readers},dcc,render" if sys.version_info < (3, 13) else readers)
     session.run("python", "-m", "pytest", *session.posargs)
 
 
