@@ -94,7 +94,7 @@ class Inspect(_OnCapture):
 
     def run(self) -> int:
         with loading():
-            from usdbrdf.tasks.photometry import inspect
+            from usdbrdf.tasks.inspect import inspect
         found = inspect(self.capture, self.inspect, self.adapter, plugins=self.plugins)
         if self.json:
             show(json.dumps(found.summary(), indent=2), whole=True)

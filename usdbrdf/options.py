@@ -199,6 +199,8 @@ class IngestOptions(Options):
     "mesh, in any place"
     objects: Path | None = option("--objects FILE", None, unset="the capture's own", file=True)
     "object names (objects.json), in any place"
+    frames: Path | None = option("--frames DIR", None, unset="the capture's own")
+    "folder of the pictures, in any place, for formats that name pictures but not their folder"
     crease_angle_deg: float = option("--crease-angle DEG", 40.0, (0, 180))
     "faces that meet at more degrees than this meet in a sharp edge"
     decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")
@@ -235,12 +237,12 @@ class IngestOptions(Options):
 class InspectOptions(IngestOptions):
     """What a user may say about a capture that is only looked at."""
 
-    frames: int = option("--frames N", 24, (2, 2**31 - 1))
+    checked: int = option("--check N", 24, (2, 2**31 - 1))
     """look at the pixels of so many frames, evenly spread, as long as all of these can be used"""
 
     @property
     def looked_at(self) -> int | None:
-        return self.frames
+        return self.checked
 
 
 class TextureOptions(Options):

@@ -57,7 +57,9 @@ def explode(*_):
 
 def test_ours_are_there_even_if_nothing_is_installed(announce):
     announce()
-    assert [a.name for a in list_adapters()] == ["transforms", "scanner-app", "colmap"]
+    assert (
+        [a.name for a in list_adapters()] == list(adapters.MODULES) == list(adapters.DESCRIPTIONS)
+    )
     assert all(a.module is not None and a.description for a in list_adapters())
 
 
@@ -73,8 +75,7 @@ def test_theirs_is_found_and_used(announce, tmp_path):
     options = IngestOptions()
     assert read_scan(tmp_path / "theirs", options).name == "read by theirs"
     assert read_scan(tmp_path, options, "theirs").name == "read by theirs"
-    ours = ["transforms", "scanner-app", "colmap"]
-    assert [a.name for a in list_adapters(plugins=False)] == ours
+    assert [a.name for a in list_adapters(plugins=False)] == list(adapters.MODULES)
 
 
 @pytest.mark.fault("S6")
@@ -138,7 +139,7 @@ def test_nothing_recognised_lists_what_would_be(tmp_path):
         read_scan(tmp_path, IngestOptions())
     with pytest.raises(InputRefused, match=r"no such file.*\[capture.missing\]"):
         read_scan(tmp_path / "nowhere", IngestOptions())
-    with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of transforms"):
+    with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of eyeful-tower"):
         read_scan(tmp_path, IngestOptions(), "opensfm")
 
 

@@ -101,10 +101,10 @@ def test_photographs_are_read_on_as_if_they_were_granted(capture):
 def test_few_frames_are_looked_at_unless_one_of_them_is_bad(tmp_path):
     capture = make_capture(tmp_path / "room", frames=30)
     write_exr(capture.image(1), np.zeros((24, 32, 3), np.float32))
-    found = inspect(capture.folder, InspectOptions(frames=4))
+    found = inspect(capture.folder, InspectOptions(checked=4))
     assert (found.looked_at, len(found.frames)) == (4, 30)
     write_exr(capture.image(29), np.zeros((24, 32, 3), np.float32))
-    found = inspect(capture.folder, InspectOptions(frames=4))
+    found = inspect(capture.folder, InspectOptions(checked=4))
     assert (found.looked_at, len(found.frames)) == (30, 28)
     assert any("2 of 30 frames dropped" in warning for warning in found.warnings)
 

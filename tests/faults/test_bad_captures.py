@@ -391,7 +391,7 @@ def test_fault_is_refused(capture, fault):
     assert re.fullmatch(rf"[^\n]+: [^\n]+ \[{re.escape(rule)}\]", message), message
     assert [word for word in words if word not in message] == [], message
     assert str(capture.folder) in message
-    told = inspect(capture.folder, InspectOptions(frames=4))
+    told = inspect(capture.folder, InspectOptions(checked=4))
     assert str(told.refusals[-1]) == message
     assert (told.refusals[0] is told.refusals[-1]) or told.granted
     assert _files(capture.folder.parent) == before

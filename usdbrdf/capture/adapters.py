@@ -24,15 +24,38 @@ if TYPE_CHECKING:
     from usdbrdf.options import IngestOptions
 
 
+# In the order in which they are asked: those whose folders hold other formats too come first.
 MODULES = {
+    "eyeful-tower": "usdbrdf.capture.formats.eyeful_tower",
+    "scannetpp": "usdbrdf.capture.formats.scannetpp",
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
+    "metashape": "usdbrdf.capture.formats.metashape",
+    "realityscan": "usdbrdf.capture.formats.realityscan",
+    "nice-slam": "usdbrdf.capture.formats.nice_slam",
+    "replica": "usdbrdf.capture.formats.replica",
+    "fipt": "usdbrdf.capture.formats.fipt",
+    "llff": "usdbrdf.capture.formats.llff",
+    "e57": "usdbrdf.capture.formats.e57",
+    "usd": "usdbrdf.capture.formats.usd_stage",
+    "alembic": "usdbrdf.capture.formats.alembic",
 }
 DESCRIPTIONS = {
+    "eyeful-tower": "room of Eyeful Tower (cameras.json, images-2k/, mesh.obj)",
+    "scannetpp": "scene of ScanNet++ (dslr/, scans/)",
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
-    "colmap": "COLMAP model, text or binary, with its images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
+    "colmap": "COLMAP model, text or binary, with its images and a mesh",
+    "metashape": "cameras that Metashape exports (XML), pictures, model",
+    "realityscan": "cameras that RealityScan (RealityCapture) exports (CSV, XMP), pictures, model",
+    "nice-slam": "NICE-SLAM's renders of Replica (traj.txt and results/)",
+    "replica": "Replica scene with frames (mesh.ply, habitat/, traj.txt)",
+    "fipt": "HDR room of FIPT, photographed (cam.txt, K_list.txt) or rendered (train/, val/)",
+    "llff": "pictures with LLFF's poses_bounds.npy, and a mesh",
+    "e57": "E57 with the stations of pictures, the pictures extracted beside it, and a mesh",
+    "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
+    "alembic": "Alembic cameras: not read, says how to convert them",
 }
 
 
@@ -177,18 +200,24 @@ def _loaded(point: EntryPoint) -> Adapter:
     )
 
 
+def files_beside(adapter: Adapter, path: Path) -> list[Path]:
+    """What an adapter reads outside of the capture's folder, as its ``beside(path)`` says; most
+    have none."""
+    beside = getattr(adapter.module, "beside", None)
+    return sorted(beside(path)) if beside is not None else []
+
+
 def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
     """What a chosen adapter makes of a capture."""
     from usdbrdf.model.capture import Scan
 
     assert adapter.module is not None
-    for named in (path, options.mesh, options.objects):
+    for named in (path, options.mesh, options.objects, options.frames):
         refuse_nameless(named)
     try:
         scan = adapter.module.read(path, options)
         if not isinstance(scan, Scan):
             raise TypeError(f"it returned a {type(scan).__name__} in the place of a Scan")
-        return scan
     except UsdBrdfError:
         raise
     except Exception as error:
@@ -198,3 +227,18 @@ def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
             f"{path}: adapter {adapter.name!r} ({adapter.origin}) failed: {error!r}. Report it to "
             "its authors. [adapter.read]"
         ) from error
+    if options.frames is not None:
+        _refuse_unused(options.frames, scan, adapter)
+    return scan
+
+
+def _refuse_unused(frames: Path, scan: Scan, adapter: Adapter) -> None:
+    """UsageError where no picture comes from the folder that the user named."""
+    views = scan.views or [None] * len(scan.frames)
+    pairs = zip(views, scan.frames.image_paths, strict=True)
+    photographs = [path if view is None else view.photograph for view, path in pairs]
+    if not any(photograph.is_relative_to(frames.resolve()) for photograph in photographs):
+        raise UsageError(
+            f"--frames {frames}: no picture of this capture lies there; the format "
+            f"{adapter.name!r} says itself where they are. Leave the option out. [usage.option]"
+        )

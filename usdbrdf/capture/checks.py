@@ -4,26 +4,23 @@ are spent on them, and what was noticed: sentences, numbers, frames left out."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import MAX_SIDE, image_size
-from usdbrdf.geometry.sides import Sides
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.model.mesh import ScanGeometry, ScanMesh, face_normals_and_angles
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.model.mesh import ScanGeometry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +70,7 @@ MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
+    "capture.alignment": "Align and calibrate these cameras, or take them out of the project.",
     "capture.camera": "Correct the focal lengths, principal points and distortion.",
     "capture.file": "Copy the missing images, or remove their entries.",
     "capture.image": "Export the images again as R, G, B float EXR.",
@@ -171,11 +169,6 @@ _EXACT = 1e-14
 # of the image.
 LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
-_MIN_BASELINE = 1e-3  # of the scene's diagonal
-_MIN_HIT_SHARE = 0.2
-_MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
-# Frames that are probed with rays, and rays along each side of them.
-_PROBED_FRAMES, _PROBED_SIDE = 64, 8
 
 
 def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
@@ -440,81 +433,3 @@ def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] |
 def clause_of(error: ImageRefused, path: Path) -> str:
     """The reader's sentence without path and rule, which the summary adds."""
     return str(error).removeprefix(f"{path}: ").rsplit(" [", 1)[0].rstrip(".")
-
-
-def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> None:
-    """InputRefused where all cameras stand at one point: nothing but a panorama."""
-    centres = frames.world_from_camera[:, :3, 3]
-    spread = float(np.linalg.norm(np.ptp(centres, axis=0)))
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points.astype(np.float64), axis=0)))
-    if spread < _MIN_BASELINE * diagonal:
-        raise InputRefused(
-            f"{source}: all {len(frames)} cameras stand within {spread:.3g} of one point in a "
-            f"scene {diagonal:.3g} across, there is no parallax. Capture from several places, or "
-            "check the translations of the poses. [capture.parallax]"
-        )
-
-
-def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float:
-    """Share of camera rays that hit the mesh; InputRefused below 20 %.
-
-    The usual mix-ups of conventions are then tried, and those that would hit are named.
-    """
-    scene = RayScene(mesh.points, mesh.triangles)
-    share = _hit_share(scene, frames, lambda pose: pose)
-    if share >= _MIN_HIT_SHARE:
-        return share
-    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
-    better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= _MIN_HIT_SHARE]
-    if better:
-        cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"
-    else:
-        cure = (
-            f"No usual convention does better (best {max(tried.values()):.0%}; tried: "
-            f"{'; '.join(tried)}). Check that mesh and poses share frame and unit"
-        )
-    raise InputRefused(
-        f"{source}: only {share:.0%} of the camera rays hit the mesh (limit "
-        f"{_MIN_HIT_SHARE:.0%}). {cure}. [capture.convention]"
-    )
-
-
-def drop_cameras_inside(
-    frames: Frames, mesh: ScanMesh, sides: Sides, names: Sequence[str], findings: Findings
-) -> list[int]:
-    """Indices of the frames that show surfaces from the side from which others show them; those
-    that look at their backs from inside are noted in ``findings`` by their ``names``."""
-    scene = RayScene(mesh.points, mesh.triangles)
-    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
-    # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
-    alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]
-    usable: list[int] = []
-    for i in range(len(frames)):
-        origins, towards = frames.camera(i).rays(_probes() * frames.resolution[i])
-        face = scene.closest(origins, towards).face
-        back = (towards * normals[face]).sum(axis=1) > 0
-        behind = float(((face >= 0) & alone[face, back.astype(np.int64)]).mean())
-        if behind > _MAX_BEHIND:
-            said = f"{behind:.0%} of its rays hit surfaces from behind, as others see them"
-            findings.drop(names[i], f"{said} (limit {_MAX_BEHIND:.0%})", "capture.inside")
-        else:
-            usable.append(i)
-    return usable
-
-
-def _probes() -> Double:
-    """(P, 2) places in an image, in parts of its sides, at which it is probed with rays."""
-    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
-    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-
-
-def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
-    count = min(len(frames), _PROBED_FRAMES)
-    grid = _probes()
-    hits = 0
-    for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
-        camera = frames.camera(i)
-        camera = replace(camera, world_from_camera=read(camera.world_from_camera))
-        rays = camera.rays(grid * frames.resolution[i])
-        hits += int((scene.closest(*rays).face >= 0).sum())
-    return hits / (count * len(grid))

@@ -13,15 +13,17 @@ from typing import Any, NamedTuple, ParamSpec
 
 import numpy as np
 
+from usdbrdf.capture.camera_checks import (
+    drop_cameras_inside,
+    refuse_rays_that_miss,
+    refuse_without_parallax,
+)
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,
     at_image_size,
     check_frames,
-    drop_cameras_inside,
     frames_from_records,
-    refuse_rays_that_miss,
-    refuse_without_parallax,
     rigid_records,
     with_masks,
 )
@@ -163,9 +165,18 @@ def objects_with_faces(
 
 
 def geometry_from_usd(
-    path: Path, options: IngestOptions, findings: Findings, *, capture_root: Path
+    path: Path,
+    options: IngestOptions,
+    findings: Findings,
+    *,
+    capture_root: Path,
+    subsets: bool = False,
 ) -> ScanGeometry:
-    """Every mesh below the default prim is one object, by its display name or its own."""
+    """Every mesh below the default prim is one object, by its display name or its own.
+
+    subsets  where meshes have face subsets, these are the objects; the asset then holds the
+             geometry itself, because only whole meshes of another file can carry its textures
+    """
     if options.decimate is not None:
         raise UsageError(
             f"{path}: --decimate does not reduce geometry that is referenced from USD. Reduce it "
@@ -175,7 +186,8 @@ def geometry_from_usd(
         raise InputRefused(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
-    found = meshes_from_usd(path, allow=(capture_root, *options.allow_outside))
+    allow = (capture_root, *options.allow_outside)
+    found = meshes_from_usd(path, allow=allow, subsets=subsets)
     findings.warnings += found.warnings
     mesh = found.mesh
     missing = np.isnan(mesh.corner_normals[:, 0, 0])
@@ -183,12 +195,18 @@ def geometry_from_usd(
         mesh.corner_normals[missing] = corner_normals(
             mesh.points, mesh.triangles[missing], options.crease_angle_deg
         )
-    return replace(found, has_normals=~missing, usd_geometry=path.resolve())
+    if not found.object_prims:
+        findings.warn(
+            f"{path.name}: {len(found.objects)} objects have been made from face subsets, so the "
+            "asset holds the meshes itself instead of referring to them. [stage.subsets]"
+        )
+    whole = path.resolve() if found.object_prims else None
+    return replace(found, has_normals=~missing, usd_geometry=whole)
 
 
 def geometry_from_file(
     mesh_path: Path,
-    objects_path: Path | None,
+    objects: Path | Callable[[FileMesh], LabelTable] | None,
     options: IngestOptions,
     findings: Findings,
     *,
@@ -197,7 +215,8 @@ def geometry_from_file(
 ) -> ScanGeometry:
     """Read, check, segment and clean a mesh.
 
-    objects_path     objects.json, or None
+    objects          objects.json; or what knows the objects of the mesh that was read, an id for
+                     each of its triangles; or None
     capture_root     folder inside which a USD file may refer to others
     meters_per_unit  of the adapter, for areas in square metres; the options' comes first
     """
@@ -211,7 +230,11 @@ def geometry_from_file(
             f"{mesh_path.name}: {broken} of {len(mesh.kept)} faces had NaN corners or pointed to "
             "vertices that do not exist, and have been removed. [mesh.broken]"
         )
+    objects_path = objects if isinstance(objects, Path) else None
     table = label_table(objects_path) if objects_path is not None else None
+    if objects is not None and not isinstance(objects, Path):
+        table = objects(mesh)
+        mesh, table = replace(mesh, face_label=table.face_id), table._replace(face_id=None)
     split = segmentation(
         mesh,
         table,
@@ -232,7 +255,7 @@ def geometry_from_file(
     )
     for name, number in clean.counts.items():
         findings.count(name, number)
-    face_object, objects = objects_with_faces(clean.face_object, split.labels)
+    face_object, labelled = objects_with_faces(clean.face_object, split.labels)
     return ScanGeometry(
         mesh=ScanMesh(
             points=clean.points,
@@ -240,7 +263,7 @@ def geometry_from_file(
             corner_normals=corner_normals(clean.points, clean.triangles, options.crease_angle_deg),
             face_object=face_object,
         ),
-        objects=objects,
+        objects=labelled,
     )
 
 

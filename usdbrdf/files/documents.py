@@ -44,7 +44,7 @@ def read_json(path: Path, *, nonfinite_below: Collection[str] = ()) -> Any:
 
     nonfinite_below  keys whose values may hold NaN and infinities, for the caller to judge
     """
-    text = _read_text(path)
+    text = read_text(path)
     too_deep = InputRefused(
         f"{path}: nested deeper than {MAX_DEPTH} levels. This is not a document of ours; check "
         "what wrote it. [document.depth]"
@@ -102,7 +102,8 @@ def json_text(obj: Any) -> str:
         ) from error
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """A whole UTF-8 file within ``MAX_BYTES``; InputRefused otherwise."""
     try:
         if not path.is_file():  # a FIFO or device would block or never end
             raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")

@@ -14,17 +14,15 @@ from usdbrdf.asset.layers.scan_layer import (
     write_root,
     write_scan_layer,
 )
-from usdbrdf.asset.layout import ROLES, Asset, relative_path
-from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
+from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.capture.develop import developed
 from usdbrdf.capture.native import refuse_taken, write_capture
-from usdbrdf.files.paths import files_below
-from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.capture_inputs import inputs_of_capture
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
-from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
 def ingest(
@@ -44,10 +42,10 @@ def ingest(
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
-        if key not in ("mesh", "objects", "allow_outside")
+        if key not in ("mesh", "objects", "frames", "allow_outside")
     }
-    inputs, places = _inputs(capture, options, asset)
     chosen = choose_adapter(capture, adapter, plugins=plugins)
+    inputs, places = inputs_of_capture(capture, options, asset, files_beside(chosen, capture))
     if chosen.package:
         # Our own adapters change with the version of the code, which every stamp holds.
         parameters["adapter_package"] = chosen.package
@@ -64,10 +62,10 @@ def ingest(
         warnings = warned(scan.warnings)
         header = StageHeader.of_scan(asset.name, scan)
         check_root(asset, header)
-        # Photographs through lenses become frames last, when nothing else can be refused.
-        places = [str(path) for path in scan.frames.image_paths]
+        # Photographs through lenses become frames when nothing but pixels can be refused.
+        files = [str(path) for path in scan.frames.image_paths]
         scan = replace(scan, frames=developed(scan, asset.folder, run.output_kept))
-        images = [run.kept.get(place, Path(place)) for place in places]
+        images = [run.kept.get(file, Path(file)) for file in files]
         asked, told = asked_of_its_pixels(scan, images, options)
         if copy_to is not None:
             write_capture(scan, images, copy_to)
@@ -95,31 +93,3 @@ def ingest(
         scan = replace(scan, frames=developed(scan, asset.folder, lambda *_: None))
         write_capture(scan, scan.frames.image_paths, copy_to)
     return result
-
-
-def _inputs(
-    capture: Path, options: IngestOptions, asset: Asset
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Hashes of all that ingest may read: the capture's folder and those that its documents may
-    point into, without the asset if that lies in one, and files named by options. And where these
-    lie, seen from scan.usdc, which names photographs and USD geometry by such paths: what is moved
-    must be read anew."""
-    folder = (capture if capture.is_dir() else capture.parent).resolve()
-    refuse_missing(capture)
-    outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
-    inputs = {
-        label: hash_of_files(files_below(place, without=asset.folder), place)
-        for label, place in ({"capture": folder} | outside).items()
-    }
-    mesh, objects = options.mesh, options.objects
-    if mesh is not None and mesh.is_file():
-        # What a USD mesh refers to may lie beside it, out of the capture.
-        usd = mesh.suffix.lower() in USD_SUFFIXES
-        layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
-        inputs["mesh"] = hash_of_files(layers)
-    if objects is not None and objects.is_file():
-        inputs["objects"] = hash_of_files([objects])
-    named = {"mesh": mesh.resolve()} if mesh is not None else {}
-    places = {"capture": capture.resolve()} | named | outside
-    here = asset.layer("scan").parent
-    return inputs, {name: relative_path(place, here) for name, place in places.items()}

@@ -13,15 +13,13 @@ import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
-from usdbrdf.capture.inspection import Inspection
-from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
-from usdbrdf.options import IngestOptions, InspectOptions
+from usdbrdf.options import IngestOptions
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,
@@ -67,8 +65,8 @@ def agreement_of_frames(
         images = read_frames(read, asked)
         for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
             camera = frames.camera(i)
-            for name, read in readings.items():
-                other = replace(camera, world_from_camera=read(camera.world_from_camera))
+            for name, turned in readings.items():
+                other = replace(camera, world_from_camera=turned(camera.world_from_camera))
                 found[name].append(logarithms_in_frame(surface, rays, other, pixels))
         return {name: agreement(np.stack(some, axis=1)) for name, some in found.items()}
 
@@ -110,20 +108,3 @@ def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]
             f"{named}; what all are off by was divided out. [capture.exposure]"
         )
     return replace(scan, frames=frames), off
-
-
-def inspect(
-    capture: Path, options: InspectOptions, adapter: str | None = None, *, plugins: bool = True
-) -> Inspection:
-    """``capture.inspection``, and whether poses, mesh and frames agree."""
-    found = inspect_capture(capture, options, adapter, plugins=plugins)
-    if found.mesh is None or found.frames is None or not found.could_be_read:
-        return found
-    if any(found.frames.photographs):  # not resampled out of these yet
-        return found
-    try:
-        read = partial(read_frame, found.frames)
-        agrees = agreement_of_frames(found.mesh, found.frames, read, capture)
-    except InputRefused as refusal:
-        return replace(found, refusals=(*found.refusals, refusal))
-    return replace(found, agreement=agrees and agrees.ratio)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import unique_identifiers
@@ -45,13 +45,18 @@ def layers_of_usd(path: Path, allow: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(Path(layer) for layer in layers)
 
 
-def meshes_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> ScanGeometry:
-    """Every visible mesh below the default prim, one object each, by its display name or its own;
-    instances count one by one.
+def meshes_from_usd(
+    path: Path, *, allow: Sequence[Path] = (), subsets: bool = False
+) -> ScanGeometry:
+    """Every visible mesh below the default prim, one object each, by its display name or its own,
+    with the class that semantic labels give it; instances count one by one.
 
-    allow  folders outside the file's own that its asset paths may lead into
+    allow    folders outside the file's own that its asset paths may lead into
+    subsets  where meshes have face subsets, each of these is an object, and what is left of its
+             mesh another; there are no ``object_prims`` then
     """
-    return _in_child("meshes", path, allow, ScanGeometry, parts=(ScanMesh, ObjectLabel))
+    reader = "parts" if subsets else "meshes"
+    return _in_child(reader, path, allow, ScanGeometry, parts=(ScanMesh, ObjectLabel))
 
 
 def render_scene_of_usd(
@@ -76,8 +81,8 @@ def _in_child(
 
 
 def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
-    """The "layers", the "meshes", or what another ``reader`` makes of a file, in this process, a
-    child; nothing is composed before the asset paths are checked."""
+    """The "layers", the "meshes", these with their "parts", or what another ``reader`` makes of a
+    file, in this process, a child; nothing is composed before the asset paths are checked."""
     with _usd_errors(path):
         layers = check_asset_paths(path, allowed)
         if reader == "layers":
@@ -89,9 +94,9 @@ def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
                 f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
                 "layers along, or flatten it. [stage.input]"
             )
-        if reader == "meshes":
-            return _meshes(stage, path)
-        _check_units(stage, path)
+        if reader in ("meshes", "parts"):
+            return _meshes(stage, path, subsets=reader == "parts")
+        check_units(stage, path)
         module, _, name = reader.partition(":")
         return getattr(import_module(module), name)(path)
 
@@ -107,14 +112,14 @@ def _usd_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _meshes(stage: Usd.Stage, path: Path) -> ScanGeometry:
+def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
     root = stage.GetDefaultPrim()
     if not root:
         raise InputRefused(
             f"{path}: the stage has no default prim, so nothing can refer to it. Set defaultPrim "
             "in the file. [stage.default_prim]"
         )
-    meters_per_unit, up_axis = _check_units(stage, path)
+    meters_per_unit, up_axis = check_units(stage, path)
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     meshes, warnings = _meshes_below(root, path)
@@ -124,23 +129,84 @@ def _meshes(stage: Usd.Stage, path: Path) -> ScanGeometry:
     ]
     points, triangles, face_object = joined([part[:2] for part in parts])
     prims = [mesh.GetPrim() for mesh in meshes]
-    labels = [prim.GetDisplayName() or prim.GetName() for prim in prims]
+    split = [face_subsets(mesh) if subsets else [] for mesh in meshes]
+    owners: list[Usd.Prim] = []
+    for i, (mesh, own) in enumerate(zip(meshes, split, strict=True)):
+        which = _subset_of_triangles(mesh, own, parts[i][3], time)
+        face_object[face_object == i] = len(owners) + np.where(which < 0, len(own), which)
+        owners += [*(subset.GetPrim() for subset in own), prims[i]]
+    if any(split):  # a whole mesh is an object even without an area: the asset refers to it
+        used, numbered = np.unique(face_object, return_inverse=True)
+        owners, face_object = [owners[i] for i in used.tolist()], numbered.astype(np.int32)
+    labels = [prim.GetDisplayName() or prim.GetName() for prim in owners]
+    identifiers = unique_identifiers(labels)
     return ScanGeometry(
         mesh=ScanMesh(
             points=points,
             triangles=triangles,
-            corner_normals=np.concatenate([normals for _, _, normals in parts]),
+            corner_normals=np.concatenate([part[2] for part in parts]),
             face_object=face_object,
         ),
         objects=tuple(
-            ObjectLabel(identifier=identifier, label=label)
-            for identifier, label in zip(unique_identifiers(labels), labels, strict=True)
+            ObjectLabel(identifier=identifier, label=label, class_name=_class_of(prim))
+            for identifier, label, prim in zip(identifiers, labels, owners, strict=True)
         ),
-        object_prims=tuple(str(p.GetPath().MakeRelativePath(root.GetPath())) for p in prims),
+        object_prims=()
+        if any(split)
+        else tuple(str(p.GetPath().MakeRelativePath(root.GetPath())) for p in prims),
         meters_per_unit=meters_per_unit,
         up_axis=up_axis,
         warnings=tuple(warnings),
     )
+
+
+def face_subsets(mesh: UsdGeom.Mesh) -> list[UsdGeom.Subset]:
+    """The subsets of faces that tell objects apart: of the family with semantic labels, else of one
+    that is not there for materials, else of that one."""
+    families: dict[str, list[UsdGeom.Subset]] = {}
+    for subset in UsdGeom.Subset.GetGeomSubsets(mesh, UsdGeom.Tokens.face):
+        families.setdefault(str(subset.GetFamilyNameAttr().Get() or ""), []).append(subset)
+
+    def rank(family: str) -> tuple[bool, bool, str]:
+        labelled = any(_labels_at(subset.GetPrim()) for subset in families[family])
+        return not labelled, family == UsdShade.Tokens.materialBind, family
+
+    return families[min(families, key=rank)] if families else []
+
+
+def _subset_of_triangles(
+    mesh: UsdGeom.Mesh, subsets: Sequence[UsdGeom.Subset], polygon: Int, time: Any
+) -> Int:
+    """(T,) the subset that each triangle's polygon is in, the first of several; -1 for none."""
+    subset_of = np.full(len(mesh.GetFaceVertexCountsAttr().Get(time) or []), -1, np.int32)
+    for i, subset in reversed(list(enumerate(subsets))):
+        indices = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
+        subset_of[indices[(indices >= 0) & (indices < len(subset_of))]] = i
+    return np.asarray(subset_of[polygon], np.int32)
+
+
+def _class_of(prim: Usd.Prim) -> str:
+    """The semantic label of a prim, or of the nearest prim above that has one; "" without any."""
+    while prim and not prim.IsPseudoRoot():
+        if labels := _labels_at(prim):
+            return labels[0]
+        prim = prim.GetParent()
+    return ""
+
+
+def _labels_at(prim: Usd.Prim) -> list[str]:
+    """Labels of UsdSemantics, or of the schema that was used before it, those of a taxonomy
+    "class" or "category" first."""
+    found = []
+    for attribute in prim.GetAuthoredAttributes():
+        words = attribute.GetName().split(":")
+        if words[:2] == ["semantics", "labels"]:
+            values = attribute.Get(Usd.TimeCode.EarliestTime()) or ()
+            found += [(words[-1] not in ("class", "category"), str(value)) for value in values]
+        elif words[0] == "semantic" and words[-1] == "semanticData":
+            kind = prim.GetAttribute(":".join([*words[:-1], "semanticType"]))
+            found += [(not kind or kind.Get() != "class", str(attribute.Get()))]
+    return [label for _, label in sorted(found, key=lambda entry: entry[0]) if label]
 
 
 def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
@@ -202,7 +268,7 @@ def _one_line(error: object) -> str:
     return " ".join(str(error).split())[:300]
 
 
-def _check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
+def check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
     """Metres per unit and the up axis; InputRefused where no scene can have them."""
     meters, axis = UsdGeom.GetStageMetersPerUnit(stage), str(UsdGeom.GetStageUpAxis(stage))
     if not (math.isfinite(meters) and _MIN_UNIT <= meters <= _MAX_UNIT):
@@ -253,7 +319,7 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
     if not meshes:
         raise InputRefused(
             f"{path}: no visible mesh below <{root.GetPath()}>. Export the surface as meshes "
-            "inside the default prim. [mesh.empty]"
+            "inside the default prim, or name a mesh with --mesh. [mesh.empty]"
         )
     return meshes, _warnings(path.name, root, meshes, other, hidden)
 
@@ -287,8 +353,9 @@ def _warnings(
     return [f"{name}: {number} {said}" for said, number in sentences.items() if number]
 
 
-def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float, Int, Float]:
-    """One mesh in the world: points, triangles, corner normals (NaN where none are authored).
+def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float, Int, Float, Int]:
+    """One mesh in the world: points, triangles, corner normals (NaN where none are authored), and
+    the polygon of each triangle.
 
     transform is USD's, for row vectors: p_world = p @ matrix.
     """
@@ -306,7 +373,7 @@ def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float
         size = np.linalg.norm(turned, axis=2, keepdims=True)
         if np.isfinite(turned).all() and (size > 0).all():
             normals = (turned / size).astype(np.float32)
-    return world.astype(np.float32), fans.triangles, normals
+    return world.astype(np.float32), fans.triangles, normals, fans.polygon
 
 
 def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:

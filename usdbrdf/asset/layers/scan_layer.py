@@ -251,13 +251,10 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     said: dict[str, Any] = {"image": images, "lens": frames.lenses}
     for name, files in (("photograph", frames.photographs), ("mask", frames.masks)):
         said[name] = [storable_path(file, folder) if file else "" for file in files]
+    said["gain"] = [1.0] * len(frames) if frames.gain is None else frames.gain.tolist()
     for name, _ in facts_of(Photographs):
         if name not in said:
-            value = (
-                np.ones(len(frames))
-                if name == "gain" and frames.gain is None
-                else getattr(frames, name)
-            )
+            value = getattr(frames, name)
             said[name] = value.tolist() if isinstance(value, np.ndarray) else value
     plates = [Sdf.AssetPath(image) for image in images]
     for fact, value in known_facts(Photographs(**said)):

@@ -16,13 +16,13 @@ from pxr import Usd, UsdGeom
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.scene import frames_from_stage
+from usdbrdf.capture.camera_checks import refuse_rays_that_miss
 from usdbrdf.capture.checks import (
     Findings,
     FrameRecord,
     check_frames,
     frames_from_records,
     refuse_photographs,
-    refuse_rays_that_miss,
     rigid_records,
 )
 from usdbrdf.capture.formats.transforms import frame_records

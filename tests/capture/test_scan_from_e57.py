@@ -1,0 +1,163 @@
+"""E57 files, written with libE57 itself, node by node, as ASTM E2807 names them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
+from tests.scenes import write_ply
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.e57 import frame_records
+from usdbrdf.capture.formats.named_pictures import pictures_of
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted import e57_files
+
+libe57 = pytest.importorskip("pye57").libe57
+OPTIONS = IngestOptions(assume_srgb=True)
+_PIXEL = 4e-6  # metres
+
+
+def _structure(file, **parts):
+    node = libe57.StructureNode(file)
+    for name, part in parts.items():
+        if isinstance(part, dict):
+            part = _structure(file, **part)
+        elif isinstance(part, str):
+            part = libe57.StringNode(file, part)
+        elif isinstance(part, int):
+            part = libe57.IntegerNode(file, part, 0, 1 << 20)
+        else:
+            part = libe57.FloatNode(file, float(part), libe57.E57_DOUBLE, -1e9, 1e9)
+        node.set(name, part)
+    return node
+
+
+def _pose(matrix):
+    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+    place = dict(zip("xyz", matrix[:3, 3], strict=True))
+    return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": place}
+
+
+def _write(path, pictures):
+    file = libe57.ImageFile(str(path), "w")
+    file.extensionsAdd("", libe57.E57_V1_0_URI)
+    root = file.root()
+    root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+    images = libe57.VectorNode(file, True)
+    root.set("images2D", images)
+    for picture in pictures:
+        images.append(_structure(file, guid="{0}", **picture))
+    file.close()
+
+
+def _pinholes(room):
+    fx, fy, cx, cy = room.intrinsics[0]
+    shown = {
+        "imageWidth": WIDTH, "imageHeight": HEIGHT, "focalLength": fx * _PIXEL,
+        "pixelWidth": _PIXEL, "pixelHeight": fx / fy * _PIXEL,
+        "principalPointX": cx, "principalPointY": cy,
+    }  # fmt: skip
+    return [
+        {"name": f"station {i}", "pose": _pose(pose), "pinholeRepresentation": shown}
+        for i, pose in enumerate(room.world_from_camera)
+    ]
+
+
+@pytest.fixture
+def room():
+    return truth()
+
+
+@pytest.fixture
+def survey(tmp_path, room):
+    folder = tmp_path / "survey"
+    folder.mkdir()
+    _write(folder / "scan.e57", _pinholes(room))
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"station {i}.jpg", image)
+    write_ply(folder / "mesh.ply", room.points, room.triangles, room.face_object)
+    return folder
+
+
+def test_pinholes_of_stations(survey, room):
+    assert choose_adapter(survey).name == "e57"
+    scan = read_scan(survey, OPTIONS)
+    assert_same(scan, room)
+    assert (scan.adapter, scan.up_axis, len(scan.objects)) == ("e57", "Z", len(room.names))
+
+
+def test_a_sphere_has_x_ahead_and_turns_to_the_left(tmp_path, room):
+    """Azimuth from x towards y, elevation from the horizon up, 0 in the middle of the picture."""
+    turn = Rotation.from_euler("xyz", [10, 20, 130], degrees=True).as_matrix()
+    station = np.eye(4)
+    station[:3, :3], station[:3, 3] = turn, (2.0, 1.5, 1.2)
+    width, height = 2 * WIDTH, WIDTH
+    shown = {
+        "imageWidth": width, "imageHeight": height,
+        "pixelWidth": 2 * np.pi / width, "pixelHeight": np.pi / height,
+    }  # fmt: skip
+    path = tmp_path / "scan.e57"
+    _write(path, [{"name": "pano", "pose": _pose(station), "sphericalRepresentation": shown}])
+    write_image(tmp_path / "images" / "pano.jpg", np.ones((height, width, 3)))
+    pictures = pictures_of(tmp_path, OPTIONS)
+    (record,) = frame_records(e57_files.pictures_of_e57(path), pictures, Findings())
+    points = room.points[::5].astype(np.float64)
+    local = (points - station[:3, 3]) @ turn
+    azimuth = np.arctan2(local[:, 1], local[:, 0])
+    elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
+    expected = np.stack(
+        [width / 2 - azimuth * width / (2 * np.pi), height / 2 - elevation * height / np.pi], axis=1
+    )
+    pose = record.world_from_camera
+    seen = record.lens.project((points - pose[:3, 3]) @ pose[:3, :3], record.intrinsics)
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+def _no_mesh(survey, room):
+    (survey / "mesh.ply").unlink()
+
+
+def _inside(survey, room):
+    for path in (survey / "images").iterdir():
+        path.unlink()
+
+
+def _no_images2d(survey, room):
+    _write(survey / "scan.e57", [])
+
+
+def _no_poses(survey, room):
+    pictures = _pinholes(room)
+    for picture in pictures[:5]:
+        del picture["pose"]
+    _write(survey / "scan.e57", pictures)
+
+
+def _damaged(survey, room):
+    (survey / "scan.e57").write_bytes(b"ASTM-E57" + bytes(3000))
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_mesh, r"no mesh\. An E57 holds points.*--mesh\. \[mesh.missing\]"),
+        (_inside, r"its 10 pictures.*inside the file.*--frames\. \[capture.frames\]"),
+        (_no_images2d, r"an E57 without pictures.*\[capture.frames\]"),
+        (_no_poses, r"only 5 of 10 frames.*without pose.*\[capture.camera\]"),
+        (_damaged, r"damaged or no E57 file.*\[e57.read\]"),
+    ],
+)
+def test_refusals(survey, room, damage, sentence):
+    damage(survey, room)
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(survey, OPTIONS)
+
+
+def test_without_the_reader_it_says_what_to_install(survey, monkeypatch):
+    monkeypatch.setattr(e57_files, "find_spec", lambda name: None)
+    with pytest.raises(EnvironmentFailure, match=r"usdbrdf\[e57\].*\[environment.pye57\]"):
+        read_scan(survey, OPTIONS)

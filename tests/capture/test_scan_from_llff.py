@@ -1,0 +1,94 @@
+"""LLFF folders, written as imgs2poses writes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
+from tests.scenes import write_ply
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions(assume_srgb=True)
+
+
+@pytest.fixture
+def room():
+    return truth().centred()
+
+
+@pytest.fixture
+def capture(tmp_path, room):
+    folder = tmp_path / "head"
+    rows = []
+    for pose, lens in zip(room.opencv, room.intrinsics, strict=True):
+        hwf = np.array([[HEIGHT], [WIDTH], [lens[0]]])
+        # LLFF's own writer: from [right, down, forwards] to [down, right, backwards].
+        matrix = np.concatenate(
+            [pose[:3, 1:2], pose[:3, 0:1], -pose[:3, 2:3], pose[:3, 3:], hwf], 1
+        )
+        rows.append([*matrix.ravel(), 0.5, 9.0])
+    folder.mkdir()
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"IMG_{i:04d}.jpg", image)
+    write_ply(folder / "surface.ply", room.points, room.triangles, room.face_object)
+    return folder
+
+
+def test_poses_are_read(capture, room):
+    assert choose_adapter(capture).name == "llff"
+    scan = read_scan(capture, OPTIONS)
+    assert_same(scan, room)
+    assert (scan.adapter, len(scan.objects)) == ("llff", len(room.names))
+
+
+@pytest.mark.parametrize("name", ["IMG_0004.png", "IMG_0004.jpg.png", "IMG_0004_mask.png"])
+def test_masks_are_found_by_the_pictures_names(capture, name):
+    hidden = np.ones((HEIGHT, WIDTH, 3))
+    hidden[:, : WIDTH // 2] = 0
+    write_image(capture / "masks" / name, hidden)
+    scan = read_scan(capture, OPTIONS)
+    masks = [view.mask for view in scan.views if view is not None and view.mask]
+    assert masks == [capture / "masks" / name]
+    assert any("1 masks are used" in warning for warning in scan.warnings)
+
+
+def _no_mesh(capture):
+    (capture / "surface.ply").unlink()
+
+
+def _picture_less(capture):
+    (capture / "images" / "IMG_0003.jpg").unlink()
+
+
+def _other_array(capture):
+    np.save(capture / "poses_bounds.npy", np.zeros((10, 12)))
+
+
+def _pickle(capture):
+    np.save(capture / "poses_bounds.npy", np.array([{}], object))
+
+
+def _other_axes(capture):
+    rows = np.load(capture / "poses_bounds.npy")
+    rows[:, :15].reshape(-1, 3, 5)[:, :, 0] *= -1
+    np.save(capture / "poses_bounds.npy", rows)
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_mesh, r"no mesh\. .*COLMAP.*--mesh\. \[mesh.missing\]"),
+        (_picture_less, r"10 poses for 9 pictures in images.*\[capture.frames\]"),
+        (_other_array, r"shape \(10, 12\).*\[capture.format\]"),
+        (_pickle, r"pickled data is refused.*\[arrays.damaged\]"),
+        (_other_axes, r"mirrored.*\[capture.pose\]"),
+    ],
+)
+def test_refusals(capture, damage, sentence):
+    damage(capture)
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(capture, OPTIONS)

@@ -1,0 +1,282 @@
+"""Metashape's XML, written after Agisoft's manual (Appendix: camera models) and its exports."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.metashape import frame_records
+from usdbrdf.capture.formats.named_pictures import pictures_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions(assume_srgb=True)
+# x_world = SCALE * TURN x_chunk + SHIFT
+TURN = Rotation.from_euler("xyz", [20, -50, 110], degrees=True).as_matrix()
+SHIFT, SCALE = np.array([3.0, -2.0, 1.0]), 2.5
+
+
+def _text(values):
+    return " ".join(f"{value:.17e}" for value in np.ravel(values))
+
+
+def _child(parent, tag, text=None, **attributes):
+    made = ET.SubElement(parent, tag, attributes)
+    made.text = text
+    return made
+
+
+def _sensor(sensors, number, kind="frame", master=None, **calibration):
+    ids = {"id": str(number), "label": f"camera {number}", "type": kind}
+    sensor = _child(sensors, "sensor", **ids, **({"master_id": str(master)} if master else {}))
+    _child(sensor, "resolution", width=str(WIDTH), height=str(HEIGHT))
+    if calibration:
+        first = _child(sensor, "calibration", type=kind, **{"class": "initial"})
+        _child(first, "resolution", width=str(WIDTH), height=str(HEIGHT))
+        _child(first, "f", "99")
+        adjusted = _child(sensor, "calibration", type=kind, **{"class": "adjusted"})
+        _child(adjusted, "resolution", width=str(WIDTH), height=str(HEIGHT))
+        for name, value in calibration.items():
+            _child(adjusted, name, repr(float(value)))
+    return sensor
+
+
+def _chunk(*, component=False):
+    document = ET.Element("document", version="2.0.0")
+    chunk = _child(document, "chunk", label="Chunk 1", enabled="true")
+    sensors = _child(chunk, "sensors", next_id="4")
+    holder = chunk
+    if component:
+        holder = _child(_child(chunk, "components"), "component", id="5")
+    cameras = _child(chunk, "cameras")
+    transform = _child(holder, "transform")
+    _child(transform, "rotation", _text(TURN), locked="false")
+    _child(transform, "translation", _text(SHIFT), locked="false")
+    _child(transform, "scale", repr(SCALE), locked="true")
+    return document, sensors, cameras
+
+
+def _in_chunk(pose):
+    """A camera's transform to the chunk, from its pose (OpenCV's axes) in the world."""
+    found = np.eye(4)
+    found[:3, :3] = TURN.T @ pose[:3, :3]
+    found[:3, 3] = TURN.T @ (pose[:3, 3] - SHIFT) / SCALE
+    return found
+
+
+def _lens(room):
+    fx, fy, cx, cy = room.intrinsics[0]
+    return {"f": fy, "cx": cx - WIDTH / 2, "cy": cy - HEIGHT / 2, "b1": fx - fy}
+
+
+@pytest.fixture
+def room():
+    return truth()
+
+
+def _write(folder, document, room, suffix=".jpg"):
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"DSC{i:04d}{suffix}", image)
+    write_obj(folder / "model.obj", room)
+    ET.ElementTree(document).write(folder / "cameras.xml", encoding="UTF-8", xml_declaration=True)
+    return folder
+
+
+@pytest.fixture
+def project(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, **_lens(room))
+    group = _child(cameras, "group", id="0", label="walk", type="folder")
+    for i, pose in enumerate(room.opencv):
+        # Labels have their suffix or have not, by version.
+        label = f"DSC{i:04d}.JPG" if i % 2 else f"DSC{i:04d}"
+        parent = group if i > 5 else cameras
+        camera = _child(parent, "camera", id=str(i), sensor_id="0", label=label)
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    return _write(tmp_path / "project", document, room)
+
+
+def test_cameras_of_a_chunk(project, room):
+    assert choose_adapter(project).name == "metashape"
+    assert choose_adapter(project / "cameras.xml").name == "metashape"
+    scan = read_scan(project, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    assert (scan.adapter, scan.up_axis, scan.meters_per_unit) == ("metashape", "Z", 1.0)
+
+
+def test_of_a_rig_only_the_master_has_a_transform(tmp_path, room):
+    """Two cameras on one rig, at five places; the transform is the component's."""
+    document, sensors, cameras = _chunk(component=True)
+    _sensor(sensors, 0, **_lens(room))
+    offset = np.eye(4)
+    offset[:3, :3] = Rotation.from_euler("xyz", [5, 15, -20], degrees=True).as_matrix()
+    offset[:3, 3] = 0.02, -0.01, 0.05
+    slave = _sensor(sensors, 1, master=0, **_lens(room))
+    slave.set("master_id", "0")
+    _child(slave, "rotation", _text(offset[:3, :3]))
+    _child(slave, "location", _text(offset[:3, 3]))
+    poses = []
+    for i in range(5):
+        master = _in_chunk(room.opencv[2 * i])
+        more = {"component_id": "5", "enabled": "true"}
+        camera = _child(
+            cameras, "camera", id=str(2 * i), sensor_id="0", label=f"DSC{2 * i:04d}", **more
+        )
+        _child(camera, "transform", _text(master))
+        ids = {"id": str(2 * i + 1), "sensor_id": "1", "master_id": str(2 * i)}
+        _child(cameras, "camera", label=f"DSC{2 * i + 1:04d}", **ids, **more)
+        # A point of the slave goes to the master, to the chunk, to the world.
+        in_world = np.eye(4)
+        in_world[:3, :3], in_world[:3, 3] = SCALE * TURN, SHIFT
+        second = in_world @ master @ offset
+        second[:3, :3] /= SCALE
+        poses += [room.world_from_camera[2 * i], second @ np.diag([1.0, -1, -1, 1])]
+    scan = read_scan(_write(tmp_path / "rig", document, room), OPTIONS)
+    assert_same(scan, room, poses=np.array(poses))
+
+
+def _agisoft(points, kind, n):
+    """Pixels of points in the camera (OpenCV's axes), as Agisoft's appendix has it."""
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    if kind == "fisheye":
+        r = np.hypot(x, y)
+        x, y = x * np.arctan(r) / r, y * np.arctan(r) / r
+    r2 = x**2 + y**2
+    bend = 1 + n["k1"] * r2 + n["k2"] * r2**2 + n["k3"] * r2**3 + n["k4"] * r2**4
+    across = x * bend + n["p1"] * (r2 + 2 * x**2) + 2 * n["p2"] * x * y
+    down = y * bend + n["p2"] * (r2 + 2 * y**2) + 2 * n["p1"] * x * y
+    u = WIDTH * 0.5 + n["cx"] + across * n["f"] + across * n["b1"] + down * n["b2"]
+    return np.stack([u, HEIGHT * 0.5 + n["cy"] + down * n["f"]], axis=1)
+
+
+@pytest.mark.parametrize("kind", ["frame", "fisheye"])
+def test_lenses_image_points_where_agisofts_do(tmp_path, room, kind):
+    document, sensors, cameras = _chunk()
+    numbers = {
+        "f": 20.0, "cx": -0.7, "cy": 0.4, "b1": 0.3, "b2": -0.2,
+        "k1": -0.11, "k2": 0.05, "k3": -0.01, "k4": 0.002, "p1": 0.004, "p2": -0.006,
+    }  # fmt: skip
+    _sensor(sensors, 0, kind, **numbers)
+    camera = _child(cameras, "camera", id="0", sensor_id="0", label="DSC0000")
+    _child(camera, "transform", _text(np.eye(4)))
+    folder = _write(tmp_path / "lens", document, room)
+    (record,) = frame_records(folder / "cameras.xml", pictures_of(folder, OPTIONS), Findings())
+    points = np.random.default_rng(0).uniform((-0.6, -0.5, 1), (0.6, 0.5, 1.2), (50, 3))
+    seen = record.lens.project(points * (1, -1, -1), record.intrinsics)
+    np.testing.assert_allclose(seen, _agisoft(points, kind, numbers), atol=1e-6)
+
+
+def test_a_spherical_sensor_needs_no_calibration(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, "spherical")
+    camera = _child(cameras, "camera", id="0", sensor_id="0", label="DSC0000")
+    _child(camera, "transform", _text(np.eye(4)))
+    folder = _write(tmp_path / "sphere", document, room)
+    (record,) = frame_records(folder / "cameras.xml", pictures_of(folder, OPTIONS), Findings())
+    assert record.lens.curve == "equirectangular"
+    ahead = record.lens.project(np.array([[0.0, 0, -1], [1, 0, 0]]), record.intrinsics)
+    np.testing.assert_allclose(ahead, [[WIDTH / 2, HEIGHT / 2], [0.75 * WIDTH, HEIGHT / 2]])
+
+
+def test_undistorted_pictures_do_not_go_with_the_lens(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, **_lens(room), k1=-0.1)
+    for i, pose in enumerate(room.opencv):
+        camera = _child(cameras, "camera", id=str(i), sensor_id="0", label=f"DSC{i:04d}")
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    folder = _write(tmp_path / "project", document, room)
+    (folder / "model.jpg").write_bytes(b"a texture")  # before model.obj, and no mesh
+    assert len(read_scan(folder, OPTIONS).views) == len(room.images)
+    (folder / "images").rename(folder / "undistorted")
+    with pytest.raises(InputRefused, match=r"has been undistorted.*\[capture.camera\]"):
+        read_scan(folder, OPTIONS)
+
+
+def test_groups_tell_pictures_of_one_name_apart(tmp_path, room):
+    document, sensors, cameras = _chunk()
+    _sensor(sensors, 0, **_lens(room))
+    for side in range(2):
+        group = _child(cameras, "group", id=str(side), label=f"camera {side}", type="folder")
+        for i, pose in list(enumerate(room.opencv))[side::2]:
+            camera = _child(group, "camera", id=str(i), sensor_id="0", label=f"{i // 2}")
+            _child(camera, "transform", _text(_in_chunk(pose)))
+    folder = _write(tmp_path / "project", document, room)
+    for i in range(len(room.images)):
+        place = folder / "images" / f"camera {i % 2}" / f"{i // 2}.jpg"
+        place.parent.mkdir(exist_ok=True)
+        (folder / "images" / f"DSC{i:04d}.jpg").rename(place)
+    scan = read_scan(folder, OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[[*range(0, 10, 2), *range(1, 10, 2)]])
+
+
+def _edit(change):
+    def damage(project):
+        tree = ET.parse(project / "cameras.xml")
+        change(tree.getroot())
+        tree.write(project / "cameras.xml")
+
+    return damage
+
+
+def _no_model(project):
+    (project / "model.obj").unlink()
+
+
+def _no_pictures(project):
+    for path in project.glob("images/*"):
+        path.unlink()
+
+
+def _not_aligned(root):
+    for camera in list(root.iter("camera"))[:4]:
+        camera.remove(camera.find("transform"))
+
+
+def _not_calibrated(root):
+    (sensor,) = root.iter("sensor")
+    for calibration in sensor.findall("calibration"):
+        sensor.remove(calibration)
+
+
+def _cylindrical(root):
+    for each in [*root.iter("sensor"), *root.iter("calibration")]:
+        each.set("type", "cylindrical")
+
+
+def _higher_terms(root):
+    _child(list(root.iter("calibration"))[1], "p3", "0.1")
+
+
+def _without_cameras(root):
+    root.find("chunk").remove(root.find("chunk/cameras"))
+
+
+def _entities(project):
+    text = (project / "cameras.xml").read_text()
+    text = text.replace("?>", '?><!DOCTYPE d [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>', 1)
+    (project / "cameras.xml").write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_model, r"no mesh\. Export the model .*--mesh\. \[mesh.missing\]"),
+        (_no_pictures, r"no pictures below.*--frames\. \[capture.frames\]"),
+        (_edit(_not_aligned), r"only 6 of 10.*not been aligned.*Align and.*\[capture.alignment\]"),
+        (_edit(_not_calibrated), r"only 0 of 10.*sensor is not calibrated.*\[capture.alignment\]"),
+        (_edit(_cylindrical), r"a 'cylindrical' camera.*\[capture.camera\]"),
+        (_edit(_higher_terms), r"'camera 0' has .*higher tangential terms.*\[capture.camera\]"),
+        (_edit(_without_cameras), r"no chunk with sensors and cameras.*\[capture.format\]"),
+        (_entities, r"document type.*\[document.xml\]"),
+    ],
+)
+def test_refusals(project, damage, sentence):
+    damage(project)
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(project, OPTIONS, "metashape")

@@ -1,0 +1,159 @@
+"""RealityScan's exports, written from their definition: Euler angles by another library."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.named_pictures import pictures_of
+from usdbrdf.capture.formats.realityscan import records_of_table
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions(assume_srgb=True)
+_COLUMNS = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
+_NEWER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
+
+
+@pytest.fixture
+def room():
+    return truth().square()
+
+
+def _pictures(folder, room):
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"IMG_{i:04d}.jpg", image)
+    write_obj(folder / "model.obj", room)
+    return folder
+
+
+def _lens(room):
+    """35 mm focal length and principal point, over the longer side, which is the width here."""
+    fx, _, cx, cy = room.intrinsics[0]
+    return fx / WIDTH * 36, (cx - WIDTH / 2) / WIDTH, (cy - HEIGHT / 2) / WIDTH
+
+
+def _write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=","):
+    f, px, py = _lens(room)
+    rows = [header]
+    for i, pose in enumerate(room.world_from_camera):
+        # Turned about its own y, then x, then against the clock about the world's up.
+        yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True)
+        x, y, z = pose[:3, 3]
+        numbers = (x, y, z, -yaw, pitch, roll, f, px, py)
+        rows.append(f"IMG_{i:04d}.jpg," + ",".join(f"{n:.15e}" for n in numbers) + f",{bent}")
+    text = "\n".join(rows).replace(",", separator)
+    (folder / "registration.csv").write_text(f"# cameras 10\n{text}\n")
+    return folder
+
+
+@pytest.mark.parametrize(("header", "separator"), [(_COLUMNS, ","), (_NEWER, ";")])
+def test_cameras_of_the_table(tmp_path, room, header, separator):
+    folder = _write_table(_pictures(tmp_path / "scan", room), room, header, separator=separator)
+    assert choose_adapter(folder).name == "realityscan"
+    scan = read_scan(folder, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    assert (scan.adapter, scan.up_axis) == ("realityscan", "Z")
+
+
+@pytest.mark.parametrize("as_attributes", [False, True])
+def test_cameras_of_sidecars(tmp_path, room, as_attributes):
+    folder = _pictures(tmp_path / "scan", room)
+    f, u, v = _lens(room)
+    for i, pose in enumerate(room.opencv):
+        # x_camera = R (X - position)
+        rotation = " ".join(f"{n:.15f}" for n in pose[:3, :3].T.ravel())
+        place = " ".join(f"{n:.15f}" for n in pose[:3, 3])
+        names = ("Rotation", "Position", "DistortionCoeficients")
+        values = dict(zip(names, (rotation, place, "0 0 0 0 0 0"), strict=True))
+        attributes = elements = ""
+        if as_attributes:
+            attributes = " ".join(f'xcr:{k}="{value}"' for k, value in values.items())
+        else:
+            elements = "".join(f"<xcr:{k}>{value}</xcr:{k}>" for k, value in values.items())
+        (folder / "images" / f"IMG_{i:04d}.xmp").write_text(
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+            '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+            'xcr:Version="3" xcr:PosePrior="exact" xcr:Coordinates="absolute" '
+            f'xcr:DistortionModel="brown3" xcr:FocalLength35mm="{f}" xcr:Skew="0" '
+            f'xcr:AspectRatio="1" xcr:PrincipalPointU="{u}" xcr:PrincipalPointV="{v}" {attributes} '
+            f'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">{elements}'
+            "</rdf:Description></rdf:RDF></x:xmpmeta>"
+        )
+    assert choose_adapter(folder).name == "realityscan"
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def test_the_lens_is_a_polynomial_of_the_ray(tmp_path, room):
+    folder = _pictures(tmp_path / "scan", room)
+    _write_table(folder, room, bent="-0.1,0.06,-0.01,0.002,0.003,0.004")
+    pictures = pictures_of(folder, OPTIONS)
+    record, *_ = records_of_table(folder / "registration.csv", pictures, Findings())
+    points = np.random.default_rng(0).uniform((-0.6, -0.5, -1.2), (0.6, 0.5, -1), (50, 3))
+    x, y = points[:, 0] / -points[:, 2], -points[:, 1] / -points[:, 2]
+    r2 = x**2 + y**2
+    bend = 1 - 0.1 * r2 + 0.06 * r2**2 - 0.01 * r2**3 + 0.002 * r2**4
+    # The program's own template for OpenCV has k1, k2, t2, t1, k3, k4 where OpenCV has p1, p2.
+    p2, p1 = 0.003, 0.004
+    across = x * bend + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    down = y * bend + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    fx, fy, cx, cy = room.intrinsics[0]
+    expected = np.stack([cx + fx * across, cy + fy * down], axis=1)
+    np.testing.assert_allclose(record.lens.project(points, record.intrinsics), expected, atol=1e-6)
+
+
+def _no_model(folder):
+    (folder / "model.obj").unlink()
+
+
+def _other_export(folder):
+    """ "Image list with places", the export that is chosen by mistake."""
+    rows = (folder / "registration.csv").read_text().splitlines()[1:]
+    (folder / "registration.csv").write_text(
+        "\n".join(",".join(row.split(",")[:4]) for row in rows)
+    )
+
+
+def _two_exports(folder):
+    (folder / "second.csv").write_text((folder / "registration.csv").read_text())
+
+
+def _cut(folder):
+    text = (folder / "registration.csv").read_text().rstrip()
+    (folder / "registration.csv").write_text(text[: text.rindex(",")])
+
+
+def _other_pictures(folder):
+    for path in folder.glob("images/*"):
+        path.rename(path.with_stem(f"small {path.stem}"))
+
+
+def _degrees(folder):
+    """Longitudes and latitudes instead of metres."""
+    rows = (folder / "registration.csv").read_text().splitlines()
+    table = [row.split(",") for row in rows]
+    for row in table[2:]:
+        row[1], row[2] = f"{-34.82 + float(row[1]) / 1e5}", f"{-7.16 + float(row[2]) / 1e5}"
+    (folder / "registration.csv").write_text("\n".join(",".join(row) for row in table))
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_model, r"no mesh\. Export the model .*--mesh\. \[mesh.missing\]"),
+        (_other_export, r"without directions.*Internal/External.*\[capture.format\]"),
+        (_two_exports, r"2 CSV exports of cameras.*\[capture.format\]"),
+        (_cut, r"15 values under 16 names.*\[document.table\]"),
+        (_other_pictures, r"only 0 of 10 frames.*has this name.*\[capture.file\]"),
+        (_degrees, r"no parallax|camera rays hit the mesh"),
+    ],
+)
+def test_refusals(tmp_path, room, damage, sentence):
+    folder = _write_table(_pictures(tmp_path / "scan", room), room)
+    damage(folder)
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(folder, OPTIONS)

@@ -1,0 +1,114 @@
+"""A scene of ScanNet++: COLMAP's text model, the laser mesh, segments and their groups."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
+from tests.scenes import write_ply
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+pytest.importorskip("pycolmap")
+OPTIONS = IngestOptions(assume_srgb=True)
+
+
+@pytest.fixture
+def room():
+    return truth()
+
+
+@pytest.fixture
+def scene(tmp_path, room):
+    folder = tmp_path / "0a5c013435"
+    model = folder / "dslr" / "colmap"
+    model.mkdir(parents=True)
+    lens = " ".join(str(number) for number in room.intrinsics[0])
+    (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {lens}\n")
+    rows = []
+    for i, pose in enumerate(room.opencv):
+        turn, centre = pose[:3, :3].T, pose[:3, 3]
+        x, y, z, w = Rotation.from_matrix(turn).as_quat()
+        numbers = " ".join(f"{n:.15f}" for n in (w, x, y, z, *(-turn @ centre)))
+        rows += [f"{i + 1} {numbers} 1 DSC{i:05d}.JPG", ""]
+        write_image(folder / "dslr" / "resized_images" / f"DSC{i:05d}.JPG", room.images[i])
+    (model / "images.txt").write_text("\n".join(rows) + "\n")
+    (model / "points3D.txt").write_text("")
+    scans = folder / "scans"
+    scans.mkdir()
+    write_ply(scans / "mesh_aligned_0.05.ply", room.points, room.triangles)
+    write_ply(scans / "mesh_aligned_0.05_semantic.ply", room.points, room.triangles)
+    # Segments of vertices, which belong to one face each here; the lamp's lie in the ceiling's too.
+    owner = np.zeros(len(room.points), int)
+    owner[room.triangles] = room.face_object[:, None]
+    segment = 1000 + np.arange(len(owner)) // 3
+    segment = 100_000 * owner + segment
+    (scans / "segments.json").write_text(json.dumps({"segIndices": segment.tolist()}))
+    groups = []
+    for i, name in enumerate(room.names):
+        own = set(segment[owner == i].tolist())
+        if name == "ceiling":
+            own |= set(segment[owner == room.names.index("lamp")].tolist())
+        row = {"id": i + 1, "objectId": i + 1, "label": name, "segments": sorted(own)}
+        groups += [row] if name != "box" else []
+    (scans / "segments_anno.json").write_text(json.dumps({"segGroups": groups}))
+    return folder
+
+
+def test_photographs_and_annotated_objects(scene, room):
+    assert choose_adapter(scene).name == "scannetpp"
+    scan = read_scan(scene, OPTIONS)
+    named = {name: f"{name}_{i + 1}" for i, name in enumerate(room.names)}
+    named["box"] = "unlabelled"
+    assert_same(scan, room, names=tuple(named.values()))
+    assert (scan.adapter, scan.name, scan.up_axis) == ("scannetpp", "0a5c013435", "Z")
+    label = np.array([each.label for each in scan.objects])[scan.mesh.face_object]
+    for i, name in enumerate(room.names):
+        assert (label == named[name]).sum() == (room.face_object == i).sum()
+
+
+def test_what_masks_hide_is_not_looked_at(scene, room):
+    for i in range(len(room.images)):
+        hidden = np.ones((HEIGHT, WIDTH, 3))
+        hidden[:, : WIDTH // 2] = 0
+        write_image(scene / "dslr" / "resized_anon_masks" / f"DSC{i:05d}.png", hidden)
+    scan = read_scan(scene, OPTIONS)
+    assert len(scan.views) == len(room.images)
+    assert {view.mask.parent.name for view in scan.views} == {"resized_anon_masks"}
+
+
+def _no_mesh(scene):
+    (scene / "scans" / "mesh_aligned_0.05.ply").unlink()
+
+
+def _no_images(scene):
+    for path in (scene / "dslr" / "resized_images").iterdir():
+        path.unlink()
+
+
+def _other_segments(scene):
+    (scene / "scans" / "segments.json").write_text('{"segIndices": [1, 2, 3]}')
+
+
+def _other_groups(scene):
+    (scene / "scans" / "segments_anno.json").write_text('{"segGroups": [{"label": "x"}]}')
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_mesh, r"Download scans/mesh_aligned_0.05.ply.*--mesh\. \[mesh.missing\]"),
+        (_no_images, r"no pictures below.*\[capture.frames\]"),
+        (_other_segments, r"segIndices for each of the \d+ vertices.*\[objects.count\]"),
+        (_other_groups, r"no segGroups with objectId.*\[objects.format\]"),
+    ],
+)
+def test_refusals(scene, damage, sentence):
+    damage(scene)
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(scene, OPTIONS)

@@ -1,0 +1,308 @@
+"""USD stages as captures, written by USD itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, Vt
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from tests.scenes import make_capture
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_weaker
+from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.ingest import ingest
+
+
+@pytest.fixture
+def room():
+    return truth()
+
+
+def _stage(path, room, *, parts=True, unit=1.0):
+    """The room's meshes below /room; ``parts`` as prims, or else as subsets of one mesh."""
+    path.parent.mkdir(exist_ok=True)
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, unit)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/room").GetPrim())
+    points = Vt.Vec3fArray.FromNumpy((room.points / unit).astype(np.float32))
+    groups = enumerate(room.names) if parts else [(None, "all")]
+    for i, name in groups:
+        own = room.triangles if i is None else room.triangles[room.face_object == i]
+        mesh = UsdGeom.Mesh.Define(stage, f"/room/{name}")
+        mesh.CreatePointsAttr(points)
+        mesh.CreateFaceVertexCountsAttr([3] * len(own))
+        mesh.CreateFaceVertexIndicesAttr(own.ravel().tolist())
+        mesh.CreateSubdivisionSchemeAttr("none")
+    return stage
+
+
+def _set_lens(camera, lens, *, time=None, aperture=36.0):
+    """Written from the definition of a UsdGeomCamera, through the matrices that USD makes of it:
+    the frustum's window has the picture's four sides."""
+    fx, fy, cx, cy = lens
+    sides = np.array([-cx / fx, (WIDTH - cx) / fx, (cy - HEIGHT) / fy, cy / fy])
+    frustum = Gf.Frustum()
+    frustum.window = Gf.Range2d(Gf.Vec2d(sides[0], sides[2]), Gf.Vec2d(sides[1], sides[3]))
+    frustum.nearFar = Gf.Range1d(1.0, 10.0)
+    made = Gf.Camera()
+    made.SetFromViewAndProjectionMatrix(
+        Gf.Matrix4d(1), frustum.ComputeProjectionMatrix(), aperture * Gf.Camera.FOCAL_LENGTH_UNIT
+    )
+    code = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    camera.CreateFocalLengthAttr().Set(made.focalLength, code)
+    camera.CreateHorizontalApertureAttr().Set(made.horizontalAperture, code)
+    camera.CreateVerticalApertureAttr().Set(made.verticalAperture, code)
+    camera.CreateHorizontalApertureOffsetAttr().Set(made.horizontalApertureOffset, code)
+    camera.CreateVerticalApertureOffsetAttr().Set(made.verticalApertureOffset, code)
+
+
+def _many_cameras(stage, room, *, unit=1.0, parent="/shots"):
+    """Static cameras below a transform that scales, as scenes in centimetres have them."""
+    group = UsdGeom.Xform.Define(stage, parent)
+    group.AddScaleOp().Set(Gf.Vec3f(1 / unit))
+    for i, pose in enumerate(room.world_from_camera):
+        camera = UsdGeom.Camera.Define(stage, f"{parent}/IMG_{i:03d}")
+        camera.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        _set_lens(camera, room.intrinsics[i])
+
+
+def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room, unit=0.01)
+    _many_cameras(stage, room, unit=0.01)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG-{i:03d}.exr", image)
+        write_image(tmp_path / "shot" / "images" / "thumbnails" / f"{i:03d}.png", image)
+    assert choose_adapter(tmp_path / "shot").name == "usd"
+    scan = read_scan(tmp_path / "shot" / "room.usda", IngestOptions())
+    poses = room.world_from_camera.copy()
+    poses[:, :3, 3] *= 100
+    assert_same(scan, room, points=room.points * 100, poses=poses, names=room.names)
+    assert (scan.adapter, scan.up_axis, round(scan.meters_per_unit, 9)) == ("usd", "Z", 0.01)
+    assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
+
+
+def _moving_camera(stage, room, names=None):
+    camera = UsdGeom.Camera.Define(stage, "/room/camera")
+    op = camera.AddTransformOp()
+    prim = camera.GetPrim()
+    if names:
+        prim.AddAppliedSchema("BackPlateAPI:photograph")
+    for i, pose in enumerate(room.world_from_camera):
+        op.Set(Gf.Matrix4d(pose.T.tolist()), 101 + i)
+        _set_lens(camera, room.intrinsics[i], time=101 + i)
+        if names:
+            plate = prim.CreateAttribute("backPlate:photograph:image", Sdf.ValueTypeNames.Asset)
+            plate.Set(Sdf.AssetPath(names[i]), 101 + i)
+
+
+def test_a_moving_camera_has_its_back_plates(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usdc", room)
+    _moving_camera(stage, room, [f"./plates/{9 - i}.exr" for i in range(10)])
+    for i in range(5):
+        UsdGeom.Camera.Define(stage, f"/cameras/view_{i}")  # of the artist
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", image)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, names=room.names)
+
+
+@pytest.mark.parametrize("plate", ["plates/p.####.exr", "plates/p.%04d.exr"])
+def test_a_sequence_is_one_name_for_all_plates(tmp_path, room, plate):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    _moving_camera(stage, room)
+    prim = stage.GetPrimAtPath("/room/camera")
+    image = prim.CreateAttribute("houdini:backgroundimage", Sdf.ValueTypeNames.Asset)
+    image.Set(Sdf.AssetPath(plate))
+    stage.Save()
+    for i, pixels in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"p.{101 + i:04d}.exr", pixels)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    _moving_camera(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images[:-1]):
+        write_image(tmp_path / "plates" / f"plate.{101 + i:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions(frames=tmp_path / "plates"))
+    assert_same(scan, room, poses=room.world_from_camera[:-1])
+    assert scan.counts["poses_without_photograph"] == 1
+
+
+def test_cameras_of_a_rig_have_pictures_by_their_names_and_numbers(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    rig = UsdGeom.Xform.Define(stage, "/rig")
+    moves = rig.AddTransformOp()
+    for i in range(5):
+        moves.Set(Gf.Matrix4d(room.world_from_camera[i].T.tolist()), 1 + i)
+    offset = np.eye(4)
+    offset[:3, 3] = 0.1, 0, 0.05
+    poses = []
+    for name, pose in (("left", np.eye(4)), ("right", offset)):
+        camera = UsdGeom.Camera.Define(stage, f"/rig/{name}")
+        camera.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        _set_lens(camera, room.intrinsics[0])
+        poses += [room.world_from_camera[i] @ pose for i in range(5)]
+    stage.Save()
+    for i in range(5):
+        write_image(tmp_path / "shot" / "images" / "left" / f"{i + 1:04d}.exr", room.images[i])
+        name = f"right_{i + 1:04d}.exr"
+        write_image(tmp_path / "shot" / "images" / name, room.images[5 + i])
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, poses=np.array(poses))
+
+
+def test_subsets_with_labels_are_objects(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room, parts=False)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/room/all"))
+    for i, name in enumerate(room.names[:-1]):
+        faces = np.flatnonzero(room.face_object == i).tolist()
+        subset = UsdGeom.Subset.CreateGeomSubset(mesh, f"part_{name}", "face", faces, "parts")
+        UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([f"a {name}"])
+    # Another division of the same faces, which says nothing of objects.
+    UsdGeom.Subset.CreateGeomSubset(mesh, "red", "face", [0, 1], "materialBind")
+    _many_cameras(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    names = (*(f"part_{name}" for name in room.names[:-1]), "all")
+    assert_same(scan, room, names=names)
+    assert {o.label: o.class_name for o in scan.objects} == {
+        **{f"part_{name}": f"a {name}" for name in room.names[:-1]},
+        "all": "",
+    }
+    assert scan.usd_geometry is None
+    assert any("face subsets" in warning for warning in scan.warnings)
+    for i, each in enumerate(scan.objects):
+        faces = (room.face_object == names.index(each.label)).sum()
+        assert (scan.mesh.face_object == i).sum() == faces
+
+
+def test_labels_of_a_group_are_the_classes_of_its_meshes(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    UsdSemantics.LabelsAPI.Apply(stage.GetPrimAtPath("/room"), "category").CreateLabelsAttr(["hut"])
+    lamp = stage.GetPrimAtPath("/room/lamp")
+    lamp.CreateAttribute("semantic:Semantics:params:semanticData", Sdf.ValueTypeNames.String).Set(
+        "light"
+    )
+    _many_cameras(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert {o.class_name for o in scan.objects if o.label != "lamp"} == {"hut"}
+    assert [o.class_name for o in scan.objects if o.label == "lamp"] == ["light"]
+
+
+def test_a_mesh_from_elsewhere_has_the_unit_of_the_stage(tmp_path, room):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "room.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.1)
+    _many_cameras(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "pictures" / f"IMG_{i:03d}.png", image)
+    write_obj(tmp_path / "room.obj", room)
+    options = IngestOptions(
+        mesh=tmp_path / "room.obj", frames=tmp_path / "pictures", assume_srgb=True
+    )
+    scan = read_scan(tmp_path / "room.usda", options)
+    assert_same(scan, room, names=room.names)
+    assert (scan.up_axis, scan.meters_per_unit, scan.frames.radiometric) == ("Y", 0.1, False)
+
+
+def _no_cameras(stage, room, folder):
+    stage.RemovePrim("/shots")
+
+
+def _orthographic(stage, room, folder):
+    for i in range(len(room.world_from_camera)):
+        camera = UsdGeom.Camera(stage.GetPrimAtPath(f"/shots/IMG_{i:03d}"))
+        camera.CreateProjectionAttr("orthographic")
+
+
+def _no_pictures(stage, room, folder):
+    for path in folder.glob("images/*"):
+        path.unlink()
+
+
+def _other_names(stage, room, folder):
+    for path in folder.glob("images/*"):
+        path.rename(path.with_stem(f"view {path.stem}"))
+
+
+def _plate_elsewhere(stage, room, folder):
+    prim = stage.GetPrimAtPath("/shots/IMG_000")
+    plate = prim.CreateAttribute("backPlate:photograph:image", Sdf.ValueTypeNames.Asset)
+    plate.Set(Sdf.AssetPath("../../elsewhere.exr"))
+
+
+def _no_mesh(stage, room, folder):
+    for name in room.names:
+        stage.RemovePrim(f"/room/{name}")
+
+
+def _opencv_axes(stage, room, folder):
+    for i, pose in enumerate(room.opencv):
+        camera = UsdGeom.Xformable(stage.GetPrimAtPath(f"/shots/IMG_{i:03d}"))
+        away = pose @ np.diag([-1.0, 1, -1, 1])  # and away from the room
+        away[:3, 3] += 100 * away[:3, 2]
+        camera.GetOrderedXformOps()[0].Set(Gf.Matrix4d(away.T.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (_no_cameras, r"no camera\..*\[stage.camera\]"),
+        (_orthographic, r"10 cameras, none of them perspective.*\[stage.camera\]"),
+        (_no_pictures, r"no pictures below .*--frames\. \[capture.frames\]"),
+        (_other_names, r"none of 10 pictures.*belongs to any of 10 cameras.*\[capture.frames\]"),
+        (_plate_elsewhere, r"leads outside the capture.*\[paths.outside\]"),
+        (_no_mesh, r"no visible mesh.*--mesh\. \[mesh.empty\]"),
+        (_opencv_axes, r"camera rays hit the mesh.*\[capture.convention\]"),
+    ],
+)
+def test_refusals(tmp_path, room, damage, sentence):
+    folder = tmp_path / "shot"
+    stage = _stage(folder / "room.usda", room)
+    _many_cameras(stage, room)
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"IMG_{i:03d}.exr", image)
+    damage(stage, room, folder)
+    stage.Save()
+    with pytest.raises(InputRefused, match=sentence):
+        read_scan(folder, IngestOptions())
+
+
+def test_pictures_in_another_place_are_inputs_and_the_stage_is_referenced(tmp_path, room):
+    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    _moving_camera(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "plates" / f"plate.{101 + i}.exr", image)
+    asset = Asset(tmp_path / "asset", "room")
+    options = IngestOptions(frames=tmp_path / "plates")
+    assert ingest(tmp_path / "shot" / "room.usda", asset, options).summary["adapter"] == "usd"
+    composed = open_weaker(asset, "texturing")
+    np.testing.assert_allclose(
+        frames_from_stage(composed).world_from_camera, room.world_from_camera, atol=1e-6
+    )
+    assert len(scene_from_stage(composed).objects) == len(room.names)
+    assert not ingest(tmp_path / "shot" / "room.usda", asset, options).reran
+    write_image(tmp_path / "plates" / "plate.103.exr", room.images[2] * 0.5)
+    assert ingest(tmp_path / "shot" / "room.usda", asset, options).reran
+
+
+def test_frames_that_a_format_does_not_ask_for_are_refused(tmp_path):
+    made = make_capture(tmp_path / "room")
+    with pytest.raises(UsageError, match=r"'transforms' says itself.*\[usage.option\]"):
+        read_scan(made.folder, IngestOptions(frames=tmp_path / "frames"))
+    with pytest.raises(UsageError, match=r"no picture of this capture lies there"):
+        read_scan(made.folder, IngestOptions(frames=tmp_path / "elsewhere"))

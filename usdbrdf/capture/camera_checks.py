@@ -1,0 +1,102 @@
+"""Do the cameras stand where a mesh can be seen from: apart, outside of things, before surfaces?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.conventions import CONVENTIONS
+from usdbrdf.errors import InputRefused
+from usdbrdf.geometry.sides import Sides
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
+from usdbrdf.transport.rays import RayScene
+
+_MIN_BASELINE = 1e-3  # of the scene's diagonal
+_MIN_HIT_SHARE = 0.2
+_MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
+# Frames that are probed with rays, and rays along each side of them.
+_PROBED_FRAMES, _PROBED_SIDE = 64, 8
+
+
+def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> None:
+    """InputRefused where all cameras stand at one point: nothing but a panorama."""
+    centres = frames.world_from_camera[:, :3, 3]
+    spread = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    diagonal = float(np.linalg.norm(np.ptp(mesh.points.astype(np.float64), axis=0)))
+    if spread < _MIN_BASELINE * diagonal:
+        raise InputRefused(
+            f"{source}: all {len(frames)} cameras stand within {spread:.3g} of one point in a "
+            f"scene {diagonal:.3g} across, there is no parallax. Capture from several places, or "
+            "check the translations of the poses. [capture.parallax]"
+        )
+
+
+def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float:
+    """Share of camera rays that hit the mesh; InputRefused below 20 %.
+
+    The usual mix-ups of conventions are then tried, and those that would hit are named.
+    """
+    scene = RayScene(mesh.points, mesh.triangles)
+    share = _hit_share(scene, frames, lambda pose: pose)
+    if share >= _MIN_HIT_SHARE:
+        return share
+    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
+    better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= _MIN_HIT_SHARE]
+    if better:
+        cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"
+    else:
+        cure = (
+            f"No usual convention does better (best {max(tried.values()):.0%}; tried: "
+            f"{'; '.join(tried)}). Check that mesh and poses share frame and unit"
+        )
+    raise InputRefused(
+        f"{source}: only {share:.0%} of the camera rays hit the mesh (limit "
+        f"{_MIN_HIT_SHARE:.0%}). {cure}. [capture.convention]"
+    )
+
+
+def drop_cameras_inside(
+    frames: Frames, mesh: ScanMesh, sides: Sides, names: Sequence[str], findings: Findings
+) -> list[int]:
+    """Indices of the frames that show surfaces from the side from which others show them; those
+    that look at their backs from inside are noted in ``findings`` by their ``names``."""
+    scene = RayScene(mesh.points, mesh.triangles)
+    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
+    # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
+    alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]
+    usable: list[int] = []
+    for i in range(len(frames)):
+        origins, towards = frames.camera(i).rays(_probes() * frames.resolution[i])
+        face = scene.closest(origins, towards).face
+        back = (towards * normals[face]).sum(axis=1) > 0
+        behind = float(((face >= 0) & alone[face, back.astype(np.int64)]).mean())
+        if behind > _MAX_BEHIND:
+            said = f"{behind:.0%} of its rays hit surfaces from behind, as others see them"
+            findings.drop(names[i], f"{said} (limit {_MAX_BEHIND:.0%})", "capture.inside")
+        else:
+            usable.append(i)
+    return usable
+
+
+def _probes() -> Double:
+    """(P, 2) places in an image, in parts of its sides, at which it is probed with rays."""
+    steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
+def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
+    count = min(len(frames), _PROBED_FRAMES)
+    grid = _probes()
+    hits = 0
+    for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
+        camera = frames.camera(i)
+        camera = replace(camera, world_from_camera=read(camera.world_from_camera))
+        rays = camera.rays(grid * frames.resolution[i])
+        hits += int((scene.closest(*rays).face >= 0).sum())
+    return hits / (count * len(grid))

@@ -1,0 +1,27 @@
+"""Alembic: recognised and refused, for no maintained package reads it; USD says the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NoReturn
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+NAME = "alembic"
+DESCRIPTION = DESCRIPTIONS[NAME]
+
+
+def matches(path: Path) -> bool:
+    """An Alembic file, or a folder with one."""
+    if path.is_dir():
+        return any(path.glob("*.abc"))
+    return path.suffix.lower() == ".abc" and path.is_file()
+
+
+def read(path: Path, options: IngestOptions) -> NoReturn:
+    raise InputRefused(
+        f"{path}: Alembic cameras are not read. Import the file into Blender (File > Import > "
+        "Alembic) or Houdini, export camera and meshes as USD, and convert that. [capture.format]"
+    )

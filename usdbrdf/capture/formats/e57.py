@@ -1,0 +1,116 @@
+"""E57: pictures taken at the stations of a laser scanner, with their poses, and a mesh beside.
+
+The file holds the pictures inside; they are looked for as files beside it, under the names that
+they have there. Pinholes look down -z with y up; whole spheres have x straight ahead and z up.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.formats.named_pictures import (
+    Pictures,
+    drop_without_picture,
+    mesh_beside,
+    pictures_of,
+    scan_of,
+)
+from usdbrdf.errors import InputRefused
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.e57_files import StationPicture, pictures_of_e57
+
+NAME = "e57"
+DESCRIPTION = DESCRIPTIONS[NAME]
+# Our camera (x right, y up, looking down -z) in the frame of a sphere (x ahead, y left, z up).
+_FLIP = np.array([[0.0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+def matches(path: Path) -> bool:
+    """An E57 file, or a folder with one of them."""
+    return _file_of(path) is not None
+
+
+def _file_of(path: Path) -> Path | None:
+    files = sorted(path.glob("*.e57")) if path.is_dir() else [path]
+    files = [file for file in files if file.suffix.lower() == ".e57" and file.is_file()]
+    return files[0] if len(files) == 1 else None
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    source = _file_of(path.resolve())
+    if source is None:
+        raise InputRefused(f"{path}: no E57 file, or several. Name the file. [capture.format]")
+    folder, findings = source.parent, Findings()
+    taken = pictures_of_e57(source)
+    if not taken:
+        raise InputRefused(
+            f"{source}: an E57 without pictures. Export the stations with their photographs. "
+            "[capture.frames]"
+        )
+    pictures = pictures_of(folder, options)
+    if not pictures.paths:
+        raise InputRefused(
+            f"{source}: its {len(taken)} pictures, first {taken[0].name!r}, are inside the file. "
+            "Extract them into a folder images beside it, each under its name (CloudCompare and "
+            "e57unpack do), or name the folder with --frames. [capture.frames]"
+        )
+    records = frame_records(taken, pictures, findings)
+    mesh = mesh_beside(
+        folder,
+        options,
+        "mesh.*",
+        how="An E57 holds points: make a mesh of them, for instance in CloudCompare, in the same "
+        "frame, and put it beside",
+    )
+    return scan_of(records, mesh, options, findings, adapter=NAME, source=source, folder=folder)
+
+
+def frame_records(
+    taken: tuple[StationPicture, ...], pictures: Pictures, findings: Findings
+) -> list[FrameRecord]:
+    """Those of a file's pictures that are there, and whose projection is known."""
+    records = []
+    for each in taken:
+        found = _camera(each)
+        if found is None:
+            why = f"a {each.kind} picture, or one without pose and size, cannot be projected"
+            findings.drop(each.name, why, "capture.camera")
+            continue
+        image = pictures.named(each.name) if each.name else None
+        if image is None:
+            drop_without_picture(each.name, findings)
+            continue
+        lens, intrinsics, pose = found
+        records.append(
+            FrameRecord(
+                name=each.name,
+                image_path=image,
+                world_from_camera=pose,
+                intrinsics=intrinsics,
+                resolution=each.resolution,
+                lens=lens,
+            )
+        )
+    return records
+
+
+def _camera(each: StationPicture) -> tuple[Lens, tuple[float, float, float, float], Double] | None:
+    """Lens, fx, fy, cx, cy and pose; None where the file does not say them."""
+    width, height = each.resolution
+    pose = each.world_from_camera
+    sizes = each.numbers[:3] if each.kind == "pinhole" else each.numbers
+    if not sizes or min(*sizes, width, height) <= 0 or not np.isfinite(pose).all():
+        return None
+    if each.kind == "pinhole":
+        focal, across, down, cx, cy = each.numbers
+        return PINHOLE, (focal / across, focal / down, cx, cy), pose
+    across, down = each.numbers
+    lens = Lens(curve="equirectangular")
+    return lens, (1 / across, 1 / down, width / 2, height / 2), pose @ _FLIP

@@ -1,0 +1,91 @@
+"""LLFF: pictures in images/ with poses_bounds.npy, which every NeRF of the first years reads.
+
+A row per picture, in the order of the pictures' names: a 3 x 5 matrix row by row, whose columns are
+the camera's axes down, right and backwards, its place, and (height, width, focal length); then the
+nearest and the farthest depth. The principal point is the picture's middle.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.formats.named_pictures import (
+    mask_beside,
+    mesh_beside,
+    pictures_of,
+    refuse_without_pictures,
+    rigid_pose,
+    scan_of,
+    up_axis_of,
+)
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import read_array
+from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
+
+NAME = "llff"
+DESCRIPTION = DESCRIPTIONS[NAME]
+_COLUMNS = (17, 15)  # with the two depths, and without
+
+
+def matches(path: Path) -> bool:
+    """A folder with poses_bounds.npy."""
+    return (path / "poses_bounds.npy").is_file()
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    folder, findings = path.resolve(), Findings()
+    source = folder / "poses_bounds.npy"
+    if not source.is_file():
+        raise InputRefused(f"{folder}: no poses_bounds.npy. Name its folder. [capture.format]")
+    rows = read_array(source)
+    if rows.ndim != 2 or rows.shape[1] not in _COLUMNS or rows.dtype.kind not in "fiu":
+        raise InputRefused(
+            f"{source}: an array of shape {rows.shape}, not one row of 17 numbers per picture. "
+            "Write it again with imgs2poses. [capture.format]"
+        )
+    pictures = pictures_of(folder, options)
+    refuse_without_pictures(pictures, source)
+    if len(pictures.paths) != len(rows):
+        raise InputRefused(
+            f"{source}: {len(rows)} poses for {len(pictures.paths)} pictures in "
+            f"{pictures.folder.name}. They belong together by their order: bring the pictures that "
+            "the poses were made of, all of them and no others. [capture.frames]"
+        )
+    records = []
+    for row, image in zip(rows.astype(np.float64), pictures.paths, strict=True):
+        down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
+        sound = np.isfinite(row[:15]).all() and min(width, height) >= 1
+        if not sound or (width, height) != (round(width), round(height)):
+            findings.drop(image.name, "its row holds no finite pose and size", "capture.pose")
+            continue
+        records.append(
+            FrameRecord(
+                name=image.name,
+                image_path=image,
+                world_from_camera=rigid_pose(np.stack([right, -down, back], axis=1), centre),
+                intrinsics=(focal, focal, width / 2, height / 2),
+                resolution=(int(width), int(height)),
+                mask_path=mask_beside(folder, image),
+            )
+        )
+    mesh = mesh_beside(
+        folder,
+        options,
+        how="LLFF has poses and no surface: make a mesh in the same frame, for instance with "
+        "COLMAP's dense reconstruction, and put it into this folder",
+    )
+    return scan_of(
+        records,
+        mesh,
+        options,
+        findings,
+        adapter=NAME,
+        source=source,
+        folder=folder,
+        up_axis=up_axis_of(records),
+    )

@@ -1,0 +1,261 @@
+"""Metashape's cameras as XML (File > Export > Export Cameras), pictures and the exported model.
+
+A camera's transform is from the camera (OpenCV's axes) to the chunk; the chunk's transform leads on
+to the frame of exported models. Of a rig, only the master has a transform: the others stand as
+their sensors say, seen from the master's. Principal points are offsets from the picture's middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.formats.named_pictures import (
+    Pictures,
+    drop_without_picture,
+    mask_beside,
+    mesh_beside,
+    opengl_from_opencv,
+    pictures_of,
+    refuse_without_pictures,
+    rigid_pose,
+    scan_of,
+    up_axis_of,
+    warn_of_unused,
+)
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, read_xml
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
+from usdbrdf.options import IngestOptions
+
+NAME = "metashape"
+DESCRIPTION = DESCRIPTIONS[NAME]
+_CURVES: dict[str, Curve] = {
+    "frame": "perspective",
+    "fisheye": "fisheye",
+    "equidistant_fisheye": "fisheye",
+}
+
+
+def matches(path: Path) -> bool:
+    """An XML document with sensors and cameras, or a folder with one of them."""
+    return len(_documents(path)) == 1
+
+
+def _documents(path: Path) -> list[Path]:
+    files = sorted(path.glob("*.xml")) if path.is_dir() else [path]
+    heads = ((file, beginning_of(file)) for file in files if file.suffix.lower() == ".xml")
+    return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    documents = _documents(path.resolve())
+    if len(documents) != 1:
+        said = f"{len(documents)} exports of cameras" if documents else "no export of cameras"
+        raise InputRefused(
+            f"{path}: {said} (XML with sensors and cameras). Name the file, which File > Export > "
+            "Export Cameras writes. [capture.format]"
+        )
+    (source,) = documents
+    folder, findings = source.parent, Findings()
+    pictures = pictures_of(folder, options)
+    refuse_without_pictures(pictures, source)
+    records = frame_records(source, pictures, findings)
+    warn_of_unused(pictures, (r.image_path for r in records), findings, source)
+    mesh = mesh_beside(
+        folder,
+        options,
+        "mesh.*",
+        "model.*",
+        how="Export the model (File > Export > Export Model) in the coordinate system of the "
+        "cameras into this folder",
+    )
+    return scan_of(
+        records,
+        mesh,
+        options,
+        findings,
+        adapter=NAME,
+        source=source,
+        folder=folder,
+        up_axis=up_axis_of(records),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sensor:
+    """A calibrated camera; ``master_from_sensor`` (4, 4) in the chunk's unit, for rigs."""
+
+    intrinsics: tuple[float, float, float, float]
+    resolution: tuple[int, int]
+    lens: Lens
+    master_from_sensor: Double
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Place:
+    """x_world = scale * rotation x + translation, of a chunk or of a component of it."""
+
+    rotation: Double
+    translation: Double
+    scale: float
+
+    def pose(self, chunk_from_camera: Double) -> Double:
+        """(4, 4) world from camera, rigid."""
+        centre = self.scale * self.rotation @ chunk_from_camera[:3, 3] + self.translation
+        return rigid_pose(self.rotation @ chunk_from_camera[:3, :3], centre)
+
+
+def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[FrameRecord]:
+    """The cameras of a document that have a pose and a picture, by their labels."""
+    chunk = read_xml(source).find("chunk")
+    if chunk is None or chunk.find("sensors") is None or chunk.find("cameras") is None:
+        raise InputRefused(
+            f"{source}: no chunk with sensors and cameras. Export the cameras again. "
+            "[capture.format]"
+        )
+    sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
+    place_of = _places(chunk, source, findings)
+    cameras = list(chunk.iterfind("cameras//camera"))
+    # Pictures of one name in several folders are told apart by the groups that they are in.
+    group_of = {c: g.get("label", "") for g in chunk.iterfind("cameras/group") for c in g}
+    chunk_from_camera = {c.get("id", ""): numbers_of(c.find("transform"), 16) for c in cameras}
+    records = []
+    for camera in cameras:
+        label = camera.get("label", "")
+        if camera.get("enabled", "true").lower() in ("false", "0"):
+            findings.count("cameras_disabled", 1)
+            continue
+        sensor = sensors.get(camera.get("sensor_id", ""))
+        master = chunk_from_camera.get(camera.get("master_id", camera.get("id", "")))
+        if sensor is None or master is None:
+            why = "its sensor is not calibrated" if sensor is None else "it has not been aligned"
+            findings.drop(label, why, "capture.alignment")
+            continue
+        image = pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
+        if image is None:
+            drop_without_picture(label, findings)
+            continue
+        pose = place_of(camera).pose(master.reshape(4, 4) @ sensor.master_from_sensor)
+        records.append(
+            FrameRecord(
+                name=label,
+                image_path=image,
+                world_from_camera=opengl_from_opencv(pose),
+                intrinsics=sensor.intrinsics,
+                resolution=sensor.resolution,
+                lens=sensor.lens,
+                mask_path=mask_beside(source.parent, image),
+            )
+        )
+    return sorted(records, key=lambda record: record.image_path)
+
+
+def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place]:
+    """Where what is in a camera's chunk stands: as the chunk says, else the camera's component."""
+    own = _place(chunk.find("transform"))
+    parts = chunk.iterfind("components/component")
+    components = {part.get("id", ""): _place(part.find("transform")) for part in parts}
+    if own is None and not any(components.values()):
+        findings.warn(
+            f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "
+            "--meters-per-unit. [capture.unit]"
+        )
+    return lambda camera: own or components.get(camera.get("component_id", "")) or _UNPLACED
+
+
+_UNPLACED = _Place(rotation=np.eye(3), translation=np.zeros(3), scale=1.0)
+
+
+def _place(transform: Element | None) -> _Place | None:
+    if transform is None:
+        return None
+    rotation = numbers_of(transform.find("rotation"), 9)
+    translation = numbers_of(transform.find("translation"), 3)
+    scale = numbers_of(transform.find("scale"), 1)
+    return _Place(
+        rotation=np.eye(3) if rotation is None else rotation.reshape(3, 3),
+        translation=np.zeros(3) if translation is None else translation,
+        scale=1.0 if scale is None else float(scale[0]),
+    )
+
+
+def _sensor(sensor: Element, source: Path) -> _Sensor | None:
+    """A sensor that is calibrated (or needs no calibration, because it sees a whole sphere)."""
+    calibrations = {c.get("class", ""): c for c in sensor.iterfind("calibration")}
+    adjusted = calibrations.get("adjusted", next(iter(calibrations.values()), None))
+    resolution = _resolution(adjusted) or _resolution(sensor)
+    if resolution is None:
+        return None
+    if sensor.get("type") == "spherical":
+        return _Sensor(
+            intrinsics=whole_sphere(*resolution),
+            resolution=resolution,
+            lens=Lens(curve="equirectangular"),
+            master_from_sensor=_offset(sensor),
+        )
+    if adjusted is None:
+        return None
+    named = f"{source}: the sensor {sensor.get('label', '')!r}"
+    kind = adjusted.get("type", sensor.get("type", "frame"))
+    if kind not in _CURVES:
+        raise InputRefused(
+            f"{named} is a {kind!r} camera (known: {', '.join(_CURVES)}, spherical). Undistort the "
+            "pictures in Metashape and export the cameras again. [capture.camera]"
+        )
+    said = {name: _number(adjusted, name) for name in _NUMBERS}
+    focal, across = said["f"], said["f"] + said["b1"]
+    if not min(focal, across) > 0 or said["p3"] or said["p4"]:
+        raise InputRefused(
+            f"{named} has no focal length, or higher tangential terms (P3, P4), which are not "
+            "read. Correct it, or optimise the cameras without these. [capture.camera]"
+        )
+    lens = Lens(
+        curve=_CURVES[kind],
+        radial=tuple(said[f"k{i}"] for i in range(1, 5)),
+        tangential=(said["p2"], said["p1"]),  # the other way round than OpenCV
+        skew=said["b2"] / across,
+    )
+    middle = resolution[0] / 2, resolution[1] / 2
+    return _Sensor(
+        intrinsics=(across, focal, middle[0] + said["cx"], middle[1] + said["cy"]),
+        resolution=resolution,
+        lens=lens if lens.bends else PINHOLE,
+        master_from_sensor=_offset(sensor),
+    )
+
+
+def _resolution(holder: Element | None) -> tuple[int, int] | None:
+    size = holder.find("resolution") if holder is not None else None
+    width, height = (number_in(size.attrib if size is not None else {}, s) for s in _SIDES)
+    return (int(width), int(height)) if width and height and min(width, height) >= 1 else None
+
+
+def _offset(sensor: Element) -> Double:
+    """(4, 4) from the sensor to its rig's master. A master stands where its cameras do, even where
+    an offset of its own is written down."""
+    rotation = numbers_of(sensor.find("rotation"), 9)
+    location = numbers_of(sensor.find("location"), 3)
+    if sensor.get("master_id") is None:
+        return np.eye(4)
+    return rigid_pose(
+        np.eye(3) if rotation is None else rotation.reshape(3, 3),
+        np.zeros(3) if location is None else location,
+    )
+
+
+_SIDES = ("width", "height")
+_NUMBERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+
+def _number(adjusted: Element, name: str) -> float:
+    """A number of a calibration; what is not there is 0."""
+    value = numbers_of(adjusted.find(name), 1)
+    return 0.0 if value is None else float(value[0])

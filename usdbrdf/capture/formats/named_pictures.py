@@ -1,0 +1,268 @@
+"""What many formats have in common: cameras that name a picture, pictures in folders, and a mesh
+beside them, in one frame and unit."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+import numpy as np
+
+from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
+from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.parts import (
+    LabelTable,
+    as_photographs,
+    geometry_from_file,
+    radiance_encoding,
+    scan_from_parts,
+)
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.paths import contained
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.mesh import ScanGeometry
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
+from usdbrdf.untrusted.mesh_files import FileMesh
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES
+
+# In the order in which they are taken where one name has several: radiance first.
+SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
+# Where programs put the pictures, beside what they say of them.
+_FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+_MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+# OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def opengl_from_opencv(world_from_camera: Double) -> Double:
+    """(..., 4, 4) poses of cameras that look down +z with y down, as our cameras stand."""
+    return np.asarray(world_from_camera @ _FLIP, np.float64)
+
+
+def rigid_pose(rotation: Double, centre: Double) -> Double:
+    """(4, 4) of a 3 x 3 rotation and a point."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, centre
+    return pose
+
+
+def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
+    """The axis along which the cameras' own point up on the whole, where the format does not say:
+    people hold cameras upright."""
+    up = sum((r.world_from_camera[:3, 1] for r in records), np.zeros(3))
+    return "Y" if abs(up[1]) > abs(up[2]) else "Z"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """The pictures below some folder, to be asked for by the names that documents have for them.
+
+    folder  absolute; nothing outside it is found
+    paths   all of them, absolute, sorted
+    """
+
+    folder: Path
+    paths: tuple[Path, ...]
+
+    def named(self, label: str) -> Path | None:
+        """The picture of this name: by its path below the folder, else by the end of its path, else
+        by its name alone, each with its suffix or another; None where there is none or several."""
+        wanted = PurePosixPath(label.replace("\\", "/").lstrip("./"))
+        stem = wanted.with_suffix("") if wanted.suffix.lower() in SUFFIXES else wanted
+        searches: tuple[Callable[[PurePosixPath], bool], ...] = (
+            lambda p: p == wanted,
+            lambda p: p.with_suffix("") == stem,
+            lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
+            lambda p: p.with_suffix("").parts[-len(stem.parts) :] == stem.parts,
+            lambda p: True,
+        )
+        candidates = self._by_stem.get(stem.name, ())
+        for search in searches:
+            found = [path for path, relative in candidates if search(relative)]
+            best = min((_nearness(path) for path in found), default=0)
+            found = [path for path in found if _nearness(path) == best]
+            if found:
+                return found[0] if len(found) == 1 else None
+        return None
+
+    @cached_property
+    def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
+        by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
+        for path in self.paths:
+            relative = PurePosixPath(path.relative_to(self.folder).as_posix())
+            by_stem.setdefault(path.stem, []).append((path, relative))
+        return by_stem
+
+    def numbered(self) -> dict[int, Path]:
+        """The pictures by the number at the end of their names, those without left out; of two of
+        one number the one that is nearer to radiance."""
+        found: dict[int, Path] = {}
+        for path in sorted(self.paths, key=_nearness, reverse=True):
+            digits = re.search(r"(\d+)$", path.stem)
+            if digits:
+                found[int(digits.group(1))] = path
+        return found
+
+
+def _nearness(path: Path) -> int:
+    return SUFFIXES.index(path.suffix.lower())
+
+
+def pictures_of(folder: Path, options: IngestOptions, *usual: str) -> Pictures:
+    """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders (or of
+    those that most programs use) that holds any."""
+    if options.frames is not None:
+        if not options.frames.is_dir():
+            raise UsageError(
+                f"--frames {options.frames}: no such folder. Name the one that holds the pictures. "
+                "[usage.option]"
+            )
+        return _below(options.frames.resolve(), deep=True)
+    for name in usual or _FOLDERS:
+        place = path_in_capture(folder, name, options) if name else folder
+        if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
+            return found
+    return Pictures(folder=folder, paths=())
+
+
+def _below(folder: Path, *, deep: bool) -> Pictures:
+    """Pictures in a folder; links that lead out of it do not count."""
+    found = folder.rglob("*") if deep else folder.glob("*")
+    inside = (p for p in found if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    home = folder.resolve()
+    paths = (p for p in inside if p.is_file() and p.resolve().is_relative_to(home))
+    return Pictures(folder=folder, paths=tuple(sorted(paths)))
+
+
+def mask_beside(folder: Path, image: Path) -> Path | None:
+    """The mask of a picture in masks/: of its name, with or without its suffix, as programs have
+    it; black is what is not to be looked at."""
+    for name in (image.name, image.stem, f"{image.stem}_mask", f"{image.name}.mask"):
+        for suffix in (".png", ".jpg"):
+            if (folder / "masks" / f"{name}{suffix}").is_file():
+                return contained(folder, f"masks/{name}{suffix}")
+    same = folder / "masks" / image.name
+    return contained(folder, f"masks/{image.name}") if same.is_file() else None
+
+
+def drop_without_picture(label: str, findings: Findings) -> None:
+    """Leave out a camera whose picture was not found."""
+    findings.drop(label, "no picture, or more than one, has this name", "capture.file")
+
+
+def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
+    """InputRefused where no picture was found at all."""
+    if not pictures.paths:
+        raise InputRefused(
+            f"{source}: no pictures below {pictures.folder}. Put them beside it in a folder "
+            "images, or name their folder with --frames. [capture.frames]"
+        )
+
+
+def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> Path:
+    """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
+    of the folder; InputRefused, which says ``how`` to get one, where there is none."""
+    if options.mesh is not None:
+        return options.mesh
+    for pattern in usual:
+        found = [p for p in sorted(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
+        if found:
+            return contained(folder, found[0].relative_to(folder).as_posix())
+    others = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
+    if len(others) == 1:
+        return contained(folder, others[0].name)
+    said = f"{len(others)} meshes" if others else "no mesh"
+    raise InputRefused(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
+
+
+def scan_of(
+    records: Sequence[FrameRecord],
+    geometry: Path | Callable[[], ScanGeometry],
+    options: IngestOptions,
+    findings: Findings,
+    *,
+    adapter: str,
+    source: Path,
+    folder: Path,
+    meters_per_unit: float = 1.0,
+    up_axis: str = "Z",
+    encoding: str | None = None,
+    name: str = "",
+    objects: Callable[[FileMesh], LabelTable] | None = None,
+) -> Scan:
+    """The capture of these frames and this mesh (a file, or what reads it).
+
+    objects   what knows the objects of the mesh; ``--objects`` comes first
+    source    the document that messages name; ``folder``, the capture's own, absolute
+    encoding  of images that hold radiance, where the format says; the user's comes first
+    """
+    for record in records:
+        if record.lens.bends and "undistort" in record.image_path.parent.name.lower():
+            raise InputRefused(
+                f"{record.image_path}: a picture that has been undistorted, but the lens of "
+                f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
+                "the cameras that were exported for these. [capture.camera]"
+            )
+    if masks := sum(record.mask_path is not None for record in records):
+        findings.warn(
+            f"{source.name}: {masks} masks are used; what is black there is not looked at. "
+            "[capture.mask]"
+        )
+    photographs = refuse_photographs(
+        [r.image_path for r in records], assume_srgb=options.assume_srgb
+    )
+    if photographs:
+        records = as_photographs(records, findings, source)
+    else:
+        options = replace(options, encoding=options.encoding or encoding)
+        if unknown := sum(math.isinf(r.saturation_radiance) for r in records):
+            findings.warn(
+                f"{source.name}: {unknown} of {len(records)} frames state no saturation, so "
+                "clipped pixels pass for radiance. [capture.saturation]"
+            )
+
+    def read_geometry() -> ScanGeometry:
+        if not isinstance(geometry, Path):
+            return geometry()
+        return geometry_from_file(
+            geometry,
+            options.objects or objects,
+            options,
+            findings,
+            capture_root=folder,
+            meters_per_unit=meters_per_unit,
+        )
+
+    return scan_from_parts(
+        records,
+        read_geometry,
+        options,
+        findings,
+        name=name or folder.name,
+        adapter=adapter,
+        source=source,
+        encoding=radiance_encoding(options, photographs=photographs),
+        radiometric=not photographs,
+        meters_per_unit=meters_per_unit,
+        up_axis=up_axis,
+    )
+
+
+def warn_of_unused(
+    pictures: Pictures, used: Iterable[Path], findings: Findings, source: Path
+) -> None:
+    """One sentence where pictures have no camera."""
+    left = set(pictures.paths) - set(used)
+    if left:
+        findings.count("pictures_without_camera", len(left))
+        findings.warn(
+            f"{source.name}: {len(left)} of {len(pictures.paths)} pictures have no camera, first "
+            f"{min(left).name!r}. [capture.unused]"
+        )

@@ -1,0 +1,218 @@
+"""RealityScan (RealityCapture): the CSV export "Internal/External camera parameters", or XMP files
+beside the pictures; pictures and the exported model.
+
+The CSV has the camera's place (x, y, alt) and heading, pitch and roll in degrees: with all three 0
+the camera looks straight down with north up, and heading turns clockwise from above. The focal
+length is that of a full-frame camera, in mm, along the longer side of the picture; the principal
+point, parts of the longer side from the picture's middle. XMP has a rotation, world to camera in
+OpenCV's axes, and the camera's position.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
+from usdbrdf.capture.formats.named_pictures import (
+    Pictures,
+    drop_without_picture,
+    mask_beside,
+    mesh_beside,
+    opengl_from_opencv,
+    pictures_of,
+    refuse_without_pictures,
+    rigid_pose,
+    scan_of,
+    warn_of_unused,
+)
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.images import image_size
+from usdbrdf.files.tables import Element, beginning_of, csv_rows, number_in, read_xml
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.options import IngestOptions
+
+NAME = "realityscan"
+DESCRIPTION = DESCRIPTIONS[NAME]
+_NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+_DESCRIBED = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
+_FULL_FRAME_MM = 36.0
+_EXPORT = 'Export the registration as "Internal/External camera parameters"'
+
+
+def matches(path: Path) -> bool:
+    """A CSV of cameras or XMP files of this program, or a folder with such."""
+    return bool(_tables(path)) or any(_is_sidecar(file) for file in _sidecars(path)[:1])
+
+
+def _tables(path: Path) -> list[Path]:
+    files = [path] if path.is_file() else sorted(path.glob("*.csv")) if path.is_dir() else []
+    return [file for file in files if file.suffix.lower() == ".csv" and _is_table(file)]
+
+
+def _is_table(file: Path) -> bool:
+    lines = beginning_of(file).decode("utf-8", "replace").lower().splitlines()
+    first = next((line for line in lines if re.search("[,;]", line)), "")
+    return {"name", "x", "y", "alt"} <= {word.strip(" #") for word in re.split("[,;]", first)}
+
+
+def _sidecars(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return []
+    return sorted(path.glob("*.xmp")) or sorted(path.glob("*/*.xmp"))
+
+
+def _is_sidecar(file: Path) -> bool:
+    return b"capturingreality.com/ns/xcr" in beginning_of(file)
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    path = path.resolve()
+    tables, findings = _tables(path), Findings()
+    folder = path if path.is_dir() else path.parent
+    if len(tables) > 1 or not (tables or _sidecars(path)):
+        raise InputRefused(
+            f"{path}: {len(tables) or 'no'} CSV exports of cameras. {_EXPORT}, and name that file. "
+            "[capture.format]"
+        )
+    source = tables[0] if tables else folder
+    pictures = pictures_of(folder, options)
+    refuse_without_pictures(pictures, source)
+    if tables:
+        records = list(records_of_table(source, pictures, findings))
+    else:
+        records = list(records_of_sidecars(_sidecars(path), pictures, findings))
+    records = [replace(r, mask_path=mask_beside(folder, r.image_path)) for r in records]
+    records.sort(key=lambda record: record.image_path)
+    warn_of_unused(pictures, (r.image_path for r in records), findings, source)
+    mesh = mesh_beside(
+        folder,
+        options,
+        "mesh.*",
+        "model.*",
+        how="Export the model in the coordinate system of the cameras into this folder",
+    )
+    return scan_of(records, mesh, options, findings, adapter=NAME, source=source, folder=folder)
+
+
+def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> Iterator[FrameRecord]:
+    """The cameras of a CSV export that have a picture."""
+    for row in csv_rows(source):
+        name = row.get("name", "")
+        place = [number_in(row, axis) for axis in ("x", "y", "alt")]
+        angles = [number_in(row, *names) for names in (("heading", "yaw"), ("pitch",), ("roll",))]
+        focal = number_in(row, "f", "f_35mm", "focallength35mm")
+        if not {"heading", "yaw"} & row.keys():
+            raise InputRefused(
+                f"{source}: places of cameras without directions and focal lengths. {_EXPORT}. "
+                "[capture.format]"
+            )
+        if None in place or None in angles or focal is None or not focal > 0:
+            findings.drop(name, "its row has no place, direction and focal length", "capture.pose")
+            continue
+        pose = rigid_pose(_axes(*(float(a or 0) for a in angles)), np.array(place, np.float64))
+        centre = [number_in(row, *names) or 0.0 for names in (("px", "px_norm"), ("py", "py_norm"))]
+        terms = [number_in(row, term) or 0.0 for term in ("k1", "k2", "k3", "k4", "t1", "t2")]
+        yield from _record(name, pose, focal, centre, terms, pictures, findings)
+
+
+def _axes(heading: float, pitch: float, roll: float) -> Double:
+    """(3, 3) world (x east, y north, z up) from camera, OpenGL's axes, of angles in degrees."""
+    turns = np.radians([-heading, pitch, roll])
+    (ch, cp, cr), (sh, sp, sr) = np.cos(turns), np.sin(turns)
+    about_z = np.array([[ch, -sh, 0], [sh, ch, 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
+    return np.asarray(about_z @ about_x @ about_y)
+
+
+def records_of_sidecars(
+    files: list[Path], pictures: Pictures, findings: Findings
+) -> Iterator[FrameRecord]:
+    """The cameras of XMP files, each beside its picture or of its name."""
+    for file in files:
+        described = read_xml(file).find(f".//{_DESCRIBED}")
+        said = _sidecar_values(described) if described is not None else {}
+        rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
+        focal = number_in(said, "FocalLength35mm")
+        model = said.get("DistortionModel", "perspective")
+        if model != "perspective" and not model.startswith("brown"):
+            raise InputRefused(
+                f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
+                "settings, and export again. [capture.camera]"
+            )
+        if said.get("Coordinates", "absolute") != "absolute":
+            raise InputRefused(
+                f"{file}: coordinates are {said['Coordinates'][:40]!r}. Export absolute ones. "
+                "[capture.pose]"
+            )
+        if rotation is None or place is None or focal is None or not focal > 0:
+            findings.drop(
+                file.stem, "its XMP has no rotation, position and focal length", "capture.pose"
+            )
+            continue
+        centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
+        terms = _numbers(said, "DistortionCoeficients", 6)
+        pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
+        bent = list(terms) if terms is not None and model != "perspective" else [0.0] * 6
+        squeeze = number_in(said, "AspectRatio") or 1.0
+        yield from _record(file.stem, pose, focal, centre, bent, pictures, findings, squeeze)
+
+
+def _sidecar_values(described: Element) -> dict[str, str]:
+    """What an XMP says, as attributes or as elements."""
+    values = {k.removeprefix(_NAMESPACE): v for k, v in described.attrib.items()}
+    return values | {c.tag.removeprefix(_NAMESPACE): c.text or "" for c in described}
+
+
+def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:
+    try:
+        values = np.array(said.get(key, "").split(), np.float64)
+    except ValueError:
+        return None
+    return values if len(values) == count and np.isfinite(values).all() else None
+
+
+def _record(
+    name: str,
+    pose: Double,
+    focal: float,
+    centre: list[float],
+    terms: list[float],
+    pictures: Pictures,
+    findings: Findings,
+    squeeze: float = 1.0,
+) -> Iterator[FrameRecord]:
+    """terms: k1 to k4, t1, t2; squeeze: the vertical focal length over the horizontal one."""
+    image = pictures.named(name)
+    if image is None:
+        drop_without_picture(name, findings)
+        return
+    try:
+        width, height, _ = image_size(image)
+    except ImageRefused as error:
+        findings.drop(name, clause_of(error, image), "capture.image")
+        return
+    longer = max(width, height)
+    # Its own template for OpenCV writes k1, k2, t2, t1: the other way round.
+    lens = Lens(radial=tuple(terms[:4]), tangential=(terms[5], terms[4]))
+    yield FrameRecord(
+        name=name,
+        image_path=image,
+        world_from_camera=pose,
+        intrinsics=(
+            focal * longer / _FULL_FRAME_MM,
+            focal * squeeze * longer / _FULL_FRAME_MM,
+            width / 2 + centre[0] * longer,
+            height / 2 + centre[1] * longer,
+        ),
+        resolution=(width, height),
+        lens=lens if lens.bends else PINHOLE,
+    )

@@ -1,0 +1,218 @@
+"""Any USD stage as a capture: its cameras are the photographs, its meshes the surface.
+
+A camera that names a picture (a back plate) has that one. Others find theirs by name: one of many
+by its prim's name, one that moves by the number of each of its time samples.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
+from usdbrdf.capture.formats.named_pictures import (
+    Pictures,
+    drop_without_picture,
+    pictures_of,
+    refuse_without_pictures,
+    scan_of,
+)
+from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
+from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.files.images import image_size
+from usdbrdf.files.naming import identifier_from
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.mesh import ScanGeometry
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.usd_cameras import UsdCamera, cameras_from_usd
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES
+
+NAME = "usd"
+DESCRIPTION = DESCRIPTIONS[NAME]
+# Of pixels whose sides differ; beyond this an aperture was made for another shape of picture.
+_MOST_SQUEEZED = 0.05
+
+
+class _Shot(NamedTuple):
+    """A camera at one of its times."""
+
+    camera: UsdCamera
+    i: int
+
+    @property
+    def time(self) -> float:
+        """NaN where nothing changes."""
+        return float(self.camera.times[self.i])
+
+    @property
+    def name(self) -> str:
+        path = self.camera.path
+        return path if math.isnan(self.time) else f"{path} at {self.time:g}"
+
+
+def matches(path: Path) -> bool:
+    """A USD file, or a folder with one of them."""
+    return _stage_of(path) is not None
+
+
+def _stage_of(path: Path) -> Path | None:
+    if path.is_file():
+        return path if path.suffix.lower() in USD_SUFFIXES else None
+    inside = path.iterdir() if path.is_dir() else ()
+    files = [p for p in inside if p.suffix.lower() in USD_SUFFIXES and p.is_file()]
+    return files[0] if len(files) == 1 else None
+
+
+def read(path: Path, options: IngestOptions) -> Scan:
+    stage = _stage_of(path.resolve())
+    if stage is None:
+        raise InputRefused(f"{path}: no USD file, or several. Name the file. [capture.format]")
+    folder, findings = stage.parent, Findings()
+    found = cameras_from_usd(stage, allow=options.allow_outside)
+    shots = [_Shot(camera, i) for camera in found.cameras for i in range(len(camera.times))]
+    records = list(_records(shots, stage, options, findings))
+
+    def geometry() -> ScanGeometry:
+        if options.mesh is not None:
+            unit = found.meters_per_unit
+            return geometry_from_file(
+                options.mesh,
+                options.objects,
+                options,
+                findings,
+                capture_root=folder,
+                meters_per_unit=unit,
+            )
+        return geometry_from_usd(stage, options, findings, capture_root=folder, subsets=True)
+
+    return scan_of(
+        records,
+        geometry,
+        options,
+        findings,
+        adapter=NAME,
+        source=stage,
+        folder=folder,
+        name=stage.stem,
+        meters_per_unit=found.meters_per_unit,
+        up_axis=found.up_axis,
+    )
+
+
+def _records(
+    shots: list[_Shot], stage: Path, options: IngestOptions, findings: Findings
+) -> Iterator[FrameRecord]:
+    by_plate = options.frames is None and any(s.camera.images[s.i] for s in shots)
+    if by_plate:
+        named = [(shot, _plate_file(shot, stage.parent, options)) for shot in shots]
+    else:
+        pictures = pictures_of(stage.parent, options)
+        refuse_without_pictures(pictures, stage)
+        named = _by_name(shots, pictures)
+        if not any(image for _, image in named):
+            first = min(pictures.paths).name
+            raise InputRefused(
+                f"{stage}: none of {len(pictures.paths)} pictures, first {first!r}, belongs to any "
+                f"of {len(shots)} cameras, first {shots[0].name}. Name each picture as its camera, "
+                "or end its name with the number of the camera's time sample. [capture.frames]"
+            )
+    for shot, image in named:
+        if image is None and (by_plate or not math.isnan(shot.time)):
+            # Other cameras, and animation that runs on between the pictures that were kept.
+            findings.count("poses_without_photograph", 1)
+        elif image is None:
+            drop_without_picture(shot.name, findings)
+        elif not image.is_file():
+            findings.drop(shot.name, "the image file does not exist", "capture.file")
+        else:
+            yield from _record(shot, image, findings)
+
+
+def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path | None]]:
+    """Each camera's picture: by its own name if it stands still, else by the number of its time,
+    among those in a folder of its name, or whose names begin with it, if it is not alone."""
+    by_identifier: dict[str, list[Path]] = {}
+    for path in pictures.paths:
+        for identifier in _identifiers(path.stem):
+            by_identifier.setdefault(identifier, []).append(path)
+    alone = len({shot.camera.path for shot in shots}) == 1
+    numbered: dict[str, dict[int, Path]] = {}
+
+    def found(shot: _Shot) -> Path | None:
+        prim = shot.camera.path.rpartition("/")[2]
+        if math.isnan(shot.time):
+            same = by_identifier.get(prim, [])
+            exact = pictures.named(prim) or pictures.named(shot.camera.label)
+            return exact or (same[0] if len(same) == 1 else None)
+        if prim not in numbered:
+            starts = re.compile(rf"{prim}\D?\d+")
+            own = (p for p in pictures.paths if p.parent.name == prim or starts.fullmatch(p.stem))
+            paths = pictures.paths if alone else tuple(own)
+            numbered[prim] = Pictures(folder=pictures.folder, paths=paths).numbered()
+        return numbered[prim].get(round(shot.time)) if shot.time == round(shot.time) else None
+
+    return [(shot, found(shot)) for shot in shots]
+
+
+def _identifiers(stem: str) -> set[str]:
+    """What exporters make of a picture's name, as that of a prim: ours, and USD's own way."""
+    return {identifier_from(stem), re.sub(r"\W|^\d", "_", stem, flags=re.ASCII)}
+
+
+def _plate_file(shot: _Shot, folder: Path, options: IngestOptions) -> Path | None:
+    """The file of a back plate, of a sequence too: plate.####.exr, plate.%04d.exr."""
+    plate = shot.camera.images[shot.i]
+    if not plate:
+        return None
+    if not math.isnan(shot.time):
+        number = f"{round(shot.time)}"
+        plate = re.sub("#+", lambda m: number.zfill(len(m[0])), plate)
+        plate = re.sub(r"%0?(\d?)d", lambda m: number.zfill(int(m[1] or 1)), plate)
+    inside = Path(plate).is_relative_to(folder)
+    relative = Path(plate).relative_to(folder).as_posix() if inside else plate
+    return path_in_capture(folder, relative, options)
+
+
+def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecord]:
+    try:
+        width, height, _ = image_size(image)
+    except ImageRefused as error:
+        findings.drop(shot.name, clause_of(error, image), "capture.image")
+        return
+    pose, exposure = shot.camera.world_from_camera[shot.i], float(shot.camera.exposure[shot.i])
+    # What a camera hangs on may scale it, which changes where it stands and not what it sees.
+    size = np.cbrt(abs(np.linalg.det(pose[:3, :3])))
+    if size > 0:
+        pose = pose @ np.diag([1 / size, 1 / size, 1 / size, 1])
+    yield FrameRecord(
+        name=shot.name,
+        image_path=image,
+        world_from_camera=pose,
+        intrinsics=pinhole_from_lens(shot.camera.lens[shot.i], width, height),
+        resolution=(width, height),
+        exposure_time=exposure if 0 < exposure < math.inf else 1.0,
+    )
+
+
+def pinhole_from_lens(lens: Double, width: int, height: int) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels of a UsdGeomCamera's lens, see ``UsdCamera``, for a picture.
+
+    A vertical aperture that is not authored (NaN), or far from the picture's shape, says nothing:
+    pixels are square then.
+    """
+    focal, across, up, offset_x, offset_y = lens.tolist()
+    if not (focal > 0 and across > 0):
+        return 0.0, 0.0, 0.0, 0.0  # no lens: the frame is dropped where lenses are checked
+    square = across * height / width
+    if not abs(up / square - 1) <= _MOST_SQUEEZED:
+        up = square
+    fx, fy = focal / across * width, focal / up * height
+    return fx, fy, width * (0.5 - offset_x / across), height * (0.5 + offset_y / up)

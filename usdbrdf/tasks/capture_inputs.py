@@ -1,0 +1,45 @@
+"""The files that a capture is made of, as hashes: what changed is read anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from usdbrdf.asset.layout import Asset, relative_path
+from usdbrdf.capture.adapters import refuse_missing
+from usdbrdf.files.paths import files_below
+from usdbrdf.job.stamp import hash_of_files
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
+
+
+def inputs_of_capture(
+    capture: Path, options: IngestOptions, asset: Asset, beside: Sequence[Path]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Hashes of all that ingest may read: the capture's folder and those that its documents may
+    point into, without the asset if that lies in one, what options name, and the files ``beside``
+    that its adapter reads. And where these lie, seen from scan.usdc, which names photographs and
+    USD geometry by such paths: what is moved must be read anew."""
+    folder = (capture if capture.is_dir() else capture.parent).resolve()
+    refuse_missing(capture)
+    outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
+    if options.frames is not None:
+        outside["frames"] = options.frames.resolve()
+    inputs = {
+        label: hash_of_files(files_below(place, without=asset.folder), place)
+        for label, place in ({"capture": folder} | outside).items()
+    }
+    if beside:
+        inputs["beside"] = hash_of_files(beside)
+    mesh, objects = options.mesh, options.objects
+    if mesh is not None and mesh.is_file():
+        # What a USD mesh refers to may lie beside it, out of the capture.
+        usd = mesh.suffix.lower() in USD_SUFFIXES
+        layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
+        inputs["mesh"] = hash_of_files(layers)
+    if objects is not None and objects.is_file():
+        inputs["objects"] = hash_of_files([objects])
+    named = {"mesh": mesh.resolve()} if mesh is not None else {}
+    places = {"capture": capture.resolve()} | named | outside
+    here = asset.layer("scan").parent
+    return inputs, {name: relative_path(place, here) for name, place in places.items()}

@@ -1,0 +1,116 @@
+"""The pictures of an E57 file: where they were taken and through what, read in a child process.
+
+Pixels stay where they are: an E57 holds JPEG and PNG files whole, and frames are read from files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.model.arrays import Double
+from usdbrdf.untrusted.bounds import read_in_child
+
+# Of the pinhole and of the sphere, by the names of ASTM E2807.
+_PINHOLE = ("focalLength", "pixelWidth", "pixelHeight", "principalPointX", "principalPointY")
+_SPHERE = ("pixelWidth", "pixelHeight")
+_KINDS = {"pinholeRepresentation": _PINHOLE, "sphericalRepresentation": _SPHERE}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationPicture:
+    """One image2D of the file.
+
+    name        as the file has it, "" where it has none
+    kind        "pinhole" (looks down -z, y up), "spherical" (x straight ahead, z up), or the name
+                of another representation
+    numbers     of a pinhole: focal length, width and height of a pixel in metres, principal point
+                in pixels; of a sphere: width and height of a pixel in radians
+    resolution  width, height
+    world_from_camera  (4, 4), metres; NaN where the file has no pose
+    """
+
+    name: str
+    kind: str
+    numbers: tuple[float, ...]
+    resolution: tuple[int, int]
+    world_from_camera: Double
+
+
+def pictures_of_e57(path: Path) -> tuple[StationPicture, ...]:
+    """All pictures, in the file's order; EnvironmentFailure without pye57."""
+    if find_spec("pye57") is None:
+        raise EnvironmentFailure(
+            f"{path}: E57 files are read with pye57, which is not installed. Install it with: pip "
+            "install 'usdbrdf[e57]'. [environment.pye57]"
+        )
+    return read_in_child("mesh", f"{__name__}:read_here", path, tuple, parts=(StationPicture,))
+
+
+def read_here(path: Path) -> tuple[StationPicture, ...]:
+    """``pictures_of_e57`` in this process, which is to be a child."""
+    from pye57 import libe57
+
+    try:
+        file = libe57.ImageFile(str(path), "r")
+        root = file.root()
+        images = root["images2D"] if root.isDefined("images2D") else []
+        return tuple(_picture(images[i]) for i in range(len(images)))
+    except libe57.E57Exception as error:
+        raise InputRefused(
+            f"{path}: damaged or no E57 file ({' '.join(str(error).split())[:160]}). Export it "
+            "again. [e57.read]"
+        ) from error
+
+
+def _picture(image: Any) -> StationPicture:
+    kinds = [kind for kind in _KINDS if image.isDefined(kind)]
+    kind = kinds[0] if kinds else "visualReferenceRepresentation"
+    shown = image[kind] if image.isDefined(kind) else None
+    pose = np.full((4, 4), np.nan)
+    if image.isDefined("pose"):
+        turn = _numbers(image["pose"], "rotation", {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0})
+        place = _numbers(image["pose"], "translation", dict.fromkeys("xyz", 0.0))
+        pose = _pose(turn, place)
+    return StationPicture(
+        name=str(image["name"].value()) if image.isDefined("name") else "",
+        kind=kind.removesuffix("Representation"),
+        numbers=tuple(_number(shown, name) for name in _KINDS.get(kind, ())),
+        resolution=(_whole(shown, "imageWidth"), _whole(shown, "imageHeight")),
+        world_from_camera=pose,
+    )
+
+
+def _number(node: Any, name: str) -> float:
+    return float(node[name].value()) if node is not None and node.isDefined(name) else 0.0
+
+
+def _whole(node: Any, name: str) -> int:
+    number = _number(node, name)
+    return int(number) if np.isfinite(number) else 0
+
+
+def _numbers(node: Any, name: str, otherwise: Mapping[str, float]) -> Double:
+    if not node.isDefined(name):
+        return np.array(list(otherwise.values()))
+    return np.array([_number(node[name], part) for part in otherwise])
+
+
+def _pose(quaternion: Double, place: Double) -> Double:
+    """(4, 4) of w, x, y, z and a point; NaN where the quaternion is none."""
+    length = np.linalg.norm(quaternion)
+    w, x, y, z = quaternion / length if length > 0 else np.full(4, np.nan)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = place
+    return pose

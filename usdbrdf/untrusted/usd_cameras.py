@@ -1,0 +1,141 @@
+"""Cameras of a USD stage that somebody else made, read in a child process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.model.arrays import Double
+from usdbrdf.untrusted.usd_files import check_units, render_scene_of_usd
+
+# Attributes that name the picture behind a camera: USD's own back plates, and Houdini's.
+_PLATES = ("houdini:backgroundimage", "usdBrdf:capture:image")
+_SHAPE = "verticalAperture"
+_LENS = (
+    "focalLength",
+    "horizontalAperture",
+    _SHAPE,
+    "horizontalApertureOffset",
+    "verticalApertureOffset",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsdCamera:
+    """One camera of a stage at its T time samples; of a camera that does not change, at one.
+
+    path, label        of the prim, and its display name or its own
+    times              (T,) time codes; NaN where nothing changes
+    world_from_camera  (T, 4, 4) as composed, column vectors, in the stage's unit; axes may be
+                       scaled
+    lens               (T, 5) focal length, horizontal and vertical aperture (NaN where it is
+                       left at its default), and their offsets, in one unit
+    exposure           (T,) what the exposure attributes multiply radiance by
+    images             T absolute paths, or patterns of such with # or %d for the number; "" where
+                       the camera names none
+    """
+
+    path: str
+    label: str
+    times: Double
+    world_from_camera: Double
+    lens: Double
+    exposure: Double
+    images: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsdCameras:
+    """All perspective cameras of a stage, in its order, and the stage's unit and axis."""
+
+    cameras: tuple[UsdCamera, ...]
+    meters_per_unit: float
+    up_axis: str
+
+
+def cameras_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> UsdCameras:
+    """InputRefused where the stage has no perspective camera.
+
+    allow  folders outside the file's own that its asset paths may lead into
+    """
+    reader = f"{__name__}:read_here"
+    parts = (UsdCamera, UsdCameras)
+    (found,) = render_scene_of_usd(path, reader, allow=allow, parts=parts)
+    assert isinstance(found, UsdCameras)
+    return found
+
+
+def read_here(path: Path) -> tuple[UsdCameras]:
+    """``cameras_from_usd`` in this process, which is to be a child."""
+    stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+    meters_per_unit, up_axis = check_units(stage, path)
+    prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+    found = [UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)]
+    perspective = UsdGeom.Tokens.perspective
+    sound = [c for c in found if c.GetProjectionAttr().Get() in (None, perspective)]
+    if not sound:
+        what = f"{len(found)} cameras, none of them perspective" if found else "no camera"
+        raise InputRefused(
+            f"{path}: {what}. Export the cameras of the photographs with the stage. [stage.camera]"
+        )
+    cameras = tuple(_camera(camera) for camera in sound)
+    return (UsdCameras(cameras=cameras, meters_per_unit=meters_per_unit, up_axis=up_axis),)
+
+
+def _camera(camera: UsdGeom.Camera) -> UsdCamera:
+    prim = camera.GetPrim()
+    named = map(prim.GetAttribute, _names_of_plates(prim))
+    plate = next((a for a in named if a.Get(Usd.TimeCode.EarliestTime())), None)
+    times = _sample_times(camera, plate)
+    codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.EarliestTime()]
+    said = [name for name in _LENS if name != _SHAPE or prim.GetAttribute(name).IsAuthored()]
+    lens = [
+        [prim.GetAttribute(name).Get(code) if name in said else np.nan for name in _LENS]
+        for code in codes
+    ]
+    return UsdCamera(
+        path=str(prim.GetPath()),
+        label=prim.GetDisplayName() or prim.GetName(),
+        times=np.array(times or [np.nan], np.float64),
+        # Row vectors in USD: transposed they are ours.
+        world_from_camera=np.array(
+            [np.array(camera.ComputeLocalToWorldTransform(code)).T for code in codes], np.float64
+        ),
+        lens=np.array(lens, np.float64),
+        exposure=np.array([camera.ComputeLinearExposureScale(code) for code in codes]),
+        images=tuple(_file_of(plate, code) if plate else "" for code in codes),
+    )
+
+
+def _names_of_plates(prim: Usd.Prim) -> list[str]:
+    own = [str(attribute.GetName()) for attribute in prim.GetAuthoredAttributes()]
+    plates = [name for name in own if name.startswith("backPlate:") and name.count(":") == 2]
+    return [name for name in plates if name.endswith(":image")] + [n for n in _PLATES if n in own]
+
+
+def _sample_times(camera: UsdGeom.Camera, plate: Any) -> list[float]:
+    """When the camera names another picture; else when it, or what it hangs on, moves or zooms."""
+    prim = camera.GetPrim()
+    if plate and plate.GetNumTimeSamples() > 1:
+        return list(plate.GetTimeSamples())
+    times = {time for name in _LENS for time in prim.GetAttribute(name).GetTimeSamples()}
+    while prim and not prim.IsPseudoRoot():
+        moving = UsdGeom.Xformable(prim)
+        times |= set(moving.GetTimeSamples() if moving else ())
+        prim = prim.GetParent()
+    return sorted(times) if len(times) > 1 else []
+
+
+def _file_of(plate: Usd.Attribute, code: Usd.TimeCode) -> str:
+    """Absolute path, existing or not, relative to the layer that holds the opinion."""
+    value = plate.Get(code)
+    if not value or not value.path:
+        return ""
+    layer = plate.GetPropertyStack(code)[0].layer
+    return str(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
