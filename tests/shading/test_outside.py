@@ -166,3 +166,49 @@ def test_a_lone_object_in_the_open_gets_light_that_lets_nothing_reflect_too_much
     assert (albedo > 1).any(axis=1).mean() < 0.03
     # Not black either.
     assert 0.1 < np.median(albedo) < 0.7
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("daylight", [0.0, 40.0])
+def test_a_sky_behind_a_slit_is_believed_in_where_its_light_is_seen(daylight: float):
+    # A hall with a lamp, and a slit under its ceiling that no frame looks through.
+    lamp = 9
+    hall = world_of([
+        quad((0, 0, 0), (6, 0, 0), (0, 5, 0), (60, 50)),
+        quad((0, 5, 0), (6, 0, 0), (0, 0, 3), (48, 24)),
+        quad((0, 0, 0), (0, 5, 0), (0, 0, 3), (40, 24)),
+        quad((6, 0, 0), (0, 0, 3), (0, 5, 0), (24, 40)),
+        quad((0, 0, 0), (0, 0, 3), (6, 0, 0), (24, 48)),
+        quad((0, 0, 3), (0, 4.5, 0), (6, 0, 0), (30, 36)),
+        quad((0, 4.9, 3), (0, 0.1, 0), (6, 0, 0), (2, 36)),
+        *box((1, 1, 0.01), (2, 2, 1.2), (20, 20))[:2],
+        quad((4, 1, 2.9), (0, 1, 0), (1, 0, 0), (8, 8)),
+    ])  # fmt: skip
+    sky = np.full((HEIGHT, WIDTH, 3), daylight, np.float32)
+    surface, texels = TexturedScene(hall.scene, hall.texels, hall.rays), hall.texels
+    owner = texels.object_index()
+    albedo = np.random.default_rng(7).uniform(0.2, 0.7, (len(texels.resolution), 3))[owner]
+    lit = np.zeros((len(texels), 3), np.float32)
+    for _ in range(4):
+        lit[owner == lamp] = 20.0
+        arriving = irradiance_at(
+            surface.rays, surface.texture(lit), lights_from_radiance(hall.scene, texels, lit),
+            Environment(sky, True), texels.position, texels.normal, independent_tiles(len(texels)),
+            Sampling(standard_error=0.05, max_rays=128), surface.diagonal_m,
+        ).mean  # fmt: skip
+        lit = (albedo / np.pi * arriving).astype(np.float32)
+    lit[owner == lamp] = 20.0
+    nothing = np.zeros((HEIGHT, WIDTH), np.bool_)
+    every = np.ones(len(lit), np.bool_)
+    found = light_from_outside(surface, lit, CoverageMap.of(every, ~every), _seen(nothing), True, 0)
+    if found is None:
+        assert daylight == 0
+        return
+    brought = irradiance_at(
+        surface.rays, surface.texture(np.zeros_like(lit)),
+        lights_from_radiance(hall.scene, texels, np.zeros_like(lit)), found.environment,
+        texels.position, texels.normal, independent_tiles(len(texels)),
+        Sampling(standard_error=0.05, max_rays=256), surface.diagonal_m,
+    ).mean  # fmt: skip
+    share = float(brought.sum() / arriving.sum())
+    assert share < 0.02 if daylight == 0 else share > 0.1

@@ -47,6 +47,9 @@ _BANDS = (
 )  # fmt: skip
 _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
+# Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
+_SLIT = calibration.number("outside.slit")
+_MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
 _BESIDE = calibration.number("outside.alike_within")
 _SEED = 0x51C4
 _DARKEST = 1e-3  # of what is usual: darker sky is none
@@ -175,11 +178,15 @@ def light_from_outside(
     radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]))
     weight = share[used].mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
+    sky_error = float(np.average(of_sky, weights=weight)) if len(used) else math.nan
+    invented = not measured.any() and not shines and not sky_error < _MOST_SKY_ERROR
+    if invented and open_share < _SLIT:
+        return None
     return Outside(
         environment=Environment(radiance, z_up).under(sun),
         confidence=seen.coverage.stored().reshape(HEIGHT, WIDTH),
         open_share=open_share,
-        sky_error=float(np.average(of_sky, weights=weight)) if len(used) else math.nan,
+        sky_error=sky_error,
         sun_error=sun_error if shines else math.nan,
     )
 
