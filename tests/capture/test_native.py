@@ -50,7 +50,7 @@ def test_a_capture_comes_back_to_the_bit(capture, tmp_path):
         del document["frames"][3]["saturation_radiance"]
     options = IngestOptions(meters_per_unit=0.3, up_axis="Y", encoding="lin_ap1_scene")
     scan = read_scan(capture.folder, options)
-    write_capture(scan, tmp_path / "new" / "copy")
+    write_capture(scan, scan.frames.image_paths, tmp_path / "new" / "copy")
     again = read_scan(tmp_path / "new" / "copy", IngestOptions())
     _assert_same(scan, again)
     assert again.name == "copy"
@@ -73,7 +73,7 @@ def test_turned_faces_and_second_skins_come_back_as_they_were_wound(tmp_path):
     scan = read_scan(capture.folder, IngestOptions())
     assert scan.turned_faces.sum() >= floor.sum() > 0
     assert scan.counts["faces_of_two_sides"] > 0
-    write_capture(scan, tmp_path / "copy")
+    write_capture(scan, scan.frames.image_paths, tmp_path / "copy")
     again = read_scan(tmp_path / "copy", IngestOptions())
     _assert_same(scan, again)
     assert again.counts == scan.counts
@@ -87,7 +87,7 @@ def test_photographs_stay_photographs(capture, tmp_path):
             frame["file_path"] = f"frames/{i:04d}.png"
             write_preview_png(capture.folder / frame["file_path"], image)
     scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
-    write_capture(scan, tmp_path / "copy")
+    write_capture(scan, scan.frames.image_paths, tmp_path / "copy")
     with pytest.raises(InputRefused, match=r"--assume-srgb"):
         read_scan(tmp_path / "copy", IngestOptions())
     _assert_same(scan, read_scan(tmp_path / "copy", IngestOptions(assume_srgb=True)))
@@ -101,7 +101,7 @@ def test_images_of_one_name_from_several_folders(capture, tmp_path):
             capture.image(i).rename(place)
             frame["file_path"] = f"pass{i}/view.exr"
     scan = read_scan(capture.folder, IngestOptions())
-    write_capture(scan, tmp_path / "copy")
+    write_capture(scan, scan.frames.image_paths, tmp_path / "copy")
     again = read_scan(tmp_path / "copy", IngestOptions())
     assert again.frames.image_paths[11].name == "00011_view.exr"
     _assert_same(replace(scan, frames=replace(scan.frames, image_paths=())),
@@ -127,8 +127,9 @@ def test_nothing_is_written_over_and_nothing_is_left_half(capture, tmp_path, mon
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("usdbrdf.capture.native.shutil.copyfile", full)
+    again = read_scan(copy, IngestOptions())
     with pytest.raises(EnvironmentFailure, match="No space left"):
-        write_capture(read_scan(copy, IngestOptions()), tmp_path / "third")
+        write_capture(again, again.frames.image_paths, tmp_path / "third")
     assert {p.name for p in tmp_path.iterdir()} == {"room", "copy", "out", "second"}
 
 
@@ -148,7 +149,8 @@ def test_an_encoding_that_the_images_do_not_have(capture):
 
 
 def test_the_document_of_the_copy_is_relative(capture, tmp_path):
-    write_capture(read_scan(capture.folder, IngestOptions()), tmp_path / "copy")
+    scan = read_scan(capture.folder, IngestOptions())
+    write_capture(scan, scan.frames.image_paths, tmp_path / "copy")
     Path(tmp_path / "copy").rename(tmp_path / "moved")
     assert str(tmp_path) not in (tmp_path / "moved" / "transforms.json").read_text()
     assert len(read_scan(tmp_path / "moved", IngestOptions()).frames) == 12
