@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.checks import Findings, spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.sides import Sides
@@ -91,12 +91,12 @@ def _probes() -> Double:
 
 
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:
-    count = min(len(frames), _PROBED_FRAMES)
+    asked = spread_evenly(len(frames), _PROBED_FRAMES)
     grid = _probes()
     hits = 0
-    for i in np.linspace(0, len(frames) - 1, count).round().astype(int):
+    for i in asked:
         camera = frames.camera(i)
         camera = replace(camera, world_from_camera=read(camera.world_from_camera))
         rays = camera.rays(grid * frames.resolution[i])
         hits += int((scene.closest(*rays).face >= 0).sum())
-    return hits / (count * len(grid))
+    return hits / (len(asked) * len(grid))

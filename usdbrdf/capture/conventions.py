@@ -8,9 +8,16 @@ import numpy as np
 
 from usdbrdf.model.arrays import Double
 
+# OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-_OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+# What nerfstudio's documents of 2022 had done to the world without saying so.
+OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+def opengl_from_opencv(world_from_camera: Double) -> Double:
+    """(..., 4, 4) poses of cameras that look down +z with y down, as our cameras stand."""
+    return np.asarray(world_from_camera @ _FLIP, np.float64)
 
 
 def _transposed(pose: Double) -> Double:
@@ -21,13 +28,13 @@ def _transposed(pose: Double) -> Double:
 
 # Mix-ups of conventions that are tried where the poses do not fit the mesh.
 CONVENTIONS: dict[str, Callable[[Double], Double]] = {
-    "OpenCV axes (negate columns 2 and 3)": lambda m: m @ _FLIP,
+    "OpenCV axes (negate columns 2 and 3)": opengl_from_opencv,
     "camera-from-world matrices (invert them)": lambda m: np.asarray(np.linalg.inv(m)),
     "camera-from-world with OpenCV axes (invert, then negate columns 2 and 3)": (
-        lambda m: np.asarray(np.linalg.inv(m) @ _FLIP)
+        lambda m: opengl_from_opencv(np.asarray(np.linalg.inv(m)))
     ),
     "rotations transposed (transpose them, keep the positions)": _transposed,
     "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
     "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
-    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: _OLD_NERFSTUDIO @ m,
+    "nerfstudio's axes of 2022 (state applied_transform)": lambda m: OLD_NERFSTUDIO @ m,
 }

@@ -263,7 +263,7 @@ def _records(
             FrameRecord(
                 name=name,
                 image_path=file,
-                world_from_camera=_world_from_camera(chosen.model.camera_from_world[k]),
+                world_from_camera=world_from_camera(chosen.model.camera_from_world[k]),
                 intrinsics=intrinsics,
                 resolution=camera.resolution,
                 lens=lens,
@@ -279,8 +279,9 @@ def _mask(path: Path, name: str, options: IngestOptions) -> Path | None:
     return mask if mask.is_file() else None
 
 
-def _world_from_camera(camera_from_world: Double) -> Double:
-    """The inverse, y and z of the camera turned round."""
+def world_from_camera(camera_from_world: Double) -> Double:
+    """(4, 4), OpenGL's axes, from a model's (3, 4), OpenCV's: the inverse, y and z of the camera
+    turned round."""
     rotation, translation = camera_from_world[:, :3], camera_from_world[:, 3]
     pose = np.eye(4)
     pose[:3, :3] = rotation.T * (1.0, -1.0, -1.0)

@@ -15,12 +15,12 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
     mask_beside,
     mesh_beside,
-    opengl_from_opencv,
     pictures_of,
     refuse_without_pictures,
     rigid_pose,

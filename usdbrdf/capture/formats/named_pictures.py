@@ -37,13 +37,6 @@ SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # Where programs put the pictures, beside what they say of them.
 _FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
-# OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def opengl_from_opencv(world_from_camera: Double) -> Double:
-    """(..., 4, 4) poses of cameras that look down +z with y down, as our cameras stand."""
-    return np.asarray(world_from_camera @ _FLIP, np.float64)
 
 
 def rigid_pose(rotation: Double, centre: Double) -> Double:

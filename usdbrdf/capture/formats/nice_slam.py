@@ -12,10 +12,10 @@ from typing import Any
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     mesh_beside,
-    opengl_from_opencv,
     pictures_of,
     refuse_without_pictures,
     scan_of,

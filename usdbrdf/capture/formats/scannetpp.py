@@ -14,11 +14,10 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.formats.colmap import lens_of
+from usdbrdf.capture.formats.colmap import lens_of, world_from_camera
 from usdbrdf.capture.formats.named_pictures import (
     drop_without_picture,
     mesh_beside,
-    opengl_from_opencv,
     pictures_of,
     refuse_without_pictures,
     scan_of,
@@ -63,12 +62,11 @@ def read(path: Path, options: IngestOptions) -> Scan:
             continue
         lens, intrinsics = lens_of(model.cameras[number])
         mask = masks / f"{Path(name).stem}.png"
-        world_from_camera = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]]))
         records.append(
             FrameRecord(
                 name=name,
                 image_path=image,
-                world_from_camera=opengl_from_opencv(world_from_camera),
+                world_from_camera=world_from_camera(pose),
                 intrinsics=intrinsics,
                 resolution=model.cameras[number].resolution,
                 lens=lens,

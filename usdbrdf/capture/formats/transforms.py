@@ -21,6 +21,7 @@ from usdbrdf.capture.checks import (
     is_camera_matrix,
     refuse_photographs,
 )
+from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -59,9 +60,8 @@ _CURVES: dict[str, Curve] = {
     "FISHEYE624": "fisheye", "EQUIRECTANGULAR": "equirectangular",
 }  # fmt: skip
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-# Folder of the reconstruction that old documents were made of, and what they had done to its world
-# without saying so (rows of applied_transform).
-_COLMAP, _LEGACY = "colmap/sparse/0", [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+# Folder of the reconstruction that old documents were made of.
+_COLMAP = "colmap/sparse/0"
 # No number in a document means anything beyond this; nor, where it must be positive, below its
 # inverse.
 _LARGEST = 1e15
@@ -406,7 +406,9 @@ def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
     scale = capture.positive({}, "applied_scale") or 1.0
     undone = pose.copy()
     undone[:3, 3] /= scale
-    applied = capture.document.get("applied_transform", _LEGACY if capture.is_legacy else None)
+    applied = capture.document.get(
+        "applied_transform", OLD_NERFSTUDIO.tolist() if capture.is_legacy else None
+    )
     if applied is None:
         return undone
     matrix = _pose(applied)
