@@ -86,7 +86,7 @@ def _fit(samples: ViewSamples, *bases: tuple[Basis, float]) -> LobeEstimate:
     for basis, blur in bases:
         at = _side_by_side(basis)
         candidates.append(Candidate(first=at, second=at, third=at, blur=blur))
-    return fit_lobe(samples, candidates)
+    return fit_lobe(samples, candidates)[0]
 
 
 def _side_by_side(basis: Basis) -> Callable[[Sequence[float]], tuple[np.ndarray, np.ndarray]]:
@@ -138,8 +138,8 @@ def test_noise_of_the_rays_does_not_draw_psi_anywhere(phi: float, noise: float):
         samples = _shone_on(samples, basis, phi, psi)
         first, second, third = (_side_by_side(_noisy(basis, 3 * seed + k, noise)) for k in range(3))
         own = Candidate(first=first, second=second, third=third, blur=0)
-        halves.append(fit_lobe(samples, [own]).psi)
-        twice.append(fit_lobe(samples, [own._replace(second=first)]).psi)
+        halves.append(fit_lobe(samples, [own])[0].psi)
+        twice.append(fit_lobe(samples, [own._replace(second=first)])[0].psi)
     assert np.mean(halves) == pytest.approx(psi, abs=0.04)
     # Noise squared adds to the square of the slope, which psi is divided by.
     assert np.mean(twice) < 0.93 * psi
@@ -158,7 +158,7 @@ def _scatter_and_foretold(
             _side_by_side(_noisy(basis, 3 * seed + k, noise, views)) for k in range(3)
         )
         own = Candidate(first=first, second=second, third=third, blur=0)
-        found.append(fit_lobe(samples, [own]))
+        found.append(fit_lobe(samples, [own])[0])
     scatter = np.std([(one.phi, one.psi) for one in found], axis=0, ddof=1)
     return scatter, np.sqrt(np.mean([np.square(one.of_rays) for one in found], axis=0))
 

@@ -237,6 +237,12 @@ def test_shifts_of_different_seeds_and_numbers_differ():
     assert_distributed([chi_square_p(counts, np.full(100, 200.0))])
 
 
+@pytest.mark.parametrize("log2_count", [0, 1, 5, 12])
+def test_sobol_points_are_those_of_scipy(log2_count):
+    points = stats.qmc.Sobol(2, scramble=False).random_base2(log2_count)
+    np.testing.assert_array_equal(sobol_bits(log2_count), points * 2.0**32)
+
+
 def test_sobol_points_stratify_both_dimensions_and_their_pair():
     # A (t, m, s)-net: 2^10 points put one point into each of 1024 intervals in every dimension,
     # and at most a few into each cell of a 32 x 32 grid.

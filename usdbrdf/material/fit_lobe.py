@@ -110,7 +110,7 @@ _LEVEL_1 = (
 )  # fmt: skip
 _LEVEL_2 = 3
 # Steps of expectation maximisation, each after a search of level 1; and how many more with another
-# candidate than the first.
+# candidate or another kind of lobe than the first.
 _UPDATES, _MORE = 4, 2
 
 
@@ -195,17 +195,22 @@ def _least(terms: Double) -> tuple[float, int, float]:
 
 
 def fit_lobe(
-    samples: ViewSamples, candidates: Sequence[Candidate], repeats: int = 1
-) -> LobeEstimate:
-    """The lobe that explains the samples best, averaged over the footprints that may be theirs.
-    Its errors are those of the mean of so many ``repeats`` with rays of their own.
+    samples: ViewSamples,
+    candidates: Sequence[Candidate],
+    repeats: int = 1,
+    known: ViewModel | None = None,
+) -> tuple[LobeEstimate, ViewModel]:
+    """The lobe that explains the samples best, averaged over the footprints that may be theirs,
+    and the model of the samples' errors. The lobe's errors are those of the mean of so many
+    ``repeats`` with rays of their own.
 
-    The errors' variances are found with the first candidate, and improved with the one that is best
-    with these. With them fixed all candidates are fitted and compared.
+    The errors' variances are found with the first candidate, or improved from those that are
+    ``known`` of another kind of lobe, and again with the candidate that is best with these. With
+    them fixed all candidates are fitted and compared.
     """
-    model = ViewModel(samples)
+    model = known or ViewModel(samples)
     fits = [_Fit(candidate, model, samples.radiance) for candidate in candidates]
-    for _ in range(_UPDATES):
+    for _ in range(_MORE if known else _UPDATES):
         fits[0].improve()
     coarse = [fit.coarse() for fit in fits]
     best = int(np.argmin([_least(terms)[0] for terms in coarse]))
@@ -219,4 +224,4 @@ def fit_lobe(
         fit.estimate(terms, without, repeats) for fit, terms in zip(fits, coarse, strict=True)
     ]
     likely = [candidate.likely for candidate in candidates]
-    return averaged(estimates, model.degrees_of_freedom, likely)
+    return averaged(estimates, model.degrees_of_freedom, likely), model

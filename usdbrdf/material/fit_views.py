@@ -19,7 +19,7 @@ from usdbrdf.material.conductor import Conductor, conductor_of
 from usdbrdf.material.fit_lobe import Candidate, first_seed, fit_lobe, repeated_where_noisy
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.verdict import SOME_EVIDENCE, LobeEstimate
-from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
@@ -116,6 +116,7 @@ def fit_kinds(
     ]
     blurs = [_deviation_of_normal(points) for points in sampled.footprints]
     found: dict[int, LobeEstimate] = {}
+    errors: ViewModel | None = None
     for kind in kinds:
         of_kind = [[partial(basis, kind) for basis in three] for three in bases]
         candidates = [
@@ -124,7 +125,7 @@ def fit_kinds(
                 of_kind, blurs, sampled.likely, strict=True
             )
         ]
-        found[kind] = fit_lobe(sampled.samples, candidates, repeats)
+        found[kind], errors = fit_lobe(sampled.samples, candidates, repeats, errors)
         if not found[kind].evidence > SOME_EVIDENCE:
             break
     return found
