@@ -260,6 +260,17 @@ def test_files_named_by_options_must_exist(option, capture, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("option", ["--mesh", "--objects", "--environment"])
+def test_files_named_by_options_are_taken(option, tmp_path):
+    file = tmp_path / "sky.exr"
+    file.write_bytes(b"")
+    chosen = parsed(["convert", "scan", "-o", "out", option, str(file)], COMMANDS).options
+    parts = (chosen.ingest, chosen.shade, chosen.fit)
+    assert file in [getattr(part, option[2:], None) for part in parts]
+    if option == "--environment":
+        assert chosen.shade.environment == chosen.fit.environment == file
+
+
 def test_output_that_is_a_file_or_lies_in_one(capture, tmp_path, capsys):
     file = tmp_path / "file"
     file.write_text("mine")

@@ -148,9 +148,11 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
         return None
     if text in option.words:
         return text
-    if option.file and not Path(text).is_file():
+    if option.file:
         # Said before any work is done; an input that is not there is refused as a capture would be.
-        raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")
+        if not Path(text).is_file():
+            raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")
+        return _path(text)
     return _checked(field, text, f"{option.name} {text}")
 
 

@@ -119,9 +119,15 @@ def _lobe(evidence: float) -> LobeEstimate:
     (0.71, 0.7, DIELECTRIC),  # hardly clearer: the lobe of renderers
 ])  # fmt: skip
 def test_the_scene_has_the_lobe_that_explains_its_views(paper: float, other: float, chosen: int):
-    names = ("texels", "rays", "radiance", "lights", "emission", "environment")
-    lit = LitScene(scene=SimpleNamespace(objects=range(2)), **dict.fromkeys(names))  # type: ignore[arg-type]
-    survey, run = SimpleNamespace(target=np.array([3, -1])), _Run(paper, other)
+    names = ("rays", "radiance", "lights", "emission", "environment")
+    lit = LitScene(
+        scene=SimpleNamespace(objects=range(2)),  # type: ignore[arg-type]
+        texels=SimpleNamespace(object_index=lambda: np.array([0, 1]), resolution=np.ones((2, 2))),  # type: ignore[arg-type]
+        **dict.fromkeys(names),  # type: ignore[arg-type]
+    )
+    shown = SimpleNamespace(texel=np.array([1, 0, 0]))
+    survey = SimpleNamespace(target=np.array([3, -1]), observations=shown)
+    run = _Run(paper, other)
 
     def fitted(options: FitOptions) -> tuple[LitScene, list[ObjectFit]]:
         return fitted_by_likelier_lobe(run, lit, None, survey, options)  # type: ignore[arg-type]
@@ -139,11 +145,11 @@ def test_the_scene_has_the_lobe_that_explains_its_views(paper: float, other: flo
 def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.MonkeyPatch):
     tried = []
 
-    def fit_lobe(samples: Any, candidates: Any, repeats: int) -> LobeEstimate:
-        tried.append(repeats)
-        return _lobe(0.05)
+    def fit_lobe(samples: Any, candidates: Any, repeats: int, known: Any) -> Any:
+        tried.append(known)
+        return _lobe(0.05), None
 
     monkeypatch.setattr(fit_views, "fit_lobe", fit_lobe)
     sampled = SampledObject(*[None] * 2, [], [], None)  # type: ignore[arg-type]
     assert list(fit_views.fit_kinds(None, sampled, [PAPER, DIELECTRIC], 0)) == [PAPER]  # type: ignore[arg-type]
-    assert tried == [1]
+    assert tried == [None]

@@ -37,10 +37,15 @@ def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.M
     before = _threads_of_blas()
     assert len(before)
     monkeypatch.setattr(fit_objects, "fit_object", _fit_that_tells_the_threads)
-    names = ("texels", "rays", "radiance", "lights", "emission", "environment")
-    lit = LitScene(scene=SimpleNamespace(objects=range(4)), **dict.fromkeys(names))  # type: ignore[arg-type]
+    names = ("rays", "radiance", "lights", "emission", "environment")
+    lit = LitScene(
+        scene=SimpleNamespace(objects=range(4)),  # type: ignore[arg-type]
+        texels=SimpleNamespace(object_index=lambda: np.arange(4), resolution=np.ones((4, 2))),  # type: ignore[arg-type]
+        **dict.fromkeys(names),  # type: ignore[arg-type]
+    )
+    survey = SimpleNamespace(observations=SimpleNamespace(texel=np.array([2, 2, 0])))
     run, options = _Run(), fit_objects.FitOptions(method="paper")
-    _, found = fit_objects.fitted_by_likelier_lobe(run, lit, None, None, options)  # type: ignore[arg-type]
+    _, found = fit_objects.fitted_by_likelier_lobe(run, lit, None, survey, options)  # type: ignore[arg-type]
     assert found[1].cost == -1  # taken from an interrupted run
     assert sorted(run.saved) == ["object-0", "object-2", "object-3"]
     for i in (0, 2, 3):

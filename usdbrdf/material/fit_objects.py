@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -42,9 +41,9 @@ from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_radiance import Mixture
 
-# Objects that are fitted together: while rays of one are traced on all cores, another is at its
+# Objects that are fitted together: while rays of one are traced on all cores, others are at their
 # algebra, which takes one.
-_AT_A_TIME = 2
+_AT_A_TIME = 3
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
 
@@ -187,8 +186,8 @@ def fitted_by_likelier_lobe(
     Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
     the model of facets, unless the paper's explains the views of all objects clearly better.
     """
-    count = len(lit.scene.objects)
-    looks: list[FirstLook | None] = [None] * count
+    sizes = _sizes(lit, survey)
+    looks: list[FirstLook | None] = [None] * len(sizes)
     kinds = [PAPER]
     if options.method == "views":
         kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
@@ -200,7 +199,7 @@ def fitted_by_likelier_lobe(
     def work(i: int) -> dict[str, Array]:
         return fit_object(lit, reader, survey, i, options, irradiance, looks[i]).arrays()
 
-    found = _of_each_object(run, "object", count, work, label="fit")
+    found = _of_each_object(run, "object", sizes, work, label="fit")
     return lit, [ObjectFit.from_arrays(one).rounded() for one in found]
 
 
@@ -220,7 +219,7 @@ def first_looks(
         lobes = fit_kinds(lit, sampled, kinds, first_seed(seed)) if sampled else {}
         return FirstLook(lobes, number).arrays()
 
-    found = _of_each_object(run, "look", len(lit.scene.objects), work, label="fit: first look")
+    found = _of_each_object(run, "look", _sizes(lit, survey), work, label="fit: first look")
     return [FirstLook.from_arrays(one) for one in found]
 
 
@@ -233,17 +232,24 @@ def _paper_explains_more(lobes: Mapping[int, LobeEstimate]) -> float:
 
 
 def _of_each_object(
-    run: TaskRun, name: str, count: int, work: Callable[[int], dict[str, Array]], label: str
+    run: TaskRun,
+    name: str,
+    sizes: Sequence[int],
+    work: Callable[[int], dict[str, Array]],
+    label: str,
 ) -> list[dict[str, Array]]:
-    """``work`` of all objects, going on where an interrupted run was."""
+    """``work`` of all objects, going on where an interrupted run was; the largest first, so that
+    none of them is worked on alone at the end."""
+    count = len(sizes)
     stored = {i: run.checkpoint_if(f"{name}-{i}") for i in range(count)}
     done = {i: found for i, found in stored.items() if found is not None}
     with (
         # With all cores for each object's small matrices BLAS's threads only wait for each other.
         threadpool_limits(limits=1, user_api="blas"),
-        ThreadPoolExecutor(max_workers=min(_AT_A_TIME, os.cpu_count() or 1)) as pool,
+        ThreadPoolExecutor(max_workers=_AT_A_TIME) as pool,
     ):
-        jobs = {pool.submit(work, i): i for i in range(count) if i not in done}
+        order = sorted(range(count), key=lambda i: -sizes[i])
+        jobs = {pool.submit(work, i): i for i in order if i not in done}
         try:
             for job in progress(as_completed(jobs), total=len(jobs), label=label, unit="objects"):
                 i, found = jobs[job], job.result()
@@ -253,6 +259,14 @@ def _of_each_object(
             for job in jobs:
                 job.cancel()
     return [done[i] for i in range(count)]
+
+
+def _sizes(lit: LitScene, survey: Survey) -> list[int]:
+    """How many observations there are of each object."""
+    texels = lit.texels
+    owner = texels.object_index()[survey.observations.texel]
+    sizes: list[int] = np.bincount(owner, minlength=len(texels.resolution)).tolist()
+    return sizes
 
 
 def _sampled(
