@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,6 +53,8 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
+# How many times as far as along another axis cameras must point up along y.
+_CLEARLY = 2.0
 _CURVES: dict[str, Curve] = {
     "PINHOLE": "perspective", "SIMPLE_PINHOLE": "perspective", "OPENCV": "perspective",
     "PERSPECTIVE": "perspective", "SIMPLE_RADIAL": "perspective", "RADIAL": "perspective",
@@ -98,6 +100,12 @@ def read(path: Path, options: IngestOptions) -> Scan:
             f"{source.name}: {unknown} of {len(records)} frames state no saturation_radiance, so "
             "clipped pixels pass for radiance. [capture.saturation]"
         )
+    up_axis = _stated(capture, "up_axis", ("Y", "Z"))
+    if up_axis is None and options.up_axis is None and (up_axis := _upright(records)) == "Y":
+        findings.warn(
+            f"{source.name}: states no up_axis, and its cameras are upright along y, not along z as "
+            "the format has it. Y is taken; say --up-axis Z if that is wrong. [capture.up-axis]"
+        )
     return scan_from_parts(
         records,
         lambda: geometry_from_file(
@@ -116,8 +124,14 @@ def read(path: Path, options: IngestOptions) -> Scan:
         encoding=encoding,
         radiometric=not photographs,
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
-        up_axis=_stated(capture, "up_axis", ("Y", "Z")) or "Z",
+        up_axis=up_axis or "Z",
     )
+
+
+def _upright(records: Sequence[FrameRecord]) -> str:
+    """The up axis: z, as nerfstudio has it, unless people held their cameras upright along y."""
+    up = np.nan_to_num(np.sum([record.world_from_camera[:3, 1] for record in records], axis=0))
+    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
 
 
 def frame_records(
