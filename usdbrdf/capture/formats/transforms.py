@@ -103,8 +103,9 @@ def read(path: Path, options: IngestOptions) -> Scan:
     up_axis = _stated(capture, "up_axis", ("Y", "Z"))
     if up_axis is None and options.up_axis is None and (up_axis := _upright(records)) == "Y":
         findings.warn(
-            f"{source.name}: states no up_axis, and its cameras are upright along y, not along z as "
-            "the format has it. Y is taken; say --up-axis Z if that is wrong. [capture.up-axis]"
+            f"{source.name}: states no up_axis, and its cameras are upright along y, not "
+            "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
+            "[capture.up-axis]"
         )
     return scan_from_parts(
         records,
