@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.scenes import edited, make_capture, rescale_images
+from tests.scenes import edited, make_capture, rescale_images, room_mesh, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.frames import read_frame
@@ -102,6 +102,25 @@ def test_applied_transform_and_scale_are_undone(capture):
             frame["transform_matrix"] = stored.tolist()
     scan = read_scan(capture.folder, IngestOptions())
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-9)
+
+
+def test_where_no_up_axis_is_stated_it_is_that_of_upright_cameras(capture):
+    from_z_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    assert read_scan(capture.folder, IngestOptions()).warnings == ()
+    points, triangles, face_object, _ = room_mesh()
+    write_ply(capture.folder / "mesh.ply", points @ from_z_up[:3, :3].T, triangles, face_object)
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = (from_z_up @ np.array(frame["transform_matrix"])).tolist()
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.up_axis == "Y"
+    assert any("--up-axis Z" in warning for warning in scan.warnings)
+    scan = read_scan(capture.folder, IngestOptions(up_axis="Z"))
+    assert (scan.up_axis, scan.warnings) == ("Z", ())
+    with edited(capture.manifest) as document:
+        document["up_axis"] = "Y"
+    scan = read_scan(capture.folder, IngestOptions())
+    assert (scan.up_axis, scan.warnings) == ("Y", ())
 
 
 @pytest.mark.fault("C2")

@@ -131,7 +131,8 @@ def read(path: Path, options: IngestOptions) -> Scan:
 
 def _upright(records: Sequence[FrameRecord]) -> str:
     """The up axis: z, as nerfstudio has it, unless people held their cameras upright along y."""
-    up = np.nan_to_num(np.sum([record.world_from_camera[:3, 1] for record in records], axis=0))
+    axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
+    up = np.nan_to_num(axes.sum(axis=0))
     return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
 
 
