@@ -31,6 +31,8 @@ SLOW = (
     "material/test_refine.py",
     "material/test_view_model.py",
     "nondestruction",
+    "page/test_browser.py",
+    "page/test_report.py",
     "physics/test_lobe_samples.py",
     "physics/test_recovery.py",
     "plugins",
