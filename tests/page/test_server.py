@@ -10,7 +10,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from usdbrdf.asset.review import read_review, review_file
+from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.page import server as server_module
 from usdbrdf.page.server import PageServer
 
 CHAIR = "/room/geo/Stuhl_No_1"
@@ -73,3 +75,20 @@ def test_an_address_that_is_taken_is_said(server, built):
     port = urlsplit(server.address).port
     with pytest.raises(EnvironmentFailure, match=r"--port\. \[view\.port\]$"):
         PageServer(built.asset, str, port)
+
+
+@pytest.mark.parametrize("browser", [True, False])
+def test_view_says_where_it_is_and_ends_with_an_interrupt(built, monkeypatch, capsys, browser):
+    opened = []
+    monkeypatch.setattr(server_module, "page_data", lambda asset, options: {})
+    monkeypatch.setattr(server_module.webbrowser, "open", opened.append)
+
+    def interrupted(_, poll_interval):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(server_module.ThreadingHTTPServer, "serve_forever", interrupted)
+    options = [] if browser else ["--no-browser"]
+    assert main(["view", str(built.asset.folder), *options]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith("http://127.0.0.1:")
+    assert opened == ([told.split(": open")[0]] if browser else [])

@@ -162,7 +162,7 @@ def nothing(values: Double) -> Double:
     return values
 
 
-def multiple_of(diffuse: Double) -> Projection:
+def multiple_of(diffuse: Float | Double) -> Projection:
     """Takes the best multiple of ``diffuse`` (P, 3), weighted like the values, off each channel."""
     square = np.maximum((diffuse * diffuse).sum(axis=0), 1e-30)
 

@@ -99,13 +99,15 @@ class PageServer:
         self.address = own + at_page
 
     def serve(self) -> None:
-        """Until ``close``, or an interrupt."""
-        self._server.serve_forever(poll_interval=0.2)
+        """Until ``close``, or an interrupt; then the address is free again."""
+        try:
+            self._server.serve_forever(poll_interval=0.2)
+        finally:
+            self._server.server_close()
 
     def close(self) -> None:
-        """Stop, from another thread than the one that serves, and free the address."""
+        """Stop, from another thread than the one that serves."""
         self._server.shutdown()
-        self._server.server_close()
 
 
 def view(
