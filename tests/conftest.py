@@ -31,6 +31,8 @@ SLOW = (
     "material/test_refine.py",
     "material/test_view_model.py",
     "nondestruction",
+    "page/test_browser.py",
+    "page/test_report.py",
     "physics/test_lobe_samples.py",
     "physics/test_recovery.py",
     "plugins",
@@ -66,6 +68,7 @@ NIGHTLY = (
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",
     "material/test_view_model.py::test_the_samples_tell_how_large_their_errors_are",
+    "page/test_report.py::test_views_that_evaluate_made_are_taken",
     "physics/test_recovery.py::"
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",

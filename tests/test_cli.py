@@ -31,6 +31,7 @@ COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 NAMES = (
     *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare", "relight"),
     *("package", "validate", "rules", "adapters", "plugin-path", "inspect", "merge-brackets"),
+    *("report", "view"),
 )
 
 
@@ -428,7 +429,7 @@ def test_rules_are_listed(capsys):
     assert main(["rules"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("usdbrdf.LookSelection (error): ") for line in lines)
-    assert all(re.match(r"[\w.:]+( \((error|warning)\))?: .+\.$", line) for line in lines)
+    assert all(re.match(r"[\w.:]+( \((error|warning|info)\))?: .+\.$", line) for line in lines)
     assert main(["rules", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert [rule["name"] for rule in listed] == [re.split(r":? ", line)[0] for line in lines]

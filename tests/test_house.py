@@ -30,7 +30,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 GROUND = {"calibration", "errors", "identity", "kernel", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
-READERS = {"delivery", "evaluation", "relighting", "validation"}
+READERS = {"delivery", "evaluation", "page", "relighting", "validation"}
 
 ARROWS: dict[str, set[str]] = {
     "errors": set(),
@@ -54,6 +54,8 @@ ARROWS: dict[str, set[str]] = {
     "pipeline": {"tasks"},
     "delivery": {"asset"},
     "evaluation": {"asset"},
+    # Shows what others measure and pack; the evidence is the method's own residual.
+    "page": {"delivery", "evaluation", "material"},
     "relighting": {"asset"},
     "validation": {"asset"},
     "cli": {"commands", "command_parser"},
@@ -113,6 +115,7 @@ OPENERS: dict[str, str] = {
     "calibration.py": "its own data",
     "identity.py": "hashes the sources",
     "kernel.py": "compiled code",
+    "page/": "the page's own parts",
     "evaluation/metrics.py": "truth comes as .npz",
     "command_parser.py": "a matrix comes as a text file",
     "validation/validate.py": "the layer of cures is an artist's file",

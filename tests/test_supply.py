@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -15,6 +16,7 @@ ALLOWED = re.compile(
 )
 # Packages whose metadata say something else, and why they may be here all the same.
 ODD = {
+    "axe-playwright-python": "MIT: its metadata name none; it brings axe-core, MPL-2.0, for tests",
     "embreex": "BSD-2-Clause: its metadata hold the text in the place of a name",
     "opencolorio": "BSD-3-Clause: its metadata hold the text in the place of a name",
     "pymeshlab": "GPL-3: arrays are exchanged with a process of its own; README, Licences",
@@ -102,3 +104,21 @@ def test_the_hashed_constraints_are_the_same():
 def test_constraints_and_hashes_name_no_place():
     for file in ROOT.glob("*.txt"):
         assert not re.search(r"://|--(extra-)?index|--find-links", file.read_text()), file.name
+
+
+def test_what_browsers_are_given_is_pinned_and_small():
+    static, web = ROOT / "usdbrdf/page/static", ROOT / "web"
+    packages = json.loads((web / "package-lock.json").read_text("utf-8"))["packages"]
+    wanted = json.loads((web / "package.json").read_text("utf-8"))["devDependencies"]
+    assert all(re.fullmatch(r"[\d.]+", version) for version in wanted.values())
+    assert not any("resolved" in package for package in packages.values())
+    three = packages["node_modules/three"]
+    assert (three["version"], three["license"]) == (wanted["three"], "MIT")
+    bundle = (static / "room.bundle.js").read_bytes()
+    assert len(bundle) <= 1_500_000
+    # three.js writes the release that it is of into the scene.
+    assert f'"{three["version"].split(".")[1]}"'.encode() in bundle
+    licence = (static / "room.bundle.LICENCE.txt").read_text("utf-8")
+    assert licence.startswith(f"three.js {three['version']}\n")
+    assert "The MIT License" in licence
+    assert "three.js authors" in licence

@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from usdbrdf.options import Insert as Insert
     from usdbrdf.options import PackageOptions as PackageOptions
     from usdbrdf.options import RelightOptions as RelightOptions
+    from usdbrdf.options import ReportOptions as ReportOptions
     from usdbrdf.options import Sampling as Sampling
     from usdbrdf.options import ShadeOptions as ShadeOptions
     from usdbrdf.options import TextureOptions as TextureOptions
+    from usdbrdf.page.report import report as report
     from usdbrdf.pipeline import convert as convert
     from usdbrdf.pipeline import fit as fit
     from usdbrdf.pipeline import ingest as ingest
@@ -39,12 +41,14 @@ if TYPE_CHECKING:
 _HOMES = {
     "usdbrdf.options": (
         *("ConvertOptions", "EvaluateOptions", "FitOptions", "IngestOptions", "Insert"),
-        *("PackageOptions", "RelightOptions", "Sampling", "ShadeOptions", "TextureOptions"),
+        *("PackageOptions", "RelightOptions", "ReportOptions", "Sampling"),
+        *("ShadeOptions", "TextureOptions"),
     ),
     "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
     "usdbrdf.delivery.package": ("package",),
     "usdbrdf.evaluation.compare_assets": ("compare",),
     "usdbrdf.evaluation.evaluate_views": ("evaluate",),
+    "usdbrdf.page.report": ("report",),
     "usdbrdf.relighting.relight": ("relight",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -53,6 +53,7 @@ class _Run(_Talking):
     def report(self, results: Mapping[str, TaskResult], folder: Path) -> int:
         """What the tasks found, with the root layer, whose name only a finished ingest knows."""
         from usdbrdf.asset.layout import Asset
+        from usdbrdf.asset.review import notes_for_run
 
         root = Asset.at(folder).root_layer
         steps = {
@@ -63,7 +64,10 @@ class _Run(_Talking):
         if steps.get("ingest", {}).get("radiometric") is False:
             doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
             lines = [f"warning: {doubt}", *lines]
-        status = self.told({"asset": str(root), "steps": steps}, *lines)
+        notes = notes_for_run(Asset.at(folder)) if any(r.reran for r in results.values()) else []
+        lines += [f"review.usda: {note}" for note in notes]
+        known = {"review": notes} if notes else {}
+        status = self.told({"asset": str(root), "steps": steps, **known}, *lines)
         doubts = sum(len(result.summary.get("warnings", ())) for result in results.values())
         if self.strict and doubts:
             tell(f"usdbrdf: done, with {doubts} warnings, which --strict counts. [quality.strict]")
@@ -275,6 +279,36 @@ class Package(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
+class Report(_WithAsset):
+    """Write one HTML page on which people see whether to believe the asset."""
+
+    output: Path = option("-o --output FILE", REQUIRED)
+    ".html, complete in itself; replaced if it is there"
+    options: options.ReportOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.page.report import report
+        summary = report(self.asset, self.output, self.options)
+        return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
+
+
+class View(_WithAsset):
+    """Serve that page on this machine alone, where verdicts are saved into ASSET/review.usda."""
+
+    port: int = option("--port N", 0, (0, 65535), unset="any that is free")
+    "of 127.0.0.1"
+    browser: bool = option("--no-browser", True)
+    "print the address, open nothing"
+    options: options.ReportOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.page.server import view
+        view(self.asset, self.options, port=self.port, browser=self.browser)
+        return 0
+
+
 class Validate(Command):
     """Check an asset by our rules and those of USD."""
 
@@ -359,6 +393,8 @@ _OTHERS = (
     Compare,
     Relight,
     Package,
+    Report,
+    View,
     Validate,
     Rules,
     Adapters,

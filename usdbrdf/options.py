@@ -477,3 +477,24 @@ class PackageOptions(Options):
     "the look that is packed"
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
+
+
+class ReportOptions(Options):
+    """What the page of an asset shows."""
+
+    views: Path | None = option(
+        "--views FILE", None, unset="8 of the capture's frames, spread evenly", file=True
+    )
+    "nerfstudio document (transforms.json) of the views that are shown beside their photographs"
+    evaluation: Path | None = option("--evaluation FOLDER", None, unset="none")
+    "folder that evaluate wrote for this asset: its views and figures are taken, none is rendered"
+    photographs: bool = option("--no-photographs", True)
+    "leave all photographs out, and what they look like beside the model's pictures"
+    environment: Surroundings = _environment()
+    seed: int = _seed()
+    allow_outside: tuple[Path, ...] = _allow_outside()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.views is not None and self.evaluation is not None:
+            raise UsageError("--views, --evaluation: they exclude each other. [usage.option]")

@@ -15,7 +15,14 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files import images
-from usdbrdf.files.images import image_size, read_exr, read_radiance, write_exr, write_preview_png
+from usdbrdf.files.images import (
+    encoded_jpeg,
+    image_size,
+    read_exr,
+    read_radiance,
+    write_exr,
+    write_preview_png,
+)
 
 
 @pytest.fixture
@@ -524,3 +531,18 @@ def test_decompression_bomb_is_refused_before_it_is_decoded(tmp_path, side):
     for read in (read_radiance, image_size):
         with pytest.raises(ImageRefused):
             read(tmp_path / "a.png")
+
+
+def test_a_jpeg_for_people_has_no_metadata_and_is_the_picture(tmp_path):
+    ramp = np.linspace(0, 255, 64, dtype=np.uint8)
+    picture = np.stack(np.broadcast_arrays(ramp[None, :], ramp[:48, None], np.uint8(90)), axis=-1)
+    content = encoded_jpeg(np.ascontiguousarray(picture), 90)
+    kinds, position = [], 2
+    while content[position + 1] != 0xDA:
+        kinds.append(content[position + 1])
+        position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+    # Tables, frame header and JFIF's own segment: no other application's, no comment.
+    assert set(kinds) <= {0xE0, 0xDB, 0xC0, 0xC2, 0xC4, 0xDD}
+    (tmp_path / "picture.jpg").write_bytes(content)
+    assert np.abs(read_radiance(tmp_path / "picture.jpg") * 255 - picture).mean() < 2
+    assert encoded_jpeg(np.ascontiguousarray(picture), 90) == content

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
 import pytest
 
-from usdbrdf.material.fit_target import GridFit, fit_grid, multiple_of, nothing
+from usdbrdf.material.fit_target import (
+    FrameSamples,
+    GridFit,
+    fit_grid,
+    multiple_of,
+    nothing,
+    relative_costs,
+)
 
 PIXELS = 300
 Residual = Literal["paper", "scaled"]
@@ -156,3 +164,22 @@ def test_two_levels_ask_for_at_most_twenty_two_roughnesses():
     assert set(np.round(np.linspace(0, 1, 11), 12)) <= {round(phi, 12) for phi in asked}
     assert min(asked) >= 0
     assert max(asked) <= 1
+
+
+def test_relative_costs_are_least_at_the_lobe_that_made_the_pixels():
+    diffuse, basis = _scene()
+    phis, psis = [0.1, 0.3, 0.5], [0.0, 0.2, 0.4, 0.6]
+
+    def of_phis(kind, some):
+        assert kind == 2
+        pairs = [basis(phi) for phi in some]
+        return tuple(np.stack(parts, axis=-1) for parts in zip(*pairs, strict=True))
+
+    base, slope = basis(0.3)
+    observed = 1.1 * diffuse + base + np.float32(0.4) * slope
+    samples = FrameSamples(observed, diffuse, np.ones(PIXELS, np.float32), of_phis)
+    costs = relative_costs(SimpleNamespace(lobe=2), samples, phis, psis)
+    assert np.unravel_index(costs.argmin(), costs.shape) == (1, 2)
+    assert costs[1, 2] == pytest.approx(0, abs=1e-9)
+    assert costs.shape == (3, 4)
+    assert costs[0, 0] > 0.05

@@ -188,6 +188,32 @@ def lamp_that_glows_beside_its_lights(built):
     opinion(built, "/room/mtl/lamp/EmissionTexture", "inputs:scale", Types.Float4, Gf.Vec4f(0.5))
 
 
+def said_in_a_review(built, **said):
+    """review.usda as a person may have written it by hand."""
+    (built.asset.folder / "review.usda").write_text('#usda 1.0\n(defaultPrim = "room")\n')
+    with edited(built.asset.folder / "review.usda") as layer:
+        Sdf.CreatePrimInLayer(layer, CHAIR).customData = {"usdbrdf": {"review": said}}
+
+
+def verdict_of_another_word(built):
+    said_in_a_review(built, verdict="perhaps", **seen_of_chair(built))
+
+
+def chair_that_was_rejected(built):
+    said_in_a_review(built, verdict="reject", comment="too\ngreen", **seen_of_chair(built))
+
+
+def chair_that_was_judged_with_other_numbers(built):
+    said_in_a_review(built, verdict="accept", **{**seen_of_chair(built), "phi": 0.99})
+
+
+def seen_of_chair(built):
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    prim = stage.GetPrimAtPath(CHAIR)
+    names = ("status", "phi", "psi")
+    return {name: prim.GetAttribute(f"usdBrdf:fit:{name}").Get() for name in names}
+
+
 FAULTS = {
     "LayerMissing": edits_layer_deleted,
     "LayerOrder": edits_below_the_measurement,
@@ -220,4 +246,7 @@ FAULTS = {
     "LookSelection": look_that_is_not_there,
     "LightsSelection": lights_that_are_not_there,
     "LampTwice": lamp_that_glows_beside_its_lights,
+    "ReviewRecord": verdict_of_another_word,
+    "ReviewRejected": chair_that_was_rejected,
+    "ReviewOutdated": chair_that_was_judged_with_other_numbers,
 }

@@ -28,6 +28,7 @@ from usdbrdf.files.images import resized
 from usdbrdf.model.arrays import Byte, Float
 from usdbrdf.model.material import Material, Surface
 
+PRIM = "usdPrim"  # of a node: the path of the prim that it was
 IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
 _WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
 _LINEAR, _LINEAR_MIPMAP = 9729, 9987
@@ -67,17 +68,21 @@ def write_glb(
         )
     scene = trimesh.Scene()
     materials: dict[str, GltfMaterial] = {}
+    paths: dict[str, str] = {}
     for surface in surfaces:
         stem = name = surface.name.rsplit("/", 1)[-1]
         number = 2
         while name in materials:
             name, number = f"{stem}_{number}", number + 1
         materials[name] = gltf_material(surface, max_size, warn)
+        paths[name] = surface.name
         pictures = {key: Image.fromarray(p) for key, p in materials[name].pictures.items()}
         dressed = _NamedMaterial(name=name, **pictures)
         scene.add_geometry(_mesh(surface, dressed), geom_name=name, node_name=name)
     content = export_glb(
-        scene, include_normals=True, tree_postprocessor=partial(_finish, materials=materials)
+        scene,
+        include_normals=True,
+        tree_postprocessor=partial(_finish, materials=materials, paths=paths),
     )
     with temporary_beside(output) as staged:
         staged.write_bytes(content)
@@ -171,8 +176,14 @@ class _NamedMaterial(PBRMaterial):  # type: ignore[misc]
         return hash(self.name)
 
 
-def _finish(tree: dict[str, Any], *, materials: dict[str, GltfMaterial]) -> None:
-    """Everything of the materials but the places of their textures, and samplers."""
+def _finish(
+    tree: dict[str, Any], *, materials: dict[str, GltfMaterial], paths: dict[str, str]
+) -> None:
+    """Everything of the materials but the places of their textures, and samplers; and of the nodes
+    which prims they were."""
+    for node in tree["nodes"]:
+        if node.get("name") in paths:
+            node["extras"] = {PRIM: paths[node["name"]]}
     used: set[str] = set()
     samplers: list[dict[str, int]] = []
     for stored in tree["materials"]:

@@ -9,7 +9,7 @@ full       I = diffuse + I_nd(phi, psi)     one specular bounce of the lit textu
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -120,17 +120,48 @@ def exposure_of_views(frames: Frames) -> float:
 def score_views(
     folder: Path, seen: ViewedAsset, views: Views, exposure: float, options: EvaluateOptions
 ) -> list[report.Row]:
-    """A row per view; a sheet per view and FLIP maps per model are written to ``folder``.
+    """A row per view; a sheet per view and FLIP maps per model are written to ``folder``."""
+    folder.mkdir()
+    rows: list[report.Row] = []
+    for view in scored_views(seen, views, exposure, options):
+        rows.append(view.row)
+        _write_pictures(folder, view)
+    return rows
 
-    Rows hold, per model, relative L2 without lamps, with them, and without them after radiance
+
+@dataclass(frozen=True, kw_only=True)
+class ScoredView:
+    """A view beside its photograph: a row of figures, display pictures in [0, 1] of the photograph
+    and, by the models' names, of both models, (H, W, 3), the pixels that count, (H, W), and FLIP's
+    maps (H, W) of both models.
+
+    The row holds, per model, relative L2 without lamps, with them, and without them after radiance
     that is shown white is cut off; PSNR and mean FLIP of the display pictures; and the shares of
     pixels that are compared and that show a lamp. A pixel counts if the photograph knows it in
     every channel and all of it shows the asset; what does not count is made equal to the
     photograph before FLIP. Infinite PSNR (equal pictures) is None.
     """
-    folder.mkdir()
-    rows: list[report.Row] = []
-    for batch in _batches(seen, views, exposure, options):
+
+    row: report.Row
+    reference: Float
+    shown: dict[str, Float]
+    counted: Bool
+    errors: dict[str, Float]
+
+
+def scored_views(
+    seen: ViewedAsset,
+    views: Views,
+    exposure: float,
+    options: EvaluateOptions,
+    widths: Sequence[int] = (),
+) -> Iterator[ScoredView]:
+    """All views in their order.
+
+    widths  of the pictures that are compared, in pixels: larger photographs are reduced; () for
+            the photographs' own
+    """
+    for batch in _batches(seen, views, exposure, options, widths):
         pairs = [
             metrics.Pair(view.reference, view.shown[model]) for view in batch for model in MODELS
         ]
@@ -142,30 +173,25 @@ def score_views(
                 values = errors[model][view.counted]
                 mean = values.mean(dtype=np.float64) if values.size else np.nan
                 row[f"flip_{model}"] = metrics.finite(mean)
-            rows.append(row)
-            _write_pictures(folder, view, errors)
-    return rows
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Scored:
-    """A view that waits for FLIP: its row without it, display pictures in [0, 1], the pixels that
-    count."""
-
-    row: report.Row
-    reference: Float
-    shown: dict[str, Float]
-    counted: Bool
+            yield replace(view, row=row, errors=errors)
 
 
 def _batches(
-    seen: ViewedAsset, views: Views, exposure: float, options: EvaluateOptions
-) -> Iterator[list[_Scored]]:
-    waiting: list[_Scored] = []
+    seen: ViewedAsset,
+    views: Views,
+    exposure: float,
+    options: EvaluateOptions,
+    widths: Sequence[int],
+) -> Iterator[list[ScoredView]]:
+    """Views that wait for FLIP."""
+    waiting: list[ScoredView] = []
     frames = views.frames
     for i in progress(range(len(frames)), total=len(frames), label="evaluate", unit="views"):
-        predicted = predict_view(seen, frames.camera(i), options, options.seed + (i << 16))
-        photograph = read_frame(frames, i)
+        camera, photograph = frames.camera(i), read_frame(frames, i)
+        if widths and widths[i] < camera.width:
+            camera = camera.at_width(widths[i])
+            photograph = photograph.at_size(camera.width, camera.height)
+        predicted = predict_view(seen, camera, options, options.seed + (i << 16))
         counted = photograph.valid & predicted.surface
         measured = photograph.radiance
         reference = to_display_srgb(np.nan_to_num(measured), exposure_scale=exposure)
@@ -185,7 +211,9 @@ def _batches(
             shown[model] = np.where(counted[..., None], display, reference)
         row["compared"] = metrics.finite(counted.mean())
         row["lamps"] = metrics.finite(predicted.lamp.mean())
-        waiting.append(_Scored(row=row, reference=reference, shown=shown, counted=counted))
+        waiting.append(
+            ScoredView(row=row, reference=reference, shown=shown, counted=counted, errors={})
+        )
         if sum(scored.counted.size for scored in waiting) >= _WAITING_PIXELS:
             yield waiting
             waiting = []
@@ -193,16 +221,16 @@ def _batches(
         yield waiting
 
 
-def _write_pictures(folder: Path, view: _Scored, errors: dict[str, Float]) -> None:
+def _write_pictures(folder: Path, view: ScoredView) -> None:
     """NAME.png: photograph, baseline, full above what changed and their FLIP maps; and the maps."""
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(view.row["view"]).stem)[:80]
     name = f"{view.row['number']:04d}_{stem}"
-    maps = {model: report.magma(errors[model], view.counted) for model in MODELS}
+    maps = {model: report.magma(view.errors[model], view.counted) for model in MODELS}
     for model, picture in maps.items():
         write_preview_png(folder / f"{name}.flip_{model}.png", picture)
     displayed = (view.reference, *(view.shown[model] for model in MODELS))
     above = [(picture * 255 + 0.5).astype(np.uint8) for picture in displayed]
-    changed = report.change(errors["baseline"], errors["full"], view.counted)
+    changed = report.change(view.errors["baseline"], view.errors["full"], view.counted)
     write_preview_png(folder / f"{name}.png", report.sheet([above, [changed, *maps.values()]]))
 
 

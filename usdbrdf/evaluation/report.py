@@ -140,6 +140,16 @@ def sheet(rows: Sequence[Sequence[Byte]]) -> Byte:
     return whole
 
 
+def parts_of_sheet(whole: Float, rows: int, columns: int) -> list[Float]:
+    """The pictures of a ``sheet``, row by row."""
+    height = (whole.shape[0] + _GAP) // rows - _GAP
+    width = (whole.shape[1] + _GAP) // columns - _GAP
+    corners = [
+        (j * (height + _GAP), i * (width + _GAP)) for j in range(rows) for i in range(columns)
+    ]
+    return [whole[top : top + height, left : left + width] for top, left in corners]
+
+
 def write_plot(path: Path, rows: Sequence[Row]) -> None:
     """Panels of L2 and FLIP over the rows ``l2_baseline``, ``l2_full``, ... as PNG.
 

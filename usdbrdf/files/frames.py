@@ -12,7 +12,7 @@ from threading import Lock
 import numpy as np
 
 from usdbrdf.files.colour import to_working_space
-from usdbrdf.files.images import read_radiance
+from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
 
@@ -25,6 +25,8 @@ _READERS, _AHEAD = 2, 3
 _BYTES_OF_PIXEL = 16
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
+# What a filter leaves of nothing.
+_ANY = 1e-4
 
 
 # An 8-bit photograph near its ends tells that a channel is bright or dark, not how much: JPEG
@@ -52,6 +54,37 @@ class FramePixels:
     dark: Bool
     unknown: Bool
     num_clamped: int
+
+    def window(self, left: int, top: int, right: int, bottom: int) -> FramePixels:
+        """The pixels of a rectangle; right and bottom are the first beyond it."""
+        part = slice(top, bottom), slice(left, right)
+        return FramePixels(
+            radiance=self.radiance[part],
+            valid=self.valid[part],
+            clipped=self.clipped[part],
+            dark=self.dark[part],
+            unknown=self.unknown[part],
+            num_clamped=self.num_clamped,
+        )
+
+    def at_size(self, width: int, height: int) -> FramePixels:
+        """Smaller, each pixel the mean of what is known of those that it covers: valid only if all
+        of them are, clipped, dark or unknown if any is."""
+        if self.valid.shape == (height, width):
+            return self
+        masks = np.stack([~self.valid, self.clipped, self.dark, self.unknown], axis=-1)
+        some = resized(masks.astype(np.float32), width, height) > _ANY
+        weight = resized((~self.unknown)[..., None].astype(np.float32), width, height)
+        total = resized(np.nan_to_num(self.radiance), width, height)
+        radiance = np.where(weight > _ANY, total / np.maximum(weight, _ANY), np.float32(np.nan))
+        return FramePixels(
+            radiance=radiance.astype(np.float32),
+            valid=~some[..., 0],
+            clipped=some[..., 1],
+            dark=some[..., 2],
+            unknown=some[..., 3],
+            num_clamped=self.num_clamped,
+        )
 
 
 def read_frame(frames: Frames, i: int) -> FramePixels:

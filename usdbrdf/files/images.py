@@ -14,6 +14,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -168,16 +169,49 @@ def resized(pixels: Float, width: int, height: int) -> Float:
 
 def write_preview_png(path: Path, rgb8: Byte) -> None:
     """Write an 8-bit sRGB picture, (H, W, 3) uint8, for people to look at."""
-    if rgb8.dtype != np.uint8 or rgb8.ndim != 3 or rgb8.shape[2] != 3 or not rgb8.size:
-        raise UsdBrdfError(
-            f"{path}: {rgb8.dtype} {rgb8.shape=} is not (H, W, 3) uint8. [image.write]"
-        )
-    spec = oiio.ImageSpec(rgb8.shape[1], rgb8.shape[0], 3, "uint8")
+    spec = _spec_of_preview(path, rgb8)
     spec.attribute("DateTime", _PINNED_DATE)
     spec.set_colorspace("srgb_rec709_scene")
     with temporary_beside(path) as staged:
         _write(path, staged, spec, np.ascontiguousarray(rgb8))
         publish(staged, path)
+
+
+def encoded_jpeg(rgb8: Byte, quality: int) -> bytes:
+    """An 8-bit sRGB picture, (H, W, 3) uint8, as JPEG without any metadata, EXIF among them.
+
+    quality  1 to 100
+    """
+    with TemporaryDirectory(prefix="usdbrdf-picture-") as folder:
+        path = Path(folder) / "picture.jpg"
+        spec = _spec_of_preview(path, rgb8)
+        spec.attribute("Compression", f"jpeg:{quality}")
+        _write(path, path, spec, np.ascontiguousarray(rgb8))
+        content = path.read_bytes()
+    kept, position = content[:2], 2
+    for kind, end in _segments_of_jpeg(content):
+        # Applications' segments, but for JFIF's, and comments.
+        if not (0xE1 <= kind <= 0xEF or kind == 0xFE):
+            kept += content[position:end]
+        position = end
+    return kept + content[position:]
+
+
+def _segments_of_jpeg(content: bytes) -> Iterator[tuple[int, int]]:
+    """Kind and end of each segment before the first scan."""
+    position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
+    while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
+        kind = content[position + 1]
+        position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+        yield kind, position
+
+
+def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
+    if rgb8.dtype != np.uint8 or rgb8.ndim != 3 or rgb8.shape[2] != 3 or not rgb8.size:
+        raise UsdBrdfError(
+            f"{path}: {rgb8.dtype} {rgb8.shape=} is not (H, W, 3) uint8. [image.write]"
+        )
+    return oiio.ImageSpec(rgb8.shape[1], rgb8.shape[0], 3, "uint8")
 
 
 def _open(path: Path, max_side: int) -> Any:
@@ -292,9 +326,7 @@ def _pixels(path: Path, source: Any) -> Float:
         # The decoder paints what is missing grey and only warns; look for the end mark. It is
         # searched after the first scan starts: a thumbnail in the header has one of its own.
         content = path.read_bytes()
-        position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
-        while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
-            position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
+        position = max((end for _, end in _segments_of_jpeg(content)), default=2)
         if content.find(b"\xff\xd9", position) < 0:
             raise ImageRefused(
                 f"{path}: truncated (no end-of-image mark). Copy or export it again. "

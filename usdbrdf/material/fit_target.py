@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -162,7 +162,7 @@ def nothing(values: Double) -> Double:
     return values
 
 
-def multiple_of(diffuse: Double) -> Projection:
+def multiple_of(diffuse: Float | Double) -> Projection:
     """Takes the best multiple of ``diffuse`` (P, 3), weighted like the values, off each channel."""
     square = np.maximum((diffuse * diffuse).sum(axis=0), 1e-30)
 
@@ -195,10 +195,28 @@ _SUB_PIXEL = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
 MIN_PIXELS = calibration.count("fit_of_frame.min_pixels")
 
 
-def fit_target_frame(
-    lit: LitScene, view: View, index: int, residual: Residual, max_pixels: int, seed: int
-) -> tuple[GridFit | None, int]:
-    """Fit object ``index`` in its target frame: (fit, number of pixels), fit None if too few.
+class FrameSamples(NamedTuple):
+    """P pixels of one object in a frame: what they show, and how much of it is diffuse, (P, 3)
+    radiance each; how many pixels each stands for, (P,); and the basis of what its lobe adds, see
+    ``lobe_basis``: kind of lobe, roughnesses (Q,) -> (base, slope), (P, 3, Q) each."""
+
+    observed: Float
+    diffuse: Float
+    stands_for: Float
+    of_phis: Callable[[int, Sequence[float]], tuple[Float, Float]]
+
+    def weight(self) -> Float:
+        """(P, 1), of squared residuals: errors of L_d and of the frame grow with the radiance; the
+        floor keeps the noise of dark pixels small."""
+        level = self.diffuse.mean(axis=1, keepdims=True)
+        floor = max(0.1 * float(np.median(level)), 1e-30)
+        return np.asarray(1 / (level + floor) ** 2, np.float32)
+
+
+def frame_samples(
+    lit: LitScene, view: View, index: int, max_pixels: int, seed: int
+) -> tuple[FrameSamples | None, int]:
+    """At most ``max_pixels`` of object ``index``, and their number; None if they are too few.
 
     Each pixel is the mean of 2 x 2 surface points with 52 rays each, traced once for all
     roughnesses.
@@ -215,22 +233,52 @@ def fit_target_frame(
     chosen, stands_for = chosen[whole], stands_for[whole]
     if len(chosen) < MIN_PIXELS:
         return None, len(chosen)
-    of_phis = lobe_basis(lit, points, len(chosen), seed)
-
-    def basis(phi: float) -> tuple[Float, Float]:
-        base, slope = of_phis(PAPER, [phi])
-        return base[..., 0], slope[..., 0]
-
     diffuse = lit.radiance.at(points.face, points.u, points.v)
     diffuse = diffuse.reshape(len(chosen), -1, 3).mean(axis=1)
     observed = view.radiance.reshape(-1, 3)[chosen]
+    of_phis = lobe_basis(lit, points, len(chosen), seed)
+    return FrameSamples(observed, diffuse, stands_for, of_phis), len(chosen)
+
+
+def fit_target_frame(
+    lit: LitScene, view: View, index: int, residual: Residual, max_pixels: int, seed: int
+) -> tuple[GridFit | None, int]:
+    """Fit object ``index`` in its target frame: (fit, number of pixels), fit None if too few."""
+    samples, number = frame_samples(lit, view, index, max_pixels, seed)
+    if samples is None:
+        return None, number
+
+    def basis(phi: float) -> tuple[Float, Float]:
+        base, slope = samples.of_phis(PAPER, [phi])
+        return base[..., 0], slope[..., 0]
+
+    observed, diffuse = samples.observed, samples.diffuse
     if residual == "paper":
         # The paper sums over all pixels alike; what was left out is stood for by what was taken.
+        stands_for = samples.stands_for
         weight = (stands_for / max(float(stands_for.mean()), 1e-12))[:, None]
-        return fit_grid(observed - diffuse, weight, basis, nothing), len(chosen)
-    # Highlights count for more than their share of pixels. Errors of L_d and of the frame grow with
-    # the radiance; the floor keeps the noise of dark pixels small.
-    level = diffuse.mean(axis=1, keepdims=True)
-    floor = max(0.1 * float(np.median(level)), 1e-30)
-    weight = (1 / (level + floor) ** 2).astype(np.float32)
-    return fit_grid(observed, weight, basis, multiple_of(diffuse * np.sqrt(weight))), len(chosen)
+        return fit_grid(observed - diffuse, weight, basis, nothing), number
+    # Highlights count for more than their share of pixels.
+    weight = samples.weight()
+    return fit_grid(observed, weight, basis, multiple_of(diffuse * np.sqrt(weight))), number
+
+
+def relative_costs(
+    lit: LitScene, samples: FrameSamples, phis: Sequence[float], psis: Sequence[float]
+) -> Double:
+    """(Q, R): what lobes of the scene's kind with roughnesses ``phis`` (Q,) and speculars ``psis``
+    (R,) leave unexplained of a frame, residuals as of "scaled", relative to no lobe at all."""
+    root = np.sqrt(samples.weight()).astype(np.float64)
+    without_diffuse = multiple_of(samples.diffuse.astype(np.float64) * root)
+    target = without_diffuse(samples.observed * root)
+    bases, slopes = samples.of_phis(lit.lobe, phis)
+    # Where the diffuse light explains all but rounding, there is nothing for a lobe to explain.
+    whole = float(((samples.observed * root) ** 2).sum())
+    alone = max(float((target * target).sum()), 1e-9 * whole, 1e-30)
+    costs = np.empty((len(phis), len(psis)))
+    for k in range(len(phis)):
+        rest = target - without_diffuse(bases[..., k] * root)
+        slope = without_diffuse(slopes[..., k] * root)
+        terms = (rest * rest).sum(), (slope * rest).sum(), (slope * slope).sum()
+        costs[k] = [terms[0] - 2 * psi * terms[1] + psi**2 * terms[2] for psi in psis]
+    return costs / alone

@@ -18,7 +18,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
-from usdbrdf.validation import file_rules, material_rules, record_rules, variant_rules
+from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
 from usdbrdf.validation.rule import (
     PREFIX,
     AssetStage,
@@ -33,7 +33,7 @@ from usdbrdf.validation.rule import (
 # In the order of the modules, and there in that of the text.
 RULES: tuple[Rule, ...] = tuple(
     each
-    for module in (file_rules, record_rules, material_rules, variant_rules)
+    for module in (file_rules, record_rules, material_rules, variant_rules, review_rules)
     for each in vars(module).values()
     if isinstance(each, Rule)
 )

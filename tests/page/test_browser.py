@@ -1,0 +1,205 @@
+"""The page in a real browser: every part is there and works, by mouse, keys and screen reader."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+
+import pytest
+
+from tests.page.conftest import data_of
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.review import read_review
+from usdbrdf.page.report import page, reviewed
+from usdbrdf.page.server import PageServer
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs usdbrdf[browser]")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium (Debian: apt install)")
+SOFTWARE_3D = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_3D]
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium):
+    """opened(address, **context's) -> a page that is ready; what went wrong is in ``page.faults``,
+    what it asked for elsewhere in ``page.asked``."""
+    contexts = []
+
+    def open_page(address, script="", **options):
+        context = chromium.new_context(accept_downloads=True, **options)
+        contexts.append(context)
+        shown = context.new_page()
+        shown.faults, shown.asked = [], []
+        shown.on("pageerror", lambda error: shown.faults.append(str(error)))
+        shown.on(
+            "console", lambda said: shown.faults.append(said.text) if said.type == "error" else None
+        )
+        shown.on("request", lambda request: shown.asked.append(request.url))
+        if script:
+            shown.add_init_script(script)
+        shown.goto(address)
+        shown.wait_for_selector("body[data-ready=yes]", timeout=60_000)
+        return shown
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+def test_all_parts_are_there_and_nothing_is_asked_of_others(opened, page_file):
+    data = data_of(page_file.read_text("utf-8"))
+    shown = opened(page_file.as_uri())
+    assert shown.locator("#table tbody tr:not(.detail)").count() == len(data["objects"])
+    assert shown.locator("#map circle").count() == data["capture"]["frames"]
+    assert shown.locator("#plots svg").count() == 2
+    assert shown.locator("#map-name option").count() == len(data["maps"])
+    assert shown.locator("#carries li").count() >= 4
+    assert shown.locator("#room-body").get_attribute("data-state") == "model"
+    broken = "[...document.images].filter(i => i.src && !i.naturalWidth).length"
+    assert shown.evaluate(broken) == 0
+    assert shown.faults == []
+    elsewhere = [url for url in shown.asked if not url.startswith(("data:", "blob:"))]
+    assert elsewhere == [page_file.as_uri()]
+
+
+def test_objects_are_sorted_filtered_and_opened_by_keys(opened, page_file):
+    objects = data_of(page_file.read_text("utf-8"))["objects"]
+    shown = opened(page_file.as_uri())
+    heading = shown.get_by_role("columnheader", name="Roughness").get_by_role("button")
+    heading.press("Enter")
+    assert shown.locator("th[aria-sort=ascending]").inner_text().startswith("Roughness")
+    order = shown.locator("#table tbody tr:not(.detail)").evaluate_all(
+        "rows => rows.map(row => row.dataset.prim)"
+    )
+    phi = {row["prim"]: 9 if row["phi"] is None else row["phi"] for row in objects}
+    assert [phi[prim] for prim in order] == sorted(phi.values())
+    shown.get_by_label("Name contains").fill(objects[0]["label"])
+    assert shown.locator("#count").inner_text().endswith(f"of {len(objects)} objects")
+    name = shown.get_by_role("button", name=objects[0]["label"], exact=True)
+    name.press("Enter")
+    assert name.get_attribute("aria-expanded") == "true"
+    detail = shown.locator(f"#{name.get_attribute('aria-controls')}")
+    assert objects[0]["prim"] in detail.inner_text()
+    assert detail.locator("img").count() == 2
+
+
+def test_the_slider_moves_over_the_views(opened, page_file):
+    shown = opened(page_file.as_uri())
+    slider, compared = shown.locator("#at"), shown.locator(".compare")
+    before = shown.locator(".compare .over").bounding_box()
+    slider.focus()
+    for _ in range(10):
+        slider.press("ArrowLeft")
+    assert compared.evaluate("x => x.style.getPropertyValue('--at')") == "40%"
+    clip = shown.locator(".compare .over").evaluate("x => getComputedStyle(x).clipPath")
+    assert "60%" in clip
+    first = shown.locator(".compare img").first.get_attribute("src")
+    shown.get_by_role("button", name="next").click()
+    assert shown.locator(".compare img").first.get_attribute("src") != first
+    shown.get_by_role("combobox", name=re.compile("^Left")).select_option("baseline")
+    assert shown.locator(".compare .tag.left").inner_text() == "diffuse baseline"
+    assert before["width"] > 100
+
+
+def test_picking_tells_the_numbers_of_what_is_picked(opened, page_file):
+    objects = {row["prim"]: row for row in data_of(page_file.read_text("utf-8"))["objects"]}
+    shown = opened(page_file.as_uri())
+    canvas, picked = shown.locator("canvas"), {}
+    for prim in objects:
+        shown.evaluate("prim => usdbrdfModel.look(prim)", prim)
+        canvas.press("Enter")
+        found = picked[prim] = canvas.get_attribute("data-picked")
+        row, text = objects[found], shown.locator(".picked").inner_text()
+        assert row["label"] in text
+        assert row["status"] == "lamp" or f"{row['phi']:.2f}" in text
+    # Nothing stands between the box and where one stands first; the middle of the walls is air.
+    box = next(prim for prim, row in objects.items() if row["label"] == "box")
+    assert picked[box] == box
+    assert len(set(picked.values())) >= 2
+    for look in ("lit", "base_color", "phi", "psi", "status", "verdict", "shaded"):
+        shown.locator("#look").select_option(look)
+    shown.get_by_role("group", name="Captured lamps").get_by_role("checkbox").first.uncheck()
+    shown.get_by_label("strength").fill("1.5")
+    shown.wait_for_timeout(300)
+    assert shown.faults == []
+
+
+def test_without_webgl_there_are_pictures(opened, page_file):
+    shown = opened(
+        page_file.as_uri(), script="HTMLCanvasElement.prototype.getContext = () => null;"
+    )
+    assert shown.locator("#room-body").get_attribute("data-state") == "pictures"
+    assert shown.locator("#room-body img").count() > 0
+    assert shown.faults == []
+
+
+def judge(shown, label, words):
+    shown.get_by_role("button", name=label, exact=True).click()
+    group = shown.get_by_role("group", name=f"Your verdict on {label}")
+    group.get_by_label("accept").check()
+    group.get_by_label("Comment").fill(words)
+    group.get_by_label("For the next run").select_option("refit")
+
+
+def test_a_verdict_of_a_file_is_handed_over_as_a_layer(opened, page_file, room, tmp_path):
+    row = next(r for r in data_of(page_file.read_text("utf-8"))["objects"] if r["phi"] is not None)
+    shown = opened(page_file.as_uri())
+    words = 'a "fine" one\\\nreally é'
+    judge(shown, row["label"], words)
+    with shown.expect_download() as download:
+        shown.get_by_role("button", name="Save verdicts").click()
+    folder = tmp_path / "room"
+    shutil.copytree(room.asset, folder)
+    download.value.save_as(folder / download.value.suggested_filename)
+    found = read_review(Asset.made(folder))
+    assert set(found) == {row["prim"]}
+    said = found[row["prim"]]
+    assert (said.verdict, said.comment, said.directive) == ("accept", words, "refit")
+    assert (said.status, said.phi) == (row["fit"], pytest.approx(row["phi"]))
+
+
+def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, page_file, room, tmp_path):
+    folder = tmp_path / "room"
+    shutil.copytree(room.asset, folder)
+    asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
+    label = data["objects"][0]["label"]
+    server = PageServer(asset, lambda at: page({**data, **reviewed(asset)}, served=at))
+    thread = threading.Thread(target=server.serve)
+    thread.start()
+    try:
+        shown = opened(server.address)
+        judge(shown, label, "good")
+        shown.get_by_role("button", name="Save verdicts").click()
+        shown.get_by_text("saved in review.usda").wait_for()
+        assert shown.faults == []
+        again = opened(server.address)
+        again.locator("#filter-verdict").select_option("accept")
+        assert again.locator("#count").inner_text() == f"1 of {len(data['objects'])} objects"
+    finally:
+        server.close()
+        thread.join()
+    assert read_review(asset)[data["objects"][0]["prim"]].comment == "good"
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
+def test_nobody_is_shut_out(opened, page_file, width, scheme):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    shown = opened(
+        page_file.as_uri(), viewport={"width": width, "height": 900}, color_scheme=scheme
+    )
+    shown.locator("button.name").first.click()
+    assert shown.evaluate("document.documentElement.scrollWidth") <= width
+    found = axe.Axe().run(shown).response["violations"]
+    serious = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
+    assert serious == [], [node["html"][:200] for v in found for node in v["nodes"]]

@@ -1,0 +1,134 @@
+"""The page carries what the asset says, in one file, and nothing that was not meant to leave."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+
+import numpy as np
+import pytest
+from pxr import Usd
+
+import usdbrdf
+from tests.page.conftest import data_of
+from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.page.pictures import part_around
+from usdbrdf.page.report import page, report
+
+
+def pictures(text):
+    return [
+        base64.b64decode(found) for found in re.findall(r"data:image/jpeg;base64,([^\"]+)", text)
+    ]
+
+
+def test_every_object_is_there_with_the_numbers_of_its_prim(room, page_file):
+    data = data_of(page_file.read_text("utf-8"))
+    stage = Usd.Stage.Open(str(next(room.asset.glob("*.usda"))))
+    meshes = [p for p in stage.Traverse() if p.GetAttribute("usdBrdf:label").HasAuthoredValue()]
+    assert {row["prim"] for row in data["objects"]} == {str(p.GetPath()) for p in meshes}
+    for row in data["objects"]:
+        prim = stage.GetPrimAtPath(row["prim"])
+        assert row["fit"] == prim.GetAttribute("usdBrdf:fit:status").Get()
+        for name in ("phi", "psi"):
+            stored = prim.GetAttribute(f"usdBrdf:fit:{name}")
+            if stored.HasAuthoredValue():
+                assert row[name] == pytest.approx(stored.Get(), abs=1e-4)
+        assert row["why"].endswith(".")
+    assert any(row["status"] == "lamp" for row in data["objects"])
+
+
+def test_frames_views_and_maps_are_there(room, page_file):
+    data = data_of(page_file.read_text("utf-8"))
+    count = data["capture"]["frames"]
+    assert len(data["rows"]) == len(data["map"]["cameras"]) == count
+    assert all(row["exposure_s"] > 0 and 0 <= row["clipped"] <= 1 for row in data["rows"])
+    assert all(0 <= value <= 1 for x, y, *_ in data["map"]["cameras"] for value in (x, y))
+    assert 1 <= len(data["views"]) <= 8
+    assert {m["name"] for m in data["maps"]} >= {
+        *("lit", "coverage", "samples", "spread", "stderr", "irradiance", "albedo", "phi", "psi")
+    }
+    assert all(len(shown["pictures"]) == len(data["views"]) for shown in data["maps"])
+
+
+def test_pictures_have_no_metadata_and_nothing_names_this_machine(room, page_file):
+    text = page_file.read_text("utf-8")
+    found = pictures(text)
+    assert len(found) > 20
+    for picture in found:
+        assert picture.startswith(b"\xff\xd8")
+        assert not any(word in picture for word in (b"Exif", b"GPS", b"http:", b"OpenImageIO"))
+    packed = base64.b64decode(data_of(text)["room"]["glb"])
+    for content in (text.encode("utf-8"), gzip.decompress(packed)):
+        assert str(room.asset.parent).encode() not in content
+        assert str(room.capture.folder.parent).encode() not in content
+
+
+def test_a_page_without_photographs_has_none_and_none_of_their_names(room, page_file, tmp_path):
+    names = {row["name"] for row in data_of(page_file.read_text("utf-8"))["rows"]}
+    options = usdbrdf.ReportOptions(photographs=False)
+    report(room.asset, tmp_path / "private.html", options)
+    text = (tmp_path / "private.html").read_text("utf-8")
+    data = data_of(text)
+    assert names
+    assert not any(name in text for name in names)
+    assert not any("photograph" in row for row in (*data["objects"], *data["views"]))
+    assert "photograph" in data_of(page_file.read_text("utf-8"))["views"][0]
+
+
+def test_what_an_asset_is_called_is_no_part_of_the_page(page_file):
+    data = data_of(page_file.read_text("utf-8"))
+    label = "</script><script>alert(1)</script>"
+    data["objects"][0]["label"] = label
+    text = page(data)
+    assert label not in text
+    assert data_of(text)["objects"][0]["label"] == label
+
+
+def test_views_that_evaluate_made_are_taken(room, page_file, tmp_path):
+    low = usdbrdf.EvaluateOptions(samples_per_pixel=1, rays=8)
+    made = usdbrdf.evaluate(room.asset, room.capture.manifest, tmp_path / "made", low)
+    options = usdbrdf.ReportOptions(evaluation=tmp_path / "made")
+    report(room.asset, tmp_path / "report.html", options)
+    data = data_of((tmp_path / "report.html").read_text("utf-8"))
+    assert [row["flip_full"] for row in data["plot"]] == [r["flip_full"] for r in made["frames"]]
+    shown = data["views"][0]
+    own = data_of(page_file.read_text("utf-8"))["views"][0]
+    assert shown["size"] == own["size"]
+    assert all(shown[name].startswith("data:image/jpeg") for name in ("photograph", "flip_full"))
+    for document, words in (
+        ({"asset": "another", "frames": made["frames"]}, "not of"),
+        ({"frames": [{}]}, "no document of usdbrdf evaluate"),
+    ):
+        (tmp_path / "made/evaluation.json").write_text(json.dumps(document))
+        with pytest.raises(InputRefused, match=rf"{words}.*\[report\.evaluation\]$"):
+            report(room.asset, tmp_path / "other.html", options)
+    assert not (tmp_path / "other.html").exists()
+
+
+def test_pages_are_refused_where_they_may_not_lie(room, tmp_path):
+    with pytest.raises(UsageError, match=r"\[report\.output\]$"):
+        report(room.asset, room.asset / "report.html")
+    with pytest.raises(UsageError, match=r"\.html"):
+        report(room.asset, tmp_path / "report.pdf")
+    (tmp_path / "taken.html").mkdir()
+    with pytest.raises(OwnershipConflict, match="a folder has this name"):
+        report(room.asset, tmp_path / "taken.html")
+    assert not list(tmp_path.glob("*.pdf"))
+
+
+def test_the_camera_of_a_part_sees_what_the_photograph_has_there(room, page_file):
+    from usdbrdf.evaluation.evaluate_views import measured_atlas
+
+    _, atlas = measured_atlas(room.asset)
+    camera = atlas.frames.camera(0)
+    part = part_around(camera, (0.5, 0.4, 0.7, 0.6))
+    left, top, right, _ = part.pixels
+    assert (left, top) <= (0.5 * camera.width, 0.4 * camera.height)
+    shrink = part.camera.width / (right - left)
+    points = camera.eye + np.random.default_rng(1).normal(size=(20, 3)) @ np.eye(3)
+    points -= 9 * camera.world_from_camera[:3, 2]
+    inside = (camera.project(points) - [left, top]) * shrink
+    assert np.allclose(part.camera.project(points), inside, atol=0.02 * part.camera.width)

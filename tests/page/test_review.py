@@ -1,0 +1,128 @@
+"""Verdicts are kept beside the edits, tell what changed since, and change nothing else."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pxr import Sdf, Usd
+
+from usdbrdf.asset.properties import FittedObject
+from usdbrdf.asset.review import (
+    Judgement,
+    changes_since,
+    judgements_of,
+    notes_for_run,
+    read_review,
+    review_file,
+    write_review,
+)
+from usdbrdf.errors import InputRefused
+
+CHAIR, WALL = "/room/geo/Stuhl_No_1", "/room/geo/wall"
+
+
+def fit(**numbers):
+    usual = {"status": "measured", "phi": 0.25, "psi": 0.5}
+    return FittedObject(
+        prim_path=CHAIR, identifier="chair", cost=0.0, evidence=0.5, target_frame=0,
+        num_pixels=9, method="views", **usual | numbers,
+    )  # fmt: skip
+
+
+def test_what_is_said_comes_back_and_is_metadata_alone(built):
+    asset = built.asset
+    said = {
+        CHAIR: {"verdict": "reject", "comment": 'too "green"\n\\ really é', "directive": "metal"},
+        WALL: {"verdict": "", "comment": "", "directive": ""},
+    }
+    write_review(asset, judgements_of(asset, said))
+    found = read_review(asset)
+    assert set(found) == {CHAIR}
+    assert found[CHAIR].comment == said[CHAIR]["comment"]
+    assert (found[CHAIR].verdict, found[CHAIR].directive) == ("reject", "metal")
+    stage = Usd.Stage.Open(str(asset.root_layer))
+    prim = stage.GetPrimAtPath(CHAIR)
+    assert found[CHAIR].status == prim.GetAttribute("usdBrdf:fit:status").Get()
+    layer = Sdf.Layer.FindOrOpen(str(review_file(asset)))
+    specs = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: specs.append(path))
+    assert not any(path.IsPropertyPath() for path in specs)
+    assert layer.defaultPrim == "room"
+
+
+def test_equal_words_are_equal_bytes_and_the_edits_stay(built):
+    asset = built.asset
+    edits = asset.edits_layer.read_bytes()
+    said = {CHAIR: {"verdict": "accept"}, WALL: {"comment": "flat"}}
+    write_review(asset, judgements_of(asset, said))
+    first = review_file(asset).read_bytes()
+    write_review(asset, judgements_of(asset, dict(reversed(said.items()))))
+    assert review_file(asset).read_bytes() == first
+    assert asset.edits_layer.read_bytes() == edits
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        [],
+        {"/room/geo/nobody": {"verdict": "accept"}},
+        {CHAIR: {"verdict": "maybe"}},
+        {CHAIR: {"directive": "gold"}},
+        {CHAIR: {"comment": "x" * 2001}},
+        {CHAIR: {"comment": 3}},
+        {CHAIR: "accept"},
+    ],
+)
+def test_what_a_page_may_not_say_is_refused_and_nothing_written(built, said):
+    with pytest.raises(InputRefused, match=r"\[review\.\w+\]$"):
+        judgements_of(built.asset, said)
+    assert not review_file(built.asset).exists()
+
+
+def test_a_verdict_says_what_changed_since():
+    judged = Judgement(verdict="accept", status="measured", phi=0.25, psi=0.5)
+    assert judged.change(fit()) == ""
+    assert judged.change(fit(phi=0.2501)) == ""
+    told = judged.change(fit(status="prior", phi=0.4))
+    assert told == (
+        "accepted as measured, phi 0.25, psi 0.50; now not determined, phi 0.40, psi 0.50."
+    )
+    assert Judgement(phi=0.1, psi=0.1).change(fit()) == ""
+    assert "now unknown" in judged.change(None)
+
+
+def test_a_changed_number_is_found_in_the_asset(built):
+    asset = built.asset
+    write_review(asset, judgements_of(asset, {CHAIR: {"verdict": "accept"}}))
+    assert changes_since(asset) == {}
+    write_review(asset, {CHAIR: Judgement(verdict="accept", status="measured", phi=0.9, psi=0.1)})
+    assert set(changes_since(asset)) == {CHAIR}
+    # Said again without a new word, the verdict stays about what was judged then.
+    again = judgements_of(asset, {CHAIR: {"verdict": "accept"}})
+    assert again[CHAIR].phi == 0.9
+    assert math.isnan(Judgement().phi)
+
+
+def test_a_run_tells_what_changed_and_what_was_asked_for(built):
+    asset = built.asset
+    said = Judgement(verdict="accept", directive="metal", status="measured", phi=0.9, psi=0.1)
+    write_review(asset, {CHAIR: said})
+    changed, asked = notes_for_run(asset)
+    assert changed.startswith(f"<{CHAIR}> accepted as measured, phi 0.90, psi 0.10; now ")
+    assert asked == f"<{CHAIR}> asks for 'metal', which is kept: no step acts on it yet."
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "#usda 1.0\n( nonsense",
+        "PXR-USDC",
+        "#usda 1.0\n" + 'over "a" {\n' * 100_000 + "}\n" * 100_000,
+    ],
+)
+def test_a_review_that_is_no_layer_is_named(built, content):
+    review_file(built.asset).write_text(content)
+    with pytest.raises(InputRefused, match=r"review\.usda.*\[review\.layer\]$"):
+        read_review(built.asset)
+    assert changes_since(built.asset) == {}

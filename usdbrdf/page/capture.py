@@ -1,0 +1,153 @@
+"""What was captured and with what, for the page: frames on a map of the room, how they were
+exposed, what was found and what not, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.frames import read_frame, read_frames
+from usdbrdf.job.progress import progress
+from usdbrdf.job.stamp import read_stamp, stamp_path
+from usdbrdf.model.arrays import Byte, Double, Float
+from usdbrdf.model.capture import Frames
+from usdbrdf.page.pictures import data_uri
+from usdbrdf.transport.lit_scene import LitScene
+
+STEPS = ("ingest", "texture", "shade", "fit")
+# Frames that are read for their exposures, and pixels across the map, at most.
+_MOST_READ, _MAP_WIDTH = 96, 480
+_FLOORLESS = np.array((40, 44, 52), np.uint8)
+
+
+def summaries(asset: Asset) -> dict[str, dict[str, Any]]:
+    """What each step found when it ran, by its name; empty where its stamp is gone."""
+    stamps = {
+        name: read_stamp(stamp_path(asset.folder, number, name))
+        for number, name in enumerate(STEPS, start=1)
+    }
+    return {name: dict(stamp.summary) if stamp else {} for name, stamp in stamps.items()}
+
+
+def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """All sentences of warning, in the order of the steps."""
+    return [str(sentence) for step in STEPS for sentence in found[step].get("warnings", ())]
+
+
+def frame_rows(frames: Frames) -> list[dict[str, Any]]:
+    """Of frames spread evenly: which they are, how they were exposed, and which shares of their
+    pixels are clipped, dark or unknown."""
+    chosen, rows = spread_evenly(len(frames), _MOST_READ), []
+    images = read_frames(lambda i: read_frame(frames, i), chosen)
+    for i, pixels in progress(images, total=len(chosen), label="report", unit="frames"):
+        known = pixels.radiance[~pixels.unknown]
+        rows.append(
+            {
+                "number": i,
+                "name": frames.image_paths[i].name,
+                "exposure_s": float(frames.exposure_time[i]),
+                "clipped": round(float(pixels.clipped.mean()), 6),
+                "dark": round(float(pixels.dark.mean()), 6),
+                "unknown": round(float(pixels.unknown.mean()), 6),
+                "median": float(np.median(known)) if known.size else None,
+            }
+        )
+    return rows
+
+
+def room_map(atlas: AssetMaps, lit: LitScene, colours: Float, up_axis: str) -> dict[str, Any]:
+    """The room from above, cut open at the cameras' height, and where the cameras stood on that
+    picture: x, y as shares of width and height, and the direction that they looked in, in the
+    same, of unit length.
+
+    colours  (T, 3), linear
+    """
+    up = 2 if up_axis == "Z" else 1
+    # On the map right and down, so that it is no mirror image: x and -y, or x and z.
+    right, down, sign = (0, 1, -1.0) if up == 2 else (0, 2, 1.0)
+    poses = atlas.frames.world_from_camera
+    eyes, looks = poses[:, :3, 3], -poses[:, :3, 2]
+    plan = np.stack([eyes[:, right], sign * eyes[:, down]], axis=1)
+    points = atlas.scene.points
+    across = np.concatenate([np.stack([points[:, right], sign * points[:, down]], axis=1), plan])
+    low, high = across.min(axis=0), across.max(axis=0)
+    margin = 0.03 * float((high - low).max())
+    low, high = low - margin, high + margin
+    size = high - low
+    width = _MAP_WIDTH
+    height = int(np.clip(round(width * size[1] / max(size[0], 1e-9)), 40, 2 * width))
+    level = float(np.median(eyes[:, up]))
+    picture = _from_above(
+        lit, colours, (low, size), (height, width), (right, down, up, sign, level)
+    )
+    direction = np.stack([looks[:, right], sign * looks[:, down]], axis=1)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    place = (plan - low) / size
+    cameras = np.concatenate([place, direction], axis=1).round(4).tolist()
+    return {
+        "picture": data_uri(picture), "width": width, "height": height, "cameras": cameras,
+        "metres": [round(float(n), 2) for n in size],
+    }  # fmt: skip
+
+
+def _from_above(
+    lit: LitScene,
+    colours: Float,
+    window: tuple[Double, Double],
+    pixels: tuple[int, int],
+    axes: tuple[int, int, int, float, float],
+) -> Byte:
+    (low, size), (height, width), (right, down, up, sign, level) = window, pixels, axes
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    origins = np.zeros((width * height, 3), np.float32)
+    origins[:, right] = (low[0] + x * size[0]).ravel()
+    origins[:, down] = sign * (low[1] + y * size[1]).ravel()
+    origins[:, up] = level
+    directions = np.zeros_like(origins)
+    directions[:, up] = -1
+    hits = lit.rays.closest(origins, directions)
+    shown = lit.radiance.showing(lit.texels, colours).at(hits.face, hits.u, hits.v)
+    picture = to_display_srgb8(shown.reshape(height, width, 3), exposure_scale=1.0)
+    return np.where((hits.face >= 0).reshape(height, width, 1), picture, _FLOORLESS)
+
+
+def findings(
+    found: Mapping[str, Mapping[str, Any]], words: Sequence[str], radiometric: bool
+) -> list[str]:
+    """What was found, what not and why, in sentences. words: of each object, see ``status_of``."""
+    count = {word: words.count(word) for word in set(words)}
+    total = len(words)
+    told = [
+        f"{count.get('measured', 0)} of {total} objects have a measured roughness and specular."
+    ]
+    if prior := count.get("prior"):
+        told.append(
+            f"{prior} {'is' if prior == 1 else 'are'} not determined: no photograph shows a clear "
+            "highlight, so the numbers are what remains likely, with an upper bound."
+        )
+    if unseen := count.get("unseen"):
+        told.append(f"{unseen} {'was' if unseen == 1 else 'were'} shown by no photograph.")
+    if lamps := count.get("lamp"):
+        told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}, found by shining.")
+    texture, shade = found["texture"], found["shade"]
+    if "measured_fraction" in texture:
+        told.append(
+            f"Photographs measured {texture['measured_fraction']:.1%} of the surface; "
+            f"{texture.get('clipped_fraction', 0):.2%} clipped in all of them; the rest is filled "
+            "in from around it."
+        )
+    if "standard_error" in shade:
+        told.append(f"The traced light has a standard error of {shade['standard_error']:.1%}.")
+    if (escaped := shade.get("escaped_fraction", 0)) > 0.001:
+        told.append(f"{escaped:.1%} of the light's directions leave the scan.")
+    for name in shade.get("estimated_emitters", {}):
+        told.append(f"The lamp {name} clipped everywhere: its radiance is an estimate.")
+    if not radiometric:
+        told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
+    return told

@@ -1,0 +1,176 @@
+"""Every object as the page tells of it: its numbers with their errors, why they are what they are,
+its photograph beside the model's picture, and the evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.properties import FittedObject, ShadedObject
+from usdbrdf.asset.readers.scene import read_shading
+from usdbrdf.evaluation.evaluate_views import ViewedAsset, predict_view
+from usdbrdf.evaluation.metrics import finite
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
+from usdbrdf.files.frames import read_frame
+from usdbrdf.job.progress import progress
+from usdbrdf.material.fit_target import frame_samples, relative_costs
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Frames
+from usdbrdf.model.scene import SceneObject
+from usdbrdf.options import EvaluateOptions
+from usdbrdf.page.pictures import Seen, data_uri, part_around, status_of
+from usdbrdf.transport.lit_scene import View
+
+# Of the pictures of objects, which are small; of the evidence's plot; and its pixels.
+_PICTURE = EvaluateOptions(samples_per_pixel=1, rays=24)
+_PHIS = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+_PSIS = tuple(k / 10 for k in range(11))
+_EVIDENCE_PIXELS = 150
+# Of no lobe it is 1; what is so much worse needs no number.
+_MOST_COST = 100.0
+
+
+def object_rows(
+    atlas: AssetMaps,
+    seen: ViewedAsset,
+    fits: Sequence[FittedObject],
+    where: Seen,
+    chosen: Sequence[int],
+    *,
+    photographs: bool,
+    seed: int,
+) -> list[dict[str, Any]]:
+    """All objects, in the order of the stage, JSON.
+
+    where, chosen  where objects are in the frames of these numbers
+    photographs    whether pictures may be photographs
+    """
+    objects, rows = atlas.scene.objects, []
+    for i, obj in progress(enumerate(objects), total=len(objects), label="report", unit="objects"):
+        row = _numbers(atlas, i, obj, fits[i])
+        share, target = where.share[:, i], fits[i].target_frame
+        shown = target in chosen and share[chosen.index(target)] > 0
+        at = chosen.index(target) if shown else int(share.argmax())
+        if share[at] > 0:
+            row |= _pictures(
+                atlas.frames, seen, i, chosen[at], where.box[at, i], row["status"],
+                photographs=photographs, seed=seed,
+            )  # fmt: skip
+        rows.append(row)
+    return rows
+
+
+def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) -> dict[str, Any]:
+    texels, own = atlas.texels, atlas.texels.of_object(index)
+    status = status_of(atlas, index, fit)
+    shading = read_shading(atlas.stage, obj.prim_path)
+    colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), None)
+    base = texels.mean_of_object(index, atlas.map_where_present(colours, 3)) if colours else None
+    return {
+        "id": obj.identifier,
+        "label": obj.label,
+        "class": obj.class_name,
+        "prim": obj.prim_path,
+        "status": status,
+        "fit": fit.status,
+        "kind": fit.kind,
+        "phi": finite(fit.phi, 4),
+        "phi_error": finite(fit.phi_error, 4),
+        "phi_confidence": fit.phi_confidence,
+        "psi": finite(fit.psi, 4),
+        "psi_error": finite(fit.psi_error, 4),
+        "psi_upper": finite(fit.psi_upper, 4),
+        "psi_confidence": fit.psi_confidence,
+        "f0": [round(value, 4) for value in fit.f0] if fit.is_metal else None,
+        "evidence": finite(fit.evidence, 4),
+        "base_color": None if base is None else [round(float(value), 4) for value in base],
+        "seen": round(float(atlas.coverage.observed[own].mean()) if len(texels) else 0.0, 4),
+        "clipped": round(float(atlas.coverage.clipped[own].mean()), 4),
+        "area": round(float(texels.area[own].sum()), 4),
+        "radiance": _radiance(shading),
+        "why": why(fit, status, shading),
+        "target": fit.target_frame,
+    }
+
+
+def _radiance(shading: ShadedObject | None) -> dict[str, Any] | None:
+    if shading is None or not shading.emitter:
+        return None
+    known = [round(float(value), 5) for value in shading.radiance]
+    return {"mean": known, "status": shading.radiance_status,
+            "error": finite(shading.radiance_error, 4)}  # fmt: skip
+
+
+def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
+    """In a sentence or two, why the numbers of an object are to be believed, or not."""
+    if status == "lamp":
+        known = shading.radiance_status if shading else "measured"
+        return {
+            "measured": "It shines; its radiance was measured.",
+            "estimated": "It shines and clipped in every photograph: its radiance is estimated "
+            "from the light that it casts.",
+        }.get(known, "It shines and clipped in every photograph: its radiance is a lower bound.")
+    if status == "unseen":
+        return "No photograph shows it: everything about it is a guess."
+    if fit.is_metal:
+        return "A metal explains the views better than any dielectric: F0 takes the place of psi."
+    explained = f"A lobe explains {max(fit.evidence, 0):.0%} of what changes with the view."
+    if math.isnan(fit.evidence):
+        explained = "There were too few samples for a fit."
+    if status == "measured":
+        return f"{explained} Both numbers are determined."
+    if status == "failed":
+        return f"{explained} The target frame does not determine the numbers."
+    sure = [name for name in ("phi", "psi") if getattr(fit, f"{name}_confidence") == "high"]
+    known = f"Only {sure[0]} is determined." if sure else "Neither number is determined."
+    bound = f" psi is below {fit.psi_upper:.2f} with 95 %." if fit.psi_upper < 0.995 else ""
+    return f"{explained} {known}{bound}"
+
+
+def _pictures(
+    frames: Frames,
+    seen: ViewedAsset,
+    index: int,
+    frame: int,
+    box: Sequence[float],
+    status: str,
+    *,
+    photographs: bool,
+    seed: int,
+) -> dict[str, Any]:
+    """The object in a frame: photograph and model's picture of one exposure, and the evidence."""
+    pixels = read_frame(frames, frame)
+    part = part_around(frames.camera(frame), box)
+    predicted = predict_view(seen, part.camera, _PICTURE, seed + index)
+    small = part.of(pixels)
+    known = small.radiance[~small.unknown] if not small.unknown.all() else predicted.full
+    exposure = display_exposure(known.reshape(-1, 3).mean(axis=1))
+    found: dict[str, Any] = {
+        "frame": frame,
+        "model": data_uri(to_display_srgb8(predicted.full, exposure_scale=exposure)),
+        "size": [part.camera.width, part.camera.height],
+    }
+    if photographs:
+        picture = to_display_srgb8(np.nan_to_num(small.radiance), exposure_scale=exposure)
+        found["photograph"] = data_uri(picture)
+    if status != "lamp":
+        view = View(radiance=np.nan_to_num(pixels.radiance), valid=pixels.valid,
+                    camera=frames.camera(frame))  # fmt: skip
+        costs = evidence(seen, view, index, seed)
+        if costs is not None:
+            found["costs"] = {
+                "phis": _PHIS, "psis": _PSIS, "values": costs.round(4).tolist(),
+            }  # fmt: skip
+    return found
+
+
+def evidence(seen: ViewedAsset, view: View, index: int, seed: int) -> Double | None:
+    """(phi, psi): what lobes leave unexplained of the object in one frame, relative to none."""
+    samples, _ = frame_samples(seen.lit, view, index, _EVIDENCE_PIXELS, seed)
+    if samples is None:
+        return None
+    return np.minimum(relative_costs(seen.lit, samples, _PHIS, _PSIS), _MOST_COST)

@@ -1,0 +1,200 @@
+"""An asset -> one self-contained HTML file: what was captured, what was found of every object and
+how far to believe it, pictures beside photographs, and the room in three dimensions.
+
+The page is data (JSON) and the parts of ``static``; nothing is loaded when it is opened."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps, camera_hits
+from usdbrdf.asset.properties import FittedObject
+from usdbrdf.asset.readers.scene import read_fit
+from usdbrdf.asset.readers.views import Views, photographs_of_views
+from usdbrdf.asset.review import changes_since, read_review
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.capture.parts import frames_at
+from usdbrdf.errors import OwnershipConflict, UsageError
+from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
+from usdbrdf.files.atomic import environment_failures, write_text_atomic
+from usdbrdf.job.stamp import code_version
+from usdbrdf.model.capture import Frames
+from usdbrdf.options import ReportOptions
+from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
+from usdbrdf.page.objects import object_rows
+from usdbrdf.page.pictures import (
+    data_uri,
+    objects_in_frames,
+    picture_of_map,
+    status_of,
+    surface_maps,
+)
+from usdbrdf.page.room import room_model
+from usdbrdf.page.views import (
+    SHOWN,
+    SHOWN_WIDTH,
+    evaluated_views,
+    models_only,
+    rendered_views,
+    unnamed,
+)
+
+_STATIC = Path(__file__).resolve().parent / "static"
+# Frames in which objects are looked for.
+_SEARCHED = 64
+
+
+def report(
+    folder: str | Path, output: str | Path, options: ReportOptions | None = None
+) -> dict[str, Any]:
+    """Write the page of the asset in ``folder`` to the file ``output``; the asset is not changed.
+
+    Returns a summary of plain values. Raises UsdBrdfError; ``output`` is then as it was.
+    """
+    place, asset = Path(output), Asset.made(Path(folder))
+    if place.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{place}: a page is an .html file. Name one with -o. [report.output]")
+    if place.is_dir():
+        raise OwnershipConflict(f"{place}: a folder has this name. Choose another. [report.output]")
+    asset.refuse_output(place, "report.output")
+    data = page_data(asset, options or ReportOptions())
+    text = page(data)
+    with environment_failures(str(place)):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(place, text)
+    return {
+        "output": str(place),
+        "bytes": len(text.encode("utf-8")),
+        "objects": len(data["objects"]),
+        "views": len(data["views"]),
+        "room": data["room"] is not None,
+    }
+
+
+def page(data: Mapping[str, Any], served: str = "") -> str:
+    """The document. served: the address that takes verdicts, "" for a file."""
+    text = json.dumps({**data, "served": served}, separators=(",", ":"), allow_nan=False)
+    parts = {
+        "STYLE": _part("page.css"),
+        "DATA": text.replace("<", "\\u003c").replace("\u2028", "\\u2028"),
+        "ROOM": _part("room.bundle.js").replace("</script", "<\\/script"),
+        "SCRIPT": _part("page.js"),
+        "LICENCE": _part("room.bundle.LICENCE.txt"),
+    }
+    document = _part("page.html")
+    for name, content in parts.items():
+        before, mark, after = document.partition(f"/*{name}*/")
+        assert mark, name
+        document = before + content + after
+    return document
+
+
+def _part(name: str) -> str:
+    return (_STATIC / name).read_text("utf-8")
+
+
+def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
+    """All that the page tells, as JSON."""
+    place, atlas = measured_atlas(asset.folder)
+    up_axis = read_header(place.layer("scan")).up_axis
+    seen = viewed_asset(place, atlas, options.environment)
+    fits = [read_fit(atlas.stage, obj.prim_path) for obj in atlas.scene.objects]
+    known = [fit for fit in fits if fit is not None]
+    words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
+    frames, found = atlas.frames, summaries(place)
+    chosen = _frames_to_search(len(frames), known)
+    where = objects_in_frames(
+        seen.lit.rays, atlas.scene.face_object, len(words), frames_at(frames, chosen)
+    )
+    views = _asked_views(place, atlas, options)
+    pictures = options.photographs
+    colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
+    if options.evaluation is None:
+        shown, rows = rendered_views(seen, views)
+    else:
+        shown, rows = evaluated_views(options.evaluation, place)
+    return {
+        "name": place.name,
+        "version": code_version(),
+        "photographs": pictures,
+        "capture": {
+            "frames": len(frames),
+            "resolution": frames.resolution[0].tolist(),
+            "encoding": frames.encoding,
+            "radiometric": bool(frames.radiometric),
+            "adapter": str(found["ingest"].get("adapter", "")),
+            "triangles": len(atlas.scene.triangles),
+            "texels": len(atlas.texels),
+        },
+        "findings": findings(found, words, bool(frames.radiometric)),
+        "warnings": warnings_of(found),
+        "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
+        "map": room_map(atlas, seen.lit, atlas.map_where_present(colours, 3), up_axis),
+        "objects": object_rows(
+            atlas, seen, known, where, chosen, photographs=pictures, seed=options.seed
+        ),
+        "views": [view.told(pictures) for view in shown],
+        "plot": models_only(rows),
+        "maps": _maps(atlas, seen, known, _overviews(views.frames)),
+        "room": room_model(place, atlas, up_axis),
+        **reviewed(place),
+    }
+
+
+def reviewed(asset: Asset) -> dict[str, Any]:
+    """What people said of the objects by now, and what changed since."""
+    said = read_review(asset)
+    words = ("verdict", "comment", "directive")
+    return {
+        "review": {path: {w: getattr(one, w) for w in words} for path, one in said.items()},
+        "changed": changes_since(asset),
+    }
+
+
+def _frames_to_search(count: int, fits: Sequence[FittedObject]) -> list[int]:
+    """Frames spread evenly, and all target frames."""
+    targets = {fit.target_frame for fit in fits if 0 <= fit.target_frame < count}
+    return sorted({*spread_evenly(count, _SEARCHED), *targets})
+
+
+def _asked_views(asset: Asset, atlas: AssetMaps, options: ReportOptions) -> Views:
+    """Those of the document that was named, else the capture's frames."""
+    if options.views is not None:
+        return photographs_of_views(
+            options.views, asset, atlas.stage, atlas.scene, options.allow_outside
+        )
+    names = tuple(path.name for path in atlas.frames.image_paths)
+    return Views(names=names, frames=atlas.frames)
+
+
+def _overviews(frames: Frames) -> Frames:
+    return frames_at(frames, spread_evenly(len(frames), SHOWN))
+
+
+def _maps(
+    atlas: AssetMaps, seen: ViewedAsset, fits: Sequence[FittedObject], frames: Frames
+) -> list[dict[str, Any]]:
+    """Every map as the cameras of ``frames`` see it."""
+    cameras = [frames.camera(i) for i in range(len(frames))]
+    small = [camera.at_width(min(SHOWN_WIDTH, camera.width)) for camera in cameras]
+    hits = [
+        camera_hits(seen.lit.rays, frames, i, camera.width, camera.height)
+        for i, camera in enumerate(small)
+    ]
+    return [
+        {
+            "name": shown.name,
+            "title": shown.title,
+            "legend": shown.legend,
+            "pictures": [
+                data_uri(picture_of_map(seen.lit, shown, one, camera.height, camera.width))
+                for one, camera in zip(hits, small, strict=True)
+            ],
+        }
+        for shown in surface_maps(atlas, fits)
+    ]

@@ -1,0 +1,96 @@
+"""The room in three dimensions: the asset's glTF and what a viewer needs besides to light it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.delivery.package import package
+from usdbrdf.errors import UsdBrdfError
+from usdbrdf.files.colour import display_exposure, to_display_srgb8
+from usdbrdf.files.images import resized
+from usdbrdf.job.progress import say
+from usdbrdf.model.material import turned_up
+from usdbrdf.options import PackageOptions
+from usdbrdf.page.pictures import data_uri
+
+# Pixels of a texture's longer side.
+_TEXTURE = 384
+
+
+def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] | None:
+    """What the page needs for its view in 3D; None, and a line that says why, where there is none.
+
+    glb    gzip, base64: y up, metres; nodes name their prims
+    lit    by prim, the lit texture as a picture
+    lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
+           radiance times m^2
+    """
+    try:
+        with TemporaryDirectory(prefix="usdbrdf-room-") as folder:
+            file = Path(folder) / "room.glb"
+            package(asset.folder, file, PackageOptions(max_size=_TEXTURE))
+            content = file.read_bytes()
+    except UsdBrdfError as error:
+        say(f"report: without the room in 3D: {error}")
+        return None
+    packed = gzip.compress(content, compresslevel=6, mtime=0)
+    return {
+        "glb": base64.b64encode(packed).decode("ascii"),
+        "lit": lit_pictures(atlas),
+        "exposure": display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1)),
+        "irradiance": _typical_irradiance(atlas),
+        "lamps": lamps(atlas, up_axis),
+    }
+
+
+def lit_pictures(atlas: AssetMaps) -> dict[str, str]:
+    """By prim path its lit texture, one exposure for all."""
+    exposure = display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1))
+    found, light = {}, atlas.light
+    for i, obj in enumerate(atlas.scene.objects):
+        image = atlas.texels.image(i, light)
+        height, width = image.shape[:2]
+        if max(width, height) > _TEXTURE:
+            scale = _TEXTURE / max(width, height)
+            image = resized(image, max(1, round(width * scale)), max(1, round(height * scale)))
+        found[obj.prim_path] = data_uri(to_display_srgb8(image, exposure_scale=exposure))
+    return found
+
+
+def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
+    """Lamps as points that send out as much light, alike in all directions: of an area A that
+    shines with radiance L all around itself or to one side, the mean intensity is A L / 4."""
+    turn, texels, found = turned_up(up_axis, "Y")[:3, :3], atlas.texels, []
+    for i, obj in enumerate(atlas.scene.objects):
+        own = texels.of_object(i)
+        power = texels.area[own, None] * atlas.emission[own]
+        if not power.any():
+            continue
+        weight = power.sum(axis=1)
+        # A little before the surface, on the side that shines, so that it lights what is there.
+        middle = np.average(texels.position[own], axis=0, weights=weight)
+        facing = np.average(texels.geometric_normal[own], axis=0, weights=weight)
+        place = turn @ (middle + 0.05 * facing)
+        found.append(
+            {
+                "prim": obj.prim_path,
+                "label": obj.label,
+                "place": [round(float(value), 4) for value in place],
+                "intensity": [float(value) for value in power.sum(axis=0) / 4],
+            }
+        )
+    return found
+
+
+def _typical_irradiance(atlas: AssetMaps) -> list[float]:
+    if not atlas.has("irradiance"):
+        return [0.0, 0.0, 0.0]
+    return [float(value) for value in np.median(atlas.irradiance, axis=0)]

@@ -1,0 +1,133 @@
+"""The page of an asset at an address of this machine alone, which also takes verdicts.
+
+Whoever asks must know a random token; nothing of the file system is served: there is the page, and
+what people say of the objects. Addresses of other machines, and pages of other addresses that a
+browser has open, are refused."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import threading
+import webbrowser
+from collections.abc import Callable
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.review import judgements_of, write_review
+from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
+from usdbrdf.job.progress import say
+from usdbrdf.options import ReportOptions
+from usdbrdf.page.report import page, page_data, reviewed
+
+_HOST = "127.0.0.1"
+_LARGEST_REVIEW = 4 << 20  # bytes
+
+
+class PageServer:
+    """Serves until it is closed; ``address`` is where, with the token."""
+
+    def __init__(self, asset: Asset, document: Callable[[str], str], port: int = 0) -> None:
+        token, writing = secrets.token_urlsafe(24), threading.Lock()
+        at_page, at_review = f"/{token}/", f"/{token}/review"
+
+        class Handler(BaseHTTPRequestHandler):
+            server_version, sys_version = "usdbrdf", ""
+            timeout = 60
+
+            def do_GET(self) -> None:
+                if self._refused(at_page):
+                    return
+                self._answer(200, document(at_review).encode("utf-8"), "text/html; charset=utf-8")
+
+            def do_POST(self) -> None:
+                if self._refused(at_review):
+                    return
+                origin = self.headers.get("Origin")
+                length = self.headers.get("Content-Length", "")
+                plain = self.headers.get("Content-Type", "") != "application/json"
+                if plain or origin not in (None, own):
+                    self._answer(403, b"not from this page")
+                elif not length.isdigit() or int(length) > _LARGEST_REVIEW:
+                    self._answer(413, b"too long")
+                else:
+                    self._take(self.rfile.read(int(length)))
+
+            def _take(self, content: bytes) -> None:
+                try:
+                    with writing:
+                        write_review(asset, judgements_of(asset, json.loads(content)))
+                except (ValueError, RecursionError):
+                    self._answer(400, b"no JSON")
+                except UsdBrdfError as error:
+                    self._answer(400, str(error).encode("utf-8"))
+                else:
+                    self._answer(200, b"saved")
+
+            def _refused(self, path: str) -> bool:
+                # Another name for this machine is how a foreign page would come in.
+                known = self.headers.get("Host") == own.removeprefix("http://")
+                if known and secrets.compare_digest(self.path.encode(), path.encode()):
+                    return False
+                self._answer(404, b"nothing here")
+                return True
+
+            def _answer(self, status: int, content: bytes, kind: str = "text/plain") -> None:
+                self.send_response(status)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(content)))
+                self.send_header("Cache-Control", "no-store")
+                self.send_header("X-Content-Type-Options", "nosniff")
+                self.send_header("Referrer-Policy", "no-referrer")
+                self.end_headers()
+                self.wfile.write(content)
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Nothing: addresses hold the token."""
+
+        try:
+            self._server = ThreadingHTTPServer((_HOST, port), Handler)
+        except OSError as error:
+            raise EnvironmentFailure(
+                f"{_HOST}:{port}: this address cannot be used ({error.strerror}). Choose another "
+                "with --port. [view.port]"
+            ) from error
+        self._server.daemon_threads = True
+        own = f"http://{_HOST}:{self._server.server_port}"
+        self.address = own + at_page
+
+    def serve(self) -> None:
+        """Until ``close``, or an interrupt; then the address is free again."""
+        try:
+            self._server.serve_forever(poll_interval=0.2)
+        finally:
+            self._server.server_close()
+
+    def close(self) -> None:
+        """Stop, from another thread than the one that serves."""
+        self._server.shutdown()
+
+
+def view(
+    folder: str | Path, options: ReportOptions | None = None, *, port: int = 0, browser: bool = True
+) -> None:
+    """Make the page of an asset and serve it on this machine until interrupted.
+
+    port     0: any that is free
+    browser  whether to open it
+    """
+    asset = Asset.made(Path(folder))
+    data = page_data(asset, options or ReportOptions())
+
+    def document(review: str) -> str:
+        # Verdicts may have been saved since.
+        return page({**data, **reviewed(asset)}, served=review)
+
+    server = PageServer(asset, document, port)
+    say(f"{server.address}: open until you interrupt (Ctrl-C)")
+    if browser:
+        webbrowser.open(server.address)
+    with suppress(KeyboardInterrupt):  # which is how it ends
+        server.serve()

@@ -1,0 +1,567 @@
+'use strict';
+(() => {
+  const data = JSON.parse(document.getElementById('data').textContent);
+  const $ = (id) => document.getElementById(id);
+  const svgNames = new Set(['svg', 'g', 'path', 'circle', 'line', 'polyline', 'text', 'image', 'rect', 'title']);
+
+  /* An element: attributes (on...: listeners), then children, text or elements. */
+  function el(tag, attributes = {}, ...children) {
+    const made = svgNames.has(tag)
+      ? document.createElementNS('http://www.w3.org/2000/svg', tag) : document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) {
+      if (name.startsWith('on')) made.addEventListener(name.slice(2), value);
+      else if (value !== null && value !== undefined && value !== false) {
+        made.setAttribute(name, value === true ? '' : value);
+      }
+    }
+    made.append(...children.filter((child) => child !== null && child !== undefined));
+    return made;
+  }
+  const fixed = (value, digits = 2) => (value === null || value === undefined ? '\u2013' : value.toFixed(digits));
+  const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(100 * value).toFixed(digits)} %`);
+  const metres = (value) => `${value.toFixed(2)} m`;
+  const STATUS = {
+    measured: 'measured', prior: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
+  };
+
+  /* --- Capture ------------------------------------------------------------------------------- */
+
+  function capture() {
+    const { capture: facts } = data;
+    document.title = `${data.name}: usdbrdf report`;
+    $('title').textContent = data.name;
+    const measured = data.objects.filter((one) => one.status === 'measured').length;
+    $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
+    $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
+    for (const sentence of data.warnings) {
+      $('warnings').append(el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
+    }
+    if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
+    const told = [
+      ['Photographs', `${facts.frames}, ${facts.resolution.join(' \u00d7 ')} pixels, ${facts.encoding}`],
+      ['Read as', facts.adapter || 'unknown'],
+      ['Radiometric', facts.radiometric ? 'yes' : 'no: numbers are relative'],
+      ['Surface', `${facts.triangles.toLocaleString('en')} triangles, ${facts.texels.toLocaleString('en')} texels`],
+      ['Made by', `usdbrdf ${data.version}`],
+    ];
+    for (const [name, value] of told) $('facts').append(el('dt', {}, name), el('dd', {}, value));
+    plan();
+    $('frames').append(
+      frameChart('Exposure of the photographs', 'seconds, logarithmic', (row) => row.exposure_s, true),
+      frameChart('Clipped pixels', '% of the photograph', (row) => 100 * row.clipped, false),
+    );
+  }
+
+  function plan() {
+    const { map } = data, long = 0.035 * Math.max(map.width, map.height);
+    const marks = map.cameras.map(([x, y, dx, dy], i) => {
+      const [cx, cy] = [x * map.width, y * map.height];
+      return el('g', {},
+        el('title', {}, `Frame ${i}`),
+        el('line', { x1: cx, y1: cy, x2: cx + long * dx, y2: cy + long * dy, stroke: '#fff', 'stroke-width': 3 }),
+        el('line', { x1: cx, y1: cy, x2: cx + long * dx, y2: cy + long * dy, stroke: '#0b5cad', 'stroke-width': 1.5 }),
+        el('circle', { cx, cy, r: 3.4, fill: '#ffb000', stroke: '#000', 'stroke-width': 0.8 }));
+    });
+    $('map').append(
+      el('svg', {
+        viewBox: `0 0 ${map.width} ${map.height}`, role: 'img', width: map.width,
+        'aria-label': `Map of the room from above, with ${map.cameras.length} cameras and the directions they look in`,
+      }, el('image', { href: map.picture, width: map.width, height: map.height }), ...marks),
+      el('figcaption', {}, `From above, cut at the cameras\u2019 height: ${map.metres.map(metres).join(' \u00d7 ')}. Dots: cameras; lines: where they look.`));
+  }
+
+  function frameChart(title, unit, value, logarithmic) {
+    const points = data.rows.map((row) => [row.number, value(row)]).filter(([, y]) => y !== null);
+    return chart(title, unit, [{ name: title, css: 'full', points }], { logarithmic, dots: true });
+  }
+
+  /* --- Charts -------------------------------------------------------------------------------- */
+
+  function chart(title, unit, series, { logarithmic = false, dots = false } = {}) {
+    const [width, height, left, top, bottom] = [520, 200, 54, 10, 34];
+    const all = series.flatMap((one) => one.points).filter(([, y]) => Number.isFinite(y));
+    const figure = el('figure');
+    figure.append(el('h3', {}, title));
+    if (!all.length) { figure.append(el('p', { class: 'soft' }, 'Nothing to show.')); return figure; }
+    const shape = logarithmic ? (y) => Math.log10(Math.max(y, 1e-12)) : (y) => y;
+    let low = logarithmic ? Math.min(...all.map(([, y]) => shape(y))) : 0;
+    let high = Math.max(...all.map(([, y]) => shape(y)));
+    if (high - low < 1e-9) { high += logarithmic ? 0.5 : 1; low -= logarithmic ? 0.5 : 0; }
+    const last = Math.max(...all.map(([x]) => x), 1);
+    const px = (x) => left + (x / last) * (width - left - 8);
+    const py = (y) => height - bottom - ((shape(y) - low) / (high - low)) * (height - top - bottom);
+    const drawing = el('svg', { viewBox: `0 0 ${width} ${height}`, role: 'img', width: '100%' });
+    const digits = (y) => Number(y.toPrecision(2)).toString();
+    for (const share of [0, 0.5, 1]) {
+      const raw = low + share * (high - low), y = logarithmic ? 10 ** raw : raw;
+      drawing.append(
+        el('line', { class: 'grid', x1: left, x2: width - 8, y1: py(y), y2: py(y) }),
+        el('text', { x: left - 6, y: py(y) + 4, 'text-anchor': 'end' }, digits(y)));
+    }
+    drawing.append(
+      el('text', { x: left, y: height - 6 }, 'frame 0'),
+      el('text', { x: width - 8, y: height - 6, 'text-anchor': 'end' }, `frame ${last}`));
+    const told = [];
+    for (const one of series) {
+      const shown = one.points.filter(([, y]) => Number.isFinite(y));
+      if (!dots) {
+        drawing.append(el('polyline', { class: one.css, points: shown.map(([x, y]) => `${px(x)},${py(y)}`).join(' ') }));
+      }
+      drawing.append(...shown.map(([x, y]) => el('circle', { class: one.css, cx: px(x), cy: py(y), r: dots ? 3 : 2.4 })));
+      const mean = shown.reduce((sum, [, y]) => sum + y, 0) / Math.max(shown.length, 1);
+      told.push(`${one.name}: mean ${digits(mean)}, from ${digits(Math.min(...shown.map(([, y]) => y)))} to ${digits(Math.max(...shown.map(([, y]) => y)))}`);
+    }
+    drawing.setAttribute('aria-label', `${title}, ${unit}, over frames. ${told.join('. ')}`);
+    figure.append(drawing);
+    const caption = el('figcaption', {}, `${unit}. `);
+    if (series.length > 1) {
+      caption.append(...series.map((one) => el('span', { class: 'key' },
+        el('i', { style: `background: var(--${one.css})` }), one.name)));
+    }
+    figure.append(caption);
+    return figure;
+  }
+
+  /* --- Objects ------------------------------------------------------------------------------- */
+
+  const review = new Map(Object.entries(data.review || {}));
+  const changed = data.changed || {};
+  let unsaved = false;
+  const judged = (prim) => review.get(prim) || { verdict: '', comment: '', directive: '' };
+  const encoded = (linear) => {
+    const value = Math.min(Math.max(linear, 0), 1);
+    return Math.round(255 * (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055));
+  };
+  const css = (colour) => (colour ? `rgb(${colour.map(encoded).join(' ')})` : 'transparent');
+  const certain = { high: 0, low: 1, none: 2 };
+  const order = Object.keys(STATUS);
+  const COLUMNS = [
+    { name: 'Picture' },
+    { name: 'Object', key: (one) => one.label.toLowerCase() },
+    { name: 'Status', wide: true, key: (one) => order.indexOf(one.status) },
+    { name: 'Colour', wide: true, key: (one) => (one.base_color ? one.base_color[0] + one.base_color[1] + one.base_color[2] : -1) },
+    { name: 'Roughness', sign: '\u03c6', key: (one) => one.phi ?? 9 },
+    { name: 'Specular', sign: '\u03c8', key: (one) => one.psi ?? 9 },
+    { name: 'Sure', wide: true, key: (one) => certain[one.phi_confidence] + certain[one.psi_confidence] },
+    { name: 'Evidence', wide: true, key: (one) => one.evidence ?? -1 },
+    { name: 'Seen', wide: true, key: (one) => one.seen },
+    { name: 'Verdict', wide: true, key: (one) => judged(one.prim).verdict || '~' },
+  ];
+  const rows = [];
+
+  function objects() {
+    const head = $('table').tHead.rows[0];
+    COLUMNS.forEach((column, i) => {
+      const cell = el('th', { scope: 'col', class: column.wide ? 'wide' : '' });
+      if (column.key) {
+        const name = column.sign
+          ? [el('span', { class: 'word' }, `${column.name} `), column.sign] : [column.name];
+        cell.append(el('button', { type: 'button', onclick: () => sort(i) }, ...name));
+        cell.setAttribute('aria-sort', 'none');
+      } else cell.append(column.name);
+      head.append(cell);
+    });
+    for (const status of order) {
+      if (data.objects.some((one) => one.status === status)) {
+        $('filter-status').append(el('option', { value: status }, STATUS[status]));
+      }
+    }
+    data.objects.forEach((one, i) => rows.push(row(one, i)));
+    for (const id of ['filter-name', 'filter-status', 'filter-verdict']) $(id).addEventListener('input', filter);
+    $('filter').addEventListener('submit', (event) => event.preventDefault());
+    $('save').addEventListener('click', save);
+    addEventListener('beforeunload', (event) => { if (unsaved) event.preventDefault(); });
+    sort(2);
+    filter();
+  }
+
+  function row(one, i) {
+    const picture = one.photograph || one.model;
+    const swatch = el('span', { class: 'swatch', style: `background: ${css(one.base_color)}` });
+    const number = (value, error, sure) => {
+      if (one.status === 'lamp') return ['\u2013'];
+      const parts = [fixed(value)];
+      if (error !== null) parts.push(el('span', { class: 'error' }, ` \u00b1 ${fixed(error)}`));
+      return parts;
+    };
+    const detail = el('tr', { class: 'detail', id: `detail-${i}`, hidden: true }, el('td', { colspan: COLUMNS.length }));
+    const opener = el('button', {
+      type: 'button', class: 'name', 'aria-expanded': 'false', 'aria-controls': `detail-${i}`,
+      onclick: () => open(entry, detail.hidden),
+    }, one.label);
+    const verdict = el('td', { class: 'wide' });
+    const status = (css) => el('span', { class: `status ${one.status} ${css}` }, STATUS[one.status]);
+    const main = el('tr', { 'data-prim': one.prim },
+      el('td', {}, picture ? el('img', { class: 'crop', src: picture, alt: `${one.label} in frame ${one.frame}` }) : ''),
+      el('td', { class: 'named' }, opener, status('small')),
+      el('td', { class: 'wide' }, status('')),
+      el('td', { class: 'wide' }, one.status === 'lamp' ? 'shines' : swatch),
+      el('td', { class: 'number' }, ...number(one.phi, one.phi_error)),
+      el('td', { class: 'number' }, ...number(one.psi, one.psi_error)),
+      el('td', { class: 'wide' }, one.status === 'lamp' ? '\u2013' : `\u03c6 ${one.phi_confidence}, \u03c8 ${one.psi_confidence}`),
+      el('td', { class: 'wide number' }, one.evidence === null ? '\u2013' : percent(one.evidence, 0)),
+      el('td', { class: 'wide number' }, percent(one.seen, 0)),
+      verdict);
+    const entry = { one, main, detail, opener, verdict, filled: false };
+    $('table').tBodies[0].append(main, detail);
+    showVerdict(entry);
+    return entry;
+  }
+
+  function showVerdict(entry) {
+    const { verdict, directive, comment } = judged(entry.one.prim);
+    const words = { accept: 'accepted', reject: 'rejected' };
+    entry.verdict.replaceChildren(
+      el('span', { class: `status ${verdict || 'none'}` }, words[verdict] || 'none yet'),
+      ...(directive ? [el('span', { class: 'soft' }, ` (${directive})`)] : []),
+      ...(comment ? [el('span', { class: 'soft' }, ' with a comment')] : []),
+      ...(changed[entry.one.prim] ? [el('div', { class: 'soft' }, 'changed since')] : []));
+  }
+
+  function open(entry, wanted) {
+    if (wanted && !entry.filled) { fill(entry); entry.filled = true; }
+    entry.detail.hidden = !wanted;
+    entry.opener.setAttribute('aria-expanded', String(wanted));
+  }
+
+  function fill(entry) {
+    const { one } = entry, cell = entry.detail.cells[0];
+    const figure = (src, text) => el('figure', {}, el('img', { src, alt: `${one.label}: ${text}` }), el('figcaption', {}, text));
+    const pictures = el('div', {}, el('h3', {}, `Frame ${one.frame ?? '\u2013'}${one.frame === one.target ? ', which shows its highlight best' : ''}`),
+      el('div', { class: 'pair' },
+        one.photograph ? figure(one.photograph, 'photograph') : null,
+        one.model ? figure(one.model, 'model') : null));
+    if (!one.model) pictures.append(el('p', {}, 'No photograph shows it.'));
+    const facts = el('dl', { class: 'facts' });
+    const fact = (name, value) => facts.append(el('dt', {}, name), el('dd', {}, value));
+    if (one.status === 'lamp' && one.radiance) {
+      fact('Radiance', `${one.radiance.mean.map((value) => value.toPrecision(3)).join(', ')} (${one.radiance.status})`);
+    } else {
+      fact('Roughness \u03c6', `${fixed(one.phi, 3)} \u00b1 ${fixed(one.phi_error, 3)}, confidence ${one.phi_confidence}`);
+      if (one.f0) fact('F0 of the metal', one.f0.map((value) => fixed(value, 3)).join(', '));
+      else {
+        fact('Specular \u03c8', `${fixed(one.psi, 3)} \u00b1 ${fixed(one.psi_error, 3)}, confidence ${one.psi_confidence}`);
+        fact('\u03c8 is below', `${fixed(one.psi_upper, 3)} with 95 %`);
+      }
+      fact('Evidence', one.evidence === null ? '\u2013' : percent(one.evidence));
+      if (one.base_color) fact('Base colour', `${one.base_color.map((value) => fixed(value, 3)).join(', ')} (linear)`);
+    }
+    fact('Class', one.class || 'none');
+    fact('Area', `${one.area.toFixed(2)} m\u00b2, ${percent(one.seen)} seen, ${percent(one.clipped, 2)} clipped everywhere`);
+    fact('Prim', one.prim);
+    cell.append(el('div', { class: 'inner' },
+      el('div', {}, pictures, el('p', {}, one.why), changed[one.prim] ? el('p', { class: 'warning' }, changed[one.prim]) : null),
+      el('div', {}, facts),
+      el('div', {}, ...evidence(one)),
+      judge(entry)));
+  }
+
+  /* What lobes leave unexplained of the target frame, over phi and psi. */
+  function evidence(one) {
+    if (!one.costs) return [el('h3', {}, 'Evidence'), el('p', { class: 'soft' }, 'Too few pixels for a plot.')];
+    const { phis, psis, values } = one.costs;
+    const [width, height, left, top, side] = [290, 232, 38, 8, 200];
+    let best = [0, 0];
+    values.forEach((line, i) => line.forEach((value, j) => { if (value < values[best[0]][best[1]]) best = [i, j]; }));
+    const least = values[best[0]][best[1]];
+    const most = least + Math.max(0.02, Math.min(1.2, Math.max(...values.flat())) - least);
+    const drawing = el('svg', { viewBox: `0 0 ${width} ${height}`, width, role: 'img' });
+    const edges = (list) => [0, ...list.slice(1).map((value, k) => (value + list[k]) / 2), 1];
+    const [xs, ys] = [edges(phis), edges(psis)];
+    const px = (phi) => left + phi * side, py = (psi) => top + (1 - psi) * side;
+    values.forEach((line, i) => line.forEach((value, j) => {
+      const share = Math.min(Math.max((value - least) / (most - least), 0), 1);
+      drawing.append(el('rect', {
+        x: px(xs[i]), y: py(ys[j + 1]), width: (xs[i + 1] - xs[i]) * side + 0.5,
+        height: (ys[j + 1] - ys[j]) * side + 0.5, fill: ramp(1 - share),
+      }));
+    }));
+    if (one.phi !== null) {
+      const spread = (value, error) => [Math.max(value - (error || 0), 0), Math.min(value + (error || 0), 1)];
+      const [x1, x2] = spread(one.phi, one.phi_error), [y1, y2] = spread(one.psi, one.psi_error);
+      const cross = (colour, thick) => [
+        el('line', { x1: px(x1), x2: px(x2), y1: py(one.psi), y2: py(one.psi), stroke: colour, 'stroke-width': thick }),
+        el('line', { x1: px(one.phi), x2: px(one.phi), y1: py(y1), y2: py(y2), stroke: colour, 'stroke-width': thick })];
+      drawing.append(...cross('#000', 4), ...cross('#fff', 2));
+    }
+    for (const share of [0, 0.5, 1]) {
+      drawing.append(
+        el('text', { x: px(share), y: top + side + 16, 'text-anchor': 'middle' }, String(share)),
+        el('text', { x: left - 6, y: py(share) + 4, 'text-anchor': 'end' }, String(share)));
+    }
+    drawing.append(el('text', { x: left + side + 8, y: top + side + 16 }, '\u03c6'), el('text', { x: 4, y: top + 18 }, '\u03c8'));
+    drawing.setAttribute('aria-label',
+      `Cost over roughness and specular in frame ${one.frame}: least ${fixed(least)} of what no lobe leaves, at phi ${phis[best[0]]} and psi ${psis[best[1]]}; at psi 0 it is ${fixed(values[best[0]][0])}`);
+    return [el('h3', {}, 'Evidence of this frame'), drawing, el('p', { class: 'soft' },
+      `Bright: lobes that explain this frame best (the best one ${percent(1 - least, 0)} of what is left without any). Cross: the published numbers with their errors, which all frames tell.`)];
+  }
+
+  /* Viridis at five steps (CC0), linear in between. */
+  function ramp(share) {
+    const steps = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+    const k = Math.min(Math.floor(share * 4), 3), t = share * 4 - k;
+    return `rgb(${steps[k].map((value, c) => Math.round(value + t * (steps[k + 1][c] - value))).join(' ')})`;
+  }
+
+  function sort(index) {
+    const cells = [...$('table').tHead.rows[0].cells], cell = cells[index];
+    const down = cell.getAttribute('aria-sort') === 'ascending';
+    cells.forEach((other) => { if (other.hasAttribute('aria-sort')) other.setAttribute('aria-sort', 'none'); });
+    cell.setAttribute('aria-sort', down ? 'descending' : 'ascending');
+    const { key } = COLUMNS[index], sign = down ? -1 : 1;
+    rows.sort((a, b) => {
+      const [x, y] = [key(a.one), key(b.one)];
+      return sign * (x < y ? -1 : x > y ? 1 : 0) || a.one.label.localeCompare(b.one.label);
+    });
+    for (const { main, detail } of rows) $('table').tBodies[0].append(main, detail);
+  }
+
+  function filter() {
+    const name = $('filter-name').value.toLowerCase(), status = $('filter-status').value;
+    const verdict = $('filter-verdict').value;
+    let shown = 0;
+    for (const entry of rows) {
+      const { one } = entry, given = judged(one.prim).verdict;
+      const kept = one.label.toLowerCase().includes(name) && (!status || one.status === status)
+        && (!verdict || (verdict === 'changed' ? Boolean(changed[one.prim]) : (given || 'none') === verdict));
+      entry.main.hidden = !kept;
+      entry.detail.hidden = !kept || entry.opener.getAttribute('aria-expanded') !== 'true';
+      shown += kept;
+    }
+    $('count').textContent = `${shown} of ${rows.length} objects`;
+  }
+
+  /* --- Verdicts ------------------------------------------------------------------------------ */
+
+  function judge(entry) {
+    const { one } = entry, now = judged(one.prim), name = `verdict-${one.id}`;
+    const comment = el('textarea', { maxlength: 2000, rows: 3 });
+    comment.value = now.comment;
+    const directive = el('select', {}, ...['', 'ignore', 'metal', 'glass', 'lamp', 'refit']
+      .map((word) => el('option', { value: word, selected: word === now.directive }, word || 'none')));
+    const choices = [['', 'none yet'], ['accept', 'accept'], ['reject', 'reject']].map(([value, text]) =>
+      el('label', {}, el('input', { type: 'radio', name, value, checked: value === now.verdict, onchange: note }), ` ${text}`));
+    function note() {
+      const chosen = form.querySelector('input:checked').value;
+      review.set(one.prim, { verdict: chosen, comment: comment.value.trim(), directive: directive.value });
+      unsaved = true;
+      $('saved').textContent = 'not saved yet';
+      showVerdict(entry);
+    }
+    comment.addEventListener('input', note);
+    directive.addEventListener('change', note);
+    const form = el('fieldset', {}, el('legend', {}, `Your verdict on ${one.label}`),
+      el('div', { class: 'bar' }, ...choices),
+      el('label', {}, 'Comment', comment),
+      el('label', {}, 'For the next run (kept; no step acts on it yet) ', directive));
+    return form;
+  }
+
+  const escaped = (text) => text.replace(/\\/g, '\\\\').replace(/"/g, '\\"').replace(/\r/g, '').replace(/\n/g, '\\n');
+
+  /* The verdicts as the layer review.usda, as usdbrdf itself writes it. */
+  function layer() {
+    const tree = {};
+    for (const one of data.objects) {
+      const { verdict, comment, directive } = judged(one.prim);
+      if (!(verdict || comment || directive)) continue;
+      let node = tree;
+      for (const part of one.prim.split('/').filter(Boolean)) node = (node[part] ??= {});
+      node[''] = { verdict, comment, directive, status: one.fit, phi: one.phi, psi: one.psi };
+    }
+    const write = (node, indent) => Object.entries(node).filter(([name]) => name).map(([name, inner]) => {
+      const said = inner[''], pad = ' '.repeat(indent);
+      let text = `${pad}over "${name}"`;
+      if (said) {
+        const lines = Object.entries(said).filter(([, value]) => value !== null && value !== '')
+          .map(([key, value]) => (typeof value === 'number'
+            ? `double ${key} = ${value}` : `string ${key} = "${escaped(value)}"`));
+        text += ` (\n${pad}    customData = {\n${pad}        dictionary usdbrdf = {\n${pad}            dictionary review = {\n`
+          + lines.map((line) => `${pad}                ${line}\n`).join('')
+          + `${pad}            }\n${pad}        }\n${pad}    }\n${pad})`;
+      }
+      return `${text}\n${pad}{\n${write(inner, indent + 4)}${pad}}\n`;
+    }).join('');
+    return `#usda 1.0\n(\n    customLayerData = {\n        dictionary usdbrdf = {\n            string role = "review"\n        }\n    }\n    defaultPrim = "${data.name}"\n)\n\n${write(tree, 0)}`;
+  }
+
+  async function save() {
+    if (data.served) {
+      const answer = await fetch(data.served, {
+        method: 'POST', headers: { 'Content-Type': 'application/json' },
+        body: JSON.stringify(Object.fromEntries(review)),
+      }).catch(() => null);
+      if (!answer || !answer.ok) {
+        $('saved').textContent = answer ? `not saved: ${await answer.text()}` : 'not saved: usdbrdf view has ended';
+        return;
+      }
+      $('saved').textContent = 'saved in review.usda';
+    } else {
+      const link = el('a', {
+        href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
+      });
+      link.click();
+      $('saved').textContent = 'review.usda was handed to you: put it beside edits.usda';
+    }
+    unsaved = false;
+  }
+
+  /* --- Views --------------------------------------------------------------------------------- */
+
+  const PICTURES = { photograph: 'photograph', baseline: 'diffuse baseline', full: 'full model' };
+
+  function views() {
+    const body = $('slider'), all = data.views;
+    if (!all.length) { body.append(el('p', {}, 'No views.')); return; }
+    const names = Object.keys(PICTURES).filter((name) => all[0][name]);
+    const choose = (label, start) => {
+      const select = el('select', { onchange: show }, ...names.map((name) => el('option', { value: name, selected: name === start }, PICTURES[name])));
+      return [select, el('label', {}, `${label} `, select)];
+    };
+    const [left, leftLabel] = choose('Left', names[0]), [right, rightLabel] = choose('Right', 'full');
+    const view = el('select', { onchange: show, id: 'view' }, ...all.map((one, i) => el('option', { value: i }, title(one))));
+    const step = (by) => { view.value = (Number(view.value) + by + all.length) % all.length; show(); };
+    const under = el('img', { alt: '' }), over = el('img', { alt: '' });
+    const tags = [el('span', { class: 'tag left' }), el('span', { class: 'tag right' })];
+    const frame = el('div', { class: 'compare' }, under, el('div', { class: 'over' }, over), el('div', { class: 'edge' }), ...tags);
+    const at = el('input', { type: 'range', id: 'at', min: 0, max: 100, value: 50, 'aria-label': 'Where the left picture ends, in percent of the width', oninput: move });
+    const flips = el('div', { class: 'flips' }), told = el('p', { class: 'soft' });
+    function move() { frame.style.setProperty('--at', `${at.value}%`); }
+    frame.addEventListener('pointermove', (event) => {
+      if (event.buttons !== 1) return;
+      const box = frame.getBoundingClientRect();
+      at.value = Math.round((100 * (event.clientX - box.left)) / box.width);
+      move();
+    });
+    frame.addEventListener('dragstart', (event) => event.preventDefault());
+    function show() {
+      const one = all[view.value];
+      over.src = one[left.value]; under.src = one[right.value];
+      over.alt = `${title(one)}: ${PICTURES[left.value]}`;
+      under.alt = `${title(one)}: ${PICTURES[right.value]}`;
+      tags[0].textContent = PICTURES[left.value]; tags[1].textContent = PICTURES[right.value];
+      const { row } = one;
+      told.textContent = `FLIP ${fixed(row.flip_baseline, 4)} (baseline), ${fixed(row.flip_full, 4)} (full model); relative L2 without lamps ${fixed(row.l2_baseline, 4)} and ${fixed(row.l2_full, 4)}; ${percent(row.compared, 0)} of the pixels are compared.`;
+      flips.replaceChildren(...['baseline', 'full'].map((model) => el('figure', {},
+        el('img', { src: one[`flip_${model}`], alt: `FLIP error map of the ${PICTURES[model]}, ${title(one)}` }),
+        el('figcaption', {}, `FLIP, ${PICTURES[model]}: mean ${fixed(row[`flip_${model}`], 4)}. Black: equal; pale yellow: wrong; grey: not compared.`))));
+      move();
+    }
+    body.append(
+      el('div', { class: 'bar' },
+        el('label', {}, 'View ', view),
+        el('button', { type: 'button', onclick: () => step(-1) }, 'previous'),
+        el('button', { type: 'button', onclick: () => step(1) }, 'next'), leftLabel, rightLabel),
+      frame, at, told, flips);
+    show();
+    const line = (metric) => ['baseline', 'full'].map((model) => ({
+      name: PICTURES[model], css: model, points: data.plot.map((row) => [row.number, row[`${metric}_${model}`] ?? NaN]),
+    }));
+    $('plots').append(
+      chart('Relative L2 over the frames', 'without lamps; small pictures', line('l2')),
+      chart('FLIP over the frames', 'mean of small pictures', line('flip')));
+  }
+  const title = (one) => `frame ${one.row.number}${one.row.view ? `, ${one.row.view}` : ''}`;
+
+  /* --- Maps ---------------------------------------------------------------------------------- */
+
+  function maps() {
+    data.maps.forEach((map, i) => $('map-name').append(el('option', { value: i }, map.title)));
+    data.maps[0].pictures.forEach((_, i) => $('map-view').append(
+      el('option', { value: i }, data.views[i] ? title(data.views[i]) : `view ${i + 1}`)));
+    const show = () => {
+      const map = data.maps[$('map-name').value];
+      $('map-picture').src = map.pictures[$('map-view').value];
+      $('map-picture').alt = `${map.title}, as seen in ${$('map-view').selectedOptions[0].textContent}`;
+      $('map-legend').textContent = map.legend;
+    };
+    $('map-name').addEventListener('change', show);
+    $('map-view').addEventListener('change', show);
+    show();
+  }
+
+  /* --- Room ---------------------------------------------------------------------------------- */
+
+  function colours() {
+    const status = { measured: [0, 0.34, 0.17], prior: [0.79, 0.35, 0], unseen: [0.3, 0.3, 0.3], failed: [0.66, 0.11, 0], lamp: [0.87, 0.77, 0.05] };
+    const verdicts = { accept: [0, 0.34, 0.17], reject: [0.66, 0.11, 0] };
+    const number = (value) => (value === null ? [0.3, 0, 0.3]
+      : ramp(value).match(/\d+/g).map((byte) => (Number(byte) / 255) ** 2.2));
+    const of = (get) => Object.fromEntries(data.objects.map((one) => [one.prim, get(one)]));
+    return {
+      status: of((one) => status[one.status]), phi: of((one) => number(one.phi)), psi: of((one) => number(one.psi)),
+      get verdict() { return of((one) => verdicts[judged(one.prim).verdict] || [0.3, 0.3, 0.3]); },
+    };
+  }
+
+  async function room() {
+    const body = $('room-body');
+    const fallback = (why) => {
+      body.replaceChildren(el('p', {}, why), el('p', {}, 'Pictures instead:'),
+        el('div', { class: 'flips' }, ...data.views.slice(0, 4).map((one) =>
+          el('figure', {}, el('img', { src: one.full, alt: `Full model, ${title(one)}` }), el('figcaption', {}, title(one))))));
+      body.dataset.state = 'pictures';
+    };
+    if (!data.room) { fallback('This page was made without a model of the room.'); return; }
+    const probe = document.createElement('canvas');
+    if (!(probe.getContext('webgl2') && window.DecompressionStream)) {
+      fallback('This browser shows no 3D (WebGL 2).');
+      return;
+    }
+    const canvas = el('canvas', {
+      tabindex: 0, role: 'application',
+      'aria-label': 'The room in 3D. Arrow keys turn, plus and minus come closer and go away, Enter picks what is in the middle.',
+    });
+    const picked = el('div', { class: 'picked', role: 'status' });
+    const pick = (prim) => {
+      const one = data.objects.find((other) => other.prim === prim);
+      picked.textContent = !one ? '' : one.status === 'lamp' ? `${one.label}: lamp`
+        : `${one.label}: ${STATUS[one.status]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, \u03c8 ${fixed(one.psi)} \u00b1 ${fixed(one.psi_error)}`;
+      canvas.dataset.picked = one ? one.prim : '';
+    };
+    let model;
+    try { model = await usdbrdfRoom.start(canvas, data.room, colours(), pick); } catch (error) {
+      fallback(`The room cannot be shown in 3D here (${error.message}).`);
+      return;
+    }
+    window.usdbrdfModel = model;
+    const looks = { shaded: 'lit by its lamps', lit: 'as photographed', base_color: 'base colour', phi: 'roughness \u03c6', psi: 'specular \u03c8', status: 'what is known', verdict: 'verdicts' };
+    const look = el('select', { id: 'look', onchange: () => model.setLook(look.value) },
+      ...Object.entries(looks).map(([value, text]) => el('option', { value }, text)));
+    const lamps = data.room.lamps.map((lamp, i) => el('label', {},
+      el('input', { type: 'checkbox', checked: true, onchange: (event) => model.setLamp(i, event.target.checked) }), ` ${lamp.label}`));
+    const range = (label, value, max = 1) => {
+      const input = el('input', { type: 'range', min: 0, max, step: 0.01, value, oninput: moved });
+      return [input, el('label', {}, `${label} `, input)];
+    };
+    const [[strength, a], [x, b], [y, c], [z, d]] = [range('strength', 0, 2), range('left to right', 0.5), range('height', 0.7), range('near to far', 0.5)];
+    function moved() { model.moveLight(Number(x.value), Number(y.value), Number(z.value), Number(strength.value)); }
+    body.append(
+      el('div', { class: 'bar' }, el('label', {}, 'Look ', look), el('button', { type: 'button', onclick: () => model.home() }, 'back to the start')),
+      el('div', { class: 'stage' }, canvas, picked),
+      el('p', { class: 'soft' }, 'Drag to turn, scroll to come closer, click an object for its numbers. Light that surfaces send on to each other is one constant here: pictures of relight are exact.'),
+      el('fieldset', {}, el('legend', {}, 'Captured lamps'), el('div', { class: 'bar' }, ...(lamps.length ? lamps : ['None was found.']))),
+      el('fieldset', {}, el('legend', {}, 'A light of your own'), el('div', { class: 'bar' }, a, b, c, d)));
+    body.dataset.state = 'model';
+  }
+
+  function carries() {
+    const told = [
+      data.photographs
+        ? `Photographs: ${data.objects.filter((one) => one.photograph).length} parts around objects and ${data.views.length} whole ones, reduced, without metadata such as EXIF or places; their file names.`
+        : 'No photograph and no name of one. What was measured from them, such as textures and the model\u2019s pictures, may still show what they show.',
+      `Pictures made from the asset: ${data.views.length} views by two models with error maps, ${data.maps.length} maps, ${data.objects.length} objects, a map of the room.`,
+      data.room ? 'The room as geometry with its textures (glTF), and its lamps.' : 'No geometry.',
+      'Names of objects and prims, numbers with their errors, verdicts and comments.',
+      'No path of the computer that it was made on, and no address: nothing is loaded when it is opened.',
+    ];
+    $('carries').append(...told.map((sentence) => el('li', {}, sentence)));
+  }
+
+  capture();
+  objects();
+  views();
+  maps();
+  carries();
+  room().finally(() => { document.body.dataset.ready = 'yes'; });
+})();
