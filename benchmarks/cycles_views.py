@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keep the pictures in this folder")
     chosen = parser.parse_args()
     asset, atlas = measured_atlas(chosen.asset)
-    views = photographs_of_views(chosen.views, asset, atlas.stage, atlas.scene)
+    views = photographs_of_views(chosen.views, asset, atlas.stage, atlas.scene, Path())
     count = min(len(views.frames), chosen.first or len(views.frames))
     exposure = exposure_of_views(views.frames)
     found = {}

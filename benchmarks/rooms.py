@@ -143,7 +143,9 @@ def room_figures(capture: Path, folder: Path) -> dict[str, Any]:
         for o, pixels in zip(maps.scene.objects, shown, strict=True)
         if o.label in truth
     ]
-    views = photographs_of_views(capture / "truth/views.json", asset, maps.stage, maps.scene)
+    views = photographs_of_views(
+        capture / "truth/views.json", asset, maps.stage, maps.scene, Path()
+    )
     return {
         "room": capture.name,
         "base_color": base_color(maps, views.frames, capture / "truth", truth, labels),

@@ -46,6 +46,8 @@ SLOW = (
     "test_convert.py",
     "test_identity.py",
     "test_units.py",
+    "texturing/test_earlier.py",
+    "texturing/test_pose_steps.py",
 )
 
 # Sweeps whose cases take seconds each: every third runs for each change, the others at night.

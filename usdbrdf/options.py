@@ -214,6 +214,9 @@ class IngestOptions(Options):
     exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
     """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
     or darker than the others do of the same surfaces is divided out"""
+    refine_poses: bool = option("--refine-poses", False)
+    """let every camera take a small step after which its frame agrees better with the others about
+    the mesh; the poses as captured are kept beside"""
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )

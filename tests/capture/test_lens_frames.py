@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.develop import resampled
 from usdbrdf.capture.lens_views import pinhole_views
+from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
@@ -298,7 +300,7 @@ def test_photographs_of_eight_bits_become_linear_frames(tmp_path):
     stage = open_weaker(asset, "texturing")
     frames = frames_from_stage(stage)
     assert (frames.encoding, frames.radiometric) == ("lin_rec709_scene", False)
-    others = photographs_of_views(views.manifest, asset, stage, scene_from_stage(stage))
+    others = photographs_of_views(views.manifest, asset, stage, scene_from_stage(stage), tmp_path)
     expected = np.array(made.radiance["walls"]) / 8
     for some in (frames, others.frames):
         pixels, shown = read_frame(some, 0), surface_of(made, some.camera(0))
@@ -313,6 +315,13 @@ def test_a_lens_that_shows_nothing_is_dropped_with_words(tmp_path):
         document |= {"cx": 400.0, "k2": 0.0}
     with pytest.raises(InputRefused, match=r"make no lens.*\[capture\.camera\]"):
         read_scan(made.folder, IngestOptions())
+
+
+def test_inspect_tells_whether_photographs_through_lenses_agree(tmp_path, capsys):
+    made = capture_through(tmp_path / "room", "OPENCV", scale=2)
+    assert main(["inspect", str(made.folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["agreement"] < 0.4
+    assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
 def test_a_plain_capture_has_no_views(tmp_path):

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 import usdbrdf
+from tests.lens_scenes import capture_through, surface_of
 from tests.scenes import edited, make_capture, ring_of_poses
 from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas
+from usdbrdf.files.frames import read_frame
 
 
 def read(asset, document):
     place, atlas = measured_atlas(asset)
-    return atlas, photographs_of_views(document, place, atlas.stage, atlas.scene)
+    return atlas, photographs_of_views(document, place, atlas.stage, atlas.scene, document.parent)
 
 
 def test_the_captures_own_document_gives_its_frames(room):
@@ -53,6 +55,24 @@ def test_an_applied_transform_is_undone(room, tmp_path):
             frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
     _, views = read(room.asset, held_out.manifest)
     assert np.abs(views.frames.world_from_camera - held_out.world_from_camera).max() < 1e-9
+
+
+@pytest.mark.parametrize(("model", "faces"), [("OPENCV", 1), ("EQUIRECTANGULAR", 6)])
+def test_views_through_lenses_become_pinhole_frames(room, tmp_path, model, faces):
+    pytest.importorskip("pycolmap")
+    held_out = capture_through(tmp_path, model, frames=3)
+    _, views = read(room.asset, held_out.manifest)
+    assert len(views.frames) == len(views.names) == 3 * faces
+    assert views.names[0] == "frames/0000.exr" + (" front" if faces > 1 else "")
+    seen = 0
+    for i in range(len(views.frames)):
+        pixels, shown = read_frame(views.frames, i), surface_of(held_out, views.frames.camera(i))
+        for k, name in enumerate(held_out.names):
+            own = (shown == k) & pixels.valid
+            seen += int(own.sum())
+            off = np.abs(pixels.radiance[own] / held_out.radiance[name] - 1)
+            assert off.max(initial=0) < 0.01, (views.names[i], name)
+    assert seen > 500
 
 
 def test_a_view_that_cannot_be_used_is_left_out(room, tmp_path):

@@ -29,7 +29,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames, Scan, View
+from usdbrdf.model.capture import Frames, View
 from usdbrdf.model.lens import Lens
 
 # Where a file of the asset is written: its path there, and what writes it at a place.
@@ -109,18 +109,16 @@ def _views(record: FrameRecord) -> list[PinholeView]:
     return [view for view in found if shows_any(view, *camera, white)]
 
 
-def developed(scan: Scan, folder: Path, place: Place) -> Frames:
-    """The scan's frames with images below ``folder``; those that are views of photographs are
-    handed to ``place``, one after the other.
+def developed(frames: Frames, views: Sequence[View | None], folder: Path, place: Place) -> Frames:
+    """The frames with images below ``folder``; those that are ``views`` of photographs (see
+    ``Scan``) are handed to ``place``, one after the other.
 
     Images keep the encoding of the photographs, but for 8-bit ones, which become linear.
     """
-    frames = scan.frames
-    if not any(scan.views):
+    if not any(views):
         return frames
-    views = [(i, view) for i, view in enumerate(scan.views) if view is not None]
-    shown = progress(views, total=len(views), label="ingest: lenses", unit="frames")
-    for i, view in shown:
+    some = [(i, view) for i, view in enumerate(views) if view is not None]
+    for i, view in progress(some, total=len(some), label="lenses", unit="frames"):
         place(str(frames.image_paths[i]), partial(_write_frame, frames, i, view))
     for cache in (_recorded, _places, mask_at_size):
         cache.cache_clear()
@@ -130,6 +128,16 @@ def developed(scan: Scan, folder: Path, place: Place) -> Frames:
         image_paths=tuple(folder / path for path in frames.image_paths),
         encoding="lin_rec709_scene" if linear else frames.encoding,
     )
+
+
+def developed_in(frames: Frames, views: Sequence[View | None], folder: Path) -> Frames:
+    """``developed`` into a folder that is there."""
+
+    def write_there(name: str, write: Callable[[Path], None]) -> None:
+        (folder / name).parent.mkdir(exist_ok=True)
+        write(folder / name)
+
+    return developed(frames, views, folder, write_there)
 
 
 def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:

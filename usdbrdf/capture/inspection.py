@@ -23,7 +23,7 @@ from usdbrdf.errors import ImageRefused, UsageError, UsdBrdfError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Float
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Frames, Scan, View
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
 from usdbrdf.options import IngestOptions, InspectOptions
 
@@ -53,6 +53,7 @@ class Inspection:
 
     adapter, description  of the one that recognised it; "" where none did
     frames, radiance      None where they could not be read
+    views                 how frames come of photographs, as those of a Scan
     mesh, objects         in the capture's unit, meters_per_unit and up_axis those of a Scan
     dropped               frames that cannot be used
     looked_at             frames whose pixels were checked
@@ -66,6 +67,7 @@ class Inspection:
     adapter: str = ""
     description: str = ""
     frames: Frames | None = None
+    views: tuple[View | None, ...] = ()
     radiance: Radiance | None = None
     mesh: ScanMesh | None = None
     objects: tuple[ObjectLabel, ...] = ()
@@ -219,6 +221,7 @@ def _of_scan(seen: Inspection, scan: Scan, options: IngestOptions) -> Inspection
     return replace(
         seen,
         frames=scan.frames,
+        views=scan.views,
         radiance=radiance_of_frames(scan.frames.as_recorded(), options.looked_at),
         mesh=scan.mesh,
         objects=scan.objects,

@@ -99,6 +99,8 @@ def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
     saturation = float(frames.saturation_radiance[i])
     if frames.radiometric and math.isfinite(saturation):
         entry["saturation_radiance"] = saturation
+    if frames.captured_pose is not None:
+        entry["captured_transform_matrix"] = frames.captured_pose[i].tolist()
     if frames.radiometric and frames.noise_floor_radiance[i] > 0:
         entry["noise_floor_radiance"] = float(frames.noise_floor_radiance[i])
     return entry

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec
+from typing import NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cam
 from usdbrdf.geometry.unwrap import connected_triangles
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Frames, Scan, frames_at
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
@@ -388,18 +388,6 @@ def _sides(
         # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
         sides = replace(sides, both=np.zeros_like(sides.both))
     return sides, outside
-
-
-def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
-    """The frames with these indices, in this order."""
-    rows = np.asarray(indices, np.int64)
-    columns: dict[str, Any] = {
-        k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
-    }
-    for name in ("image_paths", "photographs", "masks", "lenses"):
-        found = getattr(frames, name)
-        columns[name] = tuple(found[i] for i in rows) if found else ()
-    return replace(frames, **columns)
 
 
 def as_photographs(

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -66,13 +67,16 @@ def evaluate(
     """
     chosen = options or EvaluateOptions()
     place, atlas = measured_atlas(Path(asset))
-    with report.output_folder(Path(output), DOCUMENT, (place,)) as work:
+    with (
+        report.output_folder(Path(output), DOCUMENT, (place,)) as work,
+        TemporaryDirectory(prefix="usdbrdf-") as folder,
+    ):
         known = {}
         if chosen.truth is not None:
             albedo = _map_or(atlas, "base_color", "albedo")
             known = {"truth": metrics.compare_with_truth(atlas, chosen.truth, chosen.mesh, albedo)}
         photographs = photographs_of_views(
-            Path(views), place, atlas.stage, atlas.scene, chosen.allow_outside
+            Path(views), place, atlas.stage, atlas.scene, Path(folder), chosen.allow_outside
         )
         exposure = exposure_of_views(photographs.frames)
         seen = viewed_asset(place, atlas, chosen.environment)

@@ -146,7 +146,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                     )
             except InputRefused:  # absent or damaged: it only says whose folder this is
                 write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
-            for folder in (state, state / "stamps", state / "work"):
+            for folder in (state, *(state / name for name in ("stamps", "work", "cache"))):
                 inside(asset, folder).mkdir(exist_ok=True)
                 for litter in folder.glob(f"{TEMPORARY_PREFIX}*"):
                     litter.unlink(missing_ok=True)  # what killed processes left half
@@ -184,7 +184,7 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
     entries = {entry.name for entry in asset.iterdir()} if place == asset else set()
     # Killed between the first mkdir and job.json: nothing of anybody's can be in there yet.
     begun = entries == {STATE_FOLDER} and all(
-        entry.name in ("stamps", "work", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
+        entry.name in ("stamps", "work", "cache", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
         for entry in state.iterdir()
     )
     if entries and not begun and not (state / "job.json").is_file():

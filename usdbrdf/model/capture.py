@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from usdbrdf.model.arrays import Bool, Double, Int
 from usdbrdf.model.camera import Camera
@@ -33,6 +37,7 @@ class Frames:
     lenses                the lenses of these photographs in words, "" where there is none
     gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
                           by, to be divided out; the limits above are those of what is left
+    captured_pose         (N, 4, 4) float64 or None: world_from_camera before it was refined
     """
 
     image_paths: tuple[Path, ...]
@@ -48,6 +53,7 @@ class Frames:
     masks: tuple[Path | None, ...] = ()
     lenses: tuple[str, ...] = ()
     gain: Double | None = None
+    captured_pose: Double | None = None
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -74,6 +80,18 @@ class Frames:
             height=height,
             name=self.image_paths[i].name,
         )
+
+
+def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
+    """The frames with these indices, in this order."""
+    rows = np.asarray(indices, np.int64)
+    columns: dict[str, Any] = {
+        k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
+    }
+    for name in ("image_paths", "photographs", "masks", "lenses"):
+        found = getattr(frames, name)
+        columns[name] = tuple(found[i] for i in rows) if found else ()
+    return replace(frames, **columns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.capture.develop import developed
 from usdbrdf.capture.native import refuse_taken, write_capture
 from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.capture_inputs import inputs_of_capture
 from usdbrdf.tasks.photometry import asked_of_its_pixels
@@ -64,11 +65,12 @@ def ingest(
         check_root(asset, header)
         # Photographs through lenses become frames when nothing but pixels can be refused.
         files = [str(path) for path in scan.frames.image_paths]
-        scan = replace(scan, frames=developed(scan, asset.folder, run.output_kept))
+        frames = developed(scan.frames, scan.views, asset.folder, run.output_kept)
+        scan = replace(scan, frames=frames)
         images = [run.kept.get(file, Path(file)) for file in files]
         asked, told = asked_of_its_pixels(scan, images, options)
         if copy_to is not None:
-            write_capture(scan, images, copy_to)
+            write_capture(_as_posed(scan, asked), images, copy_to)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
@@ -90,6 +92,17 @@ def ingest(
     result = task.run(work)
     if copy_to is not None and not result.reran:
         scan = read_with(chosen, capture, options)
-        scan = replace(scan, frames=developed(scan, asset.folder, lambda *_: None))
-        write_capture(scan, scan.frames.image_paths, copy_to)
+        frames = developed(scan.frames, scan.views, asset.folder, lambda *_: None)
+        scan = replace(scan, frames=frames)
+        again = options.refine_poses
+        asked = asked_of_its_pixels(scan, frames.image_paths, options)[0] if again else scan
+        write_capture(_as_posed(scan, asked), frames.image_paths, copy_to)
     return result
+
+
+def _as_posed(scan: Scan, asked: Scan) -> Scan:
+    """The scan, whose files are copied as they are, with refined poses."""
+    refined, captured = asked.frames.world_from_camera, asked.frames.captured_pose
+    return replace(
+        scan, frames=replace(scan.frames, world_from_camera=refined, captured_pose=captured)
+    )

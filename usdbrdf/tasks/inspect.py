@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.capture.develop import developed_in
 from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
+from usdbrdf.model.capture import frames_at
 from usdbrdf.options import InspectOptions
-from usdbrdf.tasks.photometry import agreement_of_frames
+from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
 
 
 def inspect(
@@ -21,11 +25,13 @@ def inspect(
     found = inspect_capture(capture, options, adapter, plugins=plugins)
     if found.mesh is None or found.frames is None or not found.could_be_read:
         return found
-    if any(found.frames.photographs):  # not resampled out of these yet
-        return found
     try:
-        read = partial(read_frame, found.frames)
-        agrees = agreement_of_frames(found.mesh, found.frames, read, capture)
+        with TemporaryDirectory(prefix="usdbrdf-") as folder:
+            asked = spread_evenly(len(found.frames), ASKED)
+            views = [found.views[i] for i in asked] if found.views else []
+            frames = developed_in(frames_at(found.frames, asked), views, Path(folder))
+            read = partial(read_frame, frames)
+            agrees = agreement_of_frames(found.mesh, frames, read, capture)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))
     return replace(found, agreement=agrees and agrees.ratio)

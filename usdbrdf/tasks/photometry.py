@@ -14,12 +14,13 @@ import numpy as np
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import FramePixels, read_frame, read_frames
+from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import IngestOptions
+from usdbrdf.tasks.poses import Read, with_refined_poses
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,
@@ -31,9 +32,8 @@ from usdbrdf.texturing.agreement import (
 from usdbrdf.texturing.exposures import with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
 
-Read = Callable[[int], FramePixels]
 # Frames that are asked whether they agree.
-_ASKED = 16
+ASKED = 16
 
 
 def asked_of_its_pixels(
@@ -44,6 +44,8 @@ def asked_of_its_pixels(
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
     told: dict[str, Any] = {"agreement": agrees and agrees.ratio}
+    if options.refine_poses:
+        scan, told["refined_poses"] = with_refined_poses(scan, read)
     if options.exposure == "estimate":
         scan, told["estimated_exposures"] = estimated_exposures(scan, read)
     return scan, told
@@ -58,7 +60,7 @@ def agreement_of_frames(
     reading of the poses.
     """
     surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
-    asked = spread_evenly(len(frames), _ASKED)
+    asked = spread_evenly(len(frames), ASKED)
 
     def under(readings: Mapping[str, Callable[[Double], Double]]) -> dict[str, Agreement | None]:
         found: dict[str, list[Float]] = {name: [] for name in readings}

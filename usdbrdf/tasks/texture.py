@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,14 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
-from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
+from usdbrdf.tasks.atlas import new_charts
 from usdbrdf.tasks.task import Task, warned
-from usdbrdf.texturing.footprints import texel_sizes_from_frames
+from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
-from usdbrdf.texturing.passes import most_texels
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
@@ -41,19 +40,18 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     def work(run: TaskRun) -> dict[str, Any]:
         scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
-        if options.texel_size:
-            sizes = TexelSizes.even(scene, options.texel_size)
-        else:
-            most = options.max_texels or most_texels(options.memory)
-            sizes = texel_sizes_from_frames(scene, rays, frames, most)
-        given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
-        charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, sizes))
+        going_on = GoingOn.of(
+            run, scene, frames, task.parameters, partial(new_charts, maps, rays, options)
+        )
+        charts = going_on.charts
         scene = replace(scene, corner_uv=charts["corner_uv"])
         surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)
-        sides = sizes.of_objects(scene)
+        sides = charts["sides"].tolist()
         side = 1000 * float(np.median(sides))
         say(f"texture: {len(surface.texels):,} texels of {side:.3g} mm, {len(frames)} frames")
-        found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
+        found = lit_texture_from_frames(
+            run, surface, frames, options.quantile, options.memory, going_on
+        )
         doubts = warned(found.doubts())
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, sides, options.quantile)

@@ -19,7 +19,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
 from usdbrdf.transport.rays import RayScene
 
-_MIN_COSINE = calibration.number("agreement.min_cosine")
+MIN_COSINE = calibration.number("agreement.min_cosine")
 _AGREES = calibration.number("agreement.agrees")
 _BETTER = calibration.number("agreement.better")
 _POINTS, _SEED = 4096, 0
@@ -67,7 +67,7 @@ def _seen(surface: SurfacePoints, rays: RayScene, camera: Camera) -> tuple[Bool,
     way = surface.point - camera.eye
     distance = np.linalg.norm(way, axis=1)
     before = way @ -camera.world_from_camera[:3, 2] > 1e-6 * distance
-    seen = before & ((surface.normal * way).sum(axis=1) < -_MIN_COSINE * distance)
+    seen = before & ((surface.normal * way).sum(axis=1) < -MIN_COSINE * distance)
     place = np.full((len(way), 2), -1.0)
     place[seen] = camera.project(surface.point[seen])
     cell = np.floor(place)

@@ -11,11 +11,12 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame, read_frames
-from usdbrdf.job.progress import progress
+from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.capture import Frames, frames_at
 from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
@@ -65,33 +66,45 @@ class LitTexture:
 
 
 def lit_texture_from_frames(
-    run: TaskRun, surface: TexturedScene, frames: Frames, quantile: float, memory: float | None
+    run: TaskRun,
+    surface: TexturedScene,
+    frames: Frames,
+    quantile: float,
+    memory: float | None,
+    going_on: GoingOn,
 ) -> LitTexture:
     """Project all frames, in as many passes over them as ``memory`` (GiB) asks for.
 
-    run  keeps what is done for a run that goes on
+    run       keeps what is done, should it be interrupted
+    going_on  in which order frames come, and what is known of the first of them
 
     Raises InputRefused where no frame shows any surface.
     """
     texels = surface.texels
 
     def measured(part: slice) -> dict[str, Array]:
-        """Some texels in all frames, going on from the last saved state of an interrupted run."""
-        name = f"frames-{part.start}-{part.stop}"
+        """Some texels in all frames, going on from the last saved state of an interrupted run, or
+        of one with fewer frames."""
+        name = going_on.name(f"frames-{part.start}-{part.stop}")
+        start, earlier, saved = 0, going_on.statistics(part), run.latest(name)
         observed = Observation.empty(part, Probes.empty(len(texels), len(frames), part))
-        start, saved = 0, run.latest(name)
         if saved is not None:
             start = saved[0] + 1
             observed.restore(saved[1])
+        elif earlier is not None and observed.restore_earlier(earlier[1]):
+            start = earlier[0]
+            say(f"texture: goes on from the statistics of {start} frames")
         images = read_frames(partial(read_frame, frames), range(start, len(frames)))
         sampled = samples_from_frames(surface, frames, images, part)
         for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
             observed.add(some, quantile)
             run.save_latest_in_time(name, some.frame, observed.arrays)
+        going_on.keep_statistics(part, observed.arrays())
         return observed.measured(quantile)
 
+    frames = frames_at(frames, going_on.order)
     groups = groups_of_texels(texels, surface.scene, frames, memory)
-    found = Measured(**in_passes(run, "texels", groups, measured))
+    found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
     return _filled_in(texels, found, contradicting_frames(frames, found.probes))
 
 

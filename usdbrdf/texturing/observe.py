@@ -233,6 +233,16 @@ class Observation:
         for name, values in self.arrays().items():
             values[...] = arrays[name]
 
+    def restore_earlier(self, arrays: Mapping[str, Array]) -> bool:
+        """The same of a state of fewer frames, which were the first; False where its probes are of
+        other texels, as those of very many frames are."""
+        own, given = self.probes.logarithm, arrays["probes"]
+        if len(own) != len(given):
+            return False
+        own[:, : given.shape[1]] = given
+        self.restore({**arrays, "probes": own})
+        return True
+
     def measured(self, quantile: float) -> dict[str, Array]:
         """The arrays of ``Measured``."""
         return {

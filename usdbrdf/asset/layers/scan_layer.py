@@ -215,14 +215,20 @@ def lens_from_pinhole(
 
 def _author_pose_and_lens(prim: Sdf.PrimSpec, scan: Scan, *, reset_transform: bool) -> None:
     """Frame i is at time code i + 1, and the first is the default as well. The poses are in the
-    world: ``reset_transform`` where the default prim moves what is below it."""
+    world: ``reset_transform`` where the default prim moves what is below it. Refined ones are those
+    captured, followed by a step in the camera's own axes."""
     frames, meters_per_unit = scan.frames, scan.meters_per_unit
-    # USD multiplies row vectors from the left: its matrices are ours transposed.
-    matrices = np.asarray(frames.world_from_camera, np.float64)
-    poses = [Gf.Matrix4d(pose.T.tolist()) for pose in matrices]
-    name = "xformOp:transform"
-    attribute_per_frame(prim, name, Types.Matrix4d, poses, always=True)
-    order = ["!resetXformStack!", name] if reset_transform else [name]
+    refined = np.asarray(frames.world_from_camera, np.float64)
+    ops = {"xformOp:transform": refined}
+    if frames.captured_pose is not None:
+        captured = frames.captured_pose
+        step = np.asarray(np.linalg.solve(captured, refined), np.float64)
+        ops = {"xformOp:transform": captured, "xformOp:transform:refined": step}
+    for name, matrices in ops.items():
+        # USD multiplies row vectors from the left: its matrices are ours transposed.
+        poses = [Gf.Matrix4d(pose.T.tolist()) for pose in matrices]
+        attribute_per_frame(prim, name, Types.Matrix4d, poses, always=True)
+    order = ["!resetXformStack!", *ops] if reset_transform else [*ops]
     attribute(prim, "xformOpOrder", Types.TokenArray, order, uniform=True)
     lens = [
         lens_from_pinhole(pinhole, resolution, meters_per_unit)

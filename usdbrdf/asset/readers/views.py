@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.header import read_provenance
@@ -24,14 +25,15 @@ from usdbrdf.capture.checks import (
     frames_from_records,
     refuse_photographs,
     rigid_records,
+    with_masks,
 )
+from usdbrdf.capture.develop import developed_in, frames_of_photographs
 from usdbrdf.capture.formats.transforms import frame_records
-from usdbrdf.capture.parts import frames_at
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.capture import Frames, frames_at
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
 from usdbrdf.options import IngestOptions
@@ -42,7 +44,8 @@ _MAX_UNKNOWN = 0.999
 
 @dataclass(frozen=True, kw_only=True)
 class Views:
-    """Photographs to compare with: their names in the document, and themselves in metres."""
+    """Photographs to compare with: their names in the document, followed by the face where one
+    through a lens became several, and themselves in metres."""
 
     names: tuple[str, ...]
     frames: Frames
@@ -83,23 +86,33 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
 
 
 def photographs_of_views(
-    source: Path, asset: Asset, stage: Usd.Stage, scene: Scene, allow_outside: tuple[Path, ...] = ()
+    source: Path,
+    asset: Asset,
+    stage: Usd.Stage,
+    scene: Scene,
+    folder: Path,
+    allow_outside: tuple[Path, ...] = (),
 ) -> Views:
     """The photographs of a document, checked as those of a capture are. Images have the capture's
     encoding. Views that cannot be used are dropped with a warning; InputRefused where none is left
-    or where the cameras do not see the asset."""
+    or where the cameras do not see the asset.
+
+    Photographs through lenses become pinhole frames below ``folder``, as those of a capture do.
+    """
     captured = frames_from_stage(stage)
     findings = Findings()
     options = IngestOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
+    records = with_masks(records, findings)
     total = len(records) + len(findings.dropped)
     encoding = captured.encoding
     if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
         encoding = PHOTOGRAPH_ENCODING
         records = [_as_the_captures_photographs(r, captured) for r in records]
     _refuse_none(len(records), findings, source)
-    frames = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
-    frames.world_from_camera[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
+    taken = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
+    taken.world_from_camera[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
+    frames, views, photograph_of = frames_of_photographs(taken, records)
     mesh = ScanMesh(
         points=scene.points,
         triangles=scene.triangles,
@@ -108,12 +121,18 @@ def photographs_of_views(
     )
     refuse_rays_that_miss(frames, mesh, source)
     names = [record.name for record in records]
-    usable = check_frames(frames, names, findings, max_nonfinite=_MAX_UNKNOWN)
+    usable = check_frames(taken, names, findings, max_nonfinite=_MAX_UNKNOWN)
     _refuse_none(len(usable), findings, source)
+    kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
+    views = tuple(views[i] for i in kept) if views else ()
+    faces = [f" {view.face}" if view and view.face else "" for view in views] or [""] * len(kept)
     findings.warn_of_dropped_frames(source, total)
     for sentence in findings.warnings:
         warn(sentence)
-    return Views(names=tuple(names[i] for i in usable), frames=frames_at(frames, usable))
+    return Views(
+        names=tuple(names[photograph_of[i]] + face for i, face in zip(kept, faces, strict=True)),
+        frames=developed_in(frames_at(frames, kept), views, folder),
+    )
 
 
 def _rigid_records(

@@ -1,0 +1,73 @@
+"""The cameras of a scan take small steps, so that its frames agree better about its mesh."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from usdbrdf.files.frames import FramePixels, read_frames
+from usdbrdf.job.progress import progress, say
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.texturing.pose_samples import logarithms
+from usdbrdf.texturing.pose_steps import refined_poses
+from usdbrdf.transport.rays import RayScene
+
+Read = Callable[[int], FramePixels]
+# Pixels of a picture's width, and of all pictures, that poses are refined with, at most.
+_MOST_ACROSS, _MOST_PIXELS = 1024, 1 << 27
+
+
+def with_refined_poses(scan: Scan, read: Read) -> tuple[Scan, list[dict[str, Any]]]:
+    """The scan with poses that agree better, and for each frame by how much it was moved (metres)
+    and turned (degrees), and how far it differs from what the others show, before and after, from 0
+    to 1; of this the user is told."""
+    frames, mesh = scan.frames, scan.mesh
+    shrink = _shrink(frames)
+    images = read_frames(read, range(len(frames)))
+    seen = progress(images, total=len(frames), label="poses: reading", unit="frames")
+    pictures: list[Float] = [logarithms(pixels, shrink) for _, pixels in seen]
+    rays = RayScene(mesh.points, mesh.triangles)
+    cameras = [frames.camera(i) for i in range(len(frames))]
+    found = refined_poses(mesh, rays, cameras, pictures)
+    captured, refined = frames.world_from_camera, found.world_from_camera
+    moved = _distances(captured, refined) * scan.meters_per_unit
+    turned = _degrees(captured, refined)
+    steps = found.after < found.before
+    say(
+        f"ingest: {steps.sum()} of {len(frames)} cameras took a step, at most "
+        f"{1000 * moved.max():.1f} mm and {turned.max():.2f} degrees"
+    )
+    told = [
+        {
+            "frame": path.name,
+            "moved_m": round(float(moved[i]), 6),
+            "turned_deg": round(float(turned[i]), 5),
+            "differed": round(float(found.before[i]), 4),
+            "differs": round(float(found.after[i]), 4),
+        }
+        for i, path in enumerate(frames.image_paths)
+    ]
+    changed = replace(frames, world_from_camera=refined, captured_pose=captured)
+    return replace(scan, frames=changed), told
+
+
+def _shrink(frames: Frames) -> int:
+    """Pixels along each side that become one."""
+    width = int(frames.resolution[:, 0].max())
+    pixels = int(frames.resolution.astype(np.int64).prod(axis=1).sum())
+    return max(1, -(-width // _MOST_ACROSS), math.ceil(math.sqrt(pixels / _MOST_PIXELS)))
+
+
+def _distances(before: Double, after: Double) -> Double:
+    return np.asarray(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1), np.float64)
+
+
+def _degrees(before: Double, after: Double) -> Double:
+    turn = before[:, :3, :3].transpose(0, 2, 1) @ after[:, :3, :3]
+    return np.asarray(np.degrees(Rotation.from_matrix(turn).magnitude()), np.float64)
