@@ -76,7 +76,7 @@ class OptionField(NamedTuple):
     def check(self, value: Any, subject: str) -> None:
         """Raise UsageError for a value that is none of the choices or out of the limits."""
         if self.option is not None and self.option.words and not isinstance(value, Path):
-            if value not in self.option.words:
+            if value is not None and value not in self.option.words:
                 words = " or ".join(self.option.words)
                 raise UsageError(f"{subject}: expected {words}, or a Path. [usage.option]")
             return
@@ -144,6 +144,10 @@ def _environment() -> Surroundings:
     return option("--environment estimate|none|HDR", ESTIMATE, **more)
 
 
+# What may stand in the place of a file with the objects' names.
+AUTO: Literal["auto"] = "auto"
+
+
 def _seed() -> int:
     text = "seed of the random numbers"
     return option("--seed N", 0, (0, 2**32 - 1), shared="light transport", help=text)
@@ -197,23 +201,31 @@ class IngestOptions(Options):
 
     mesh: Path | None = option("--mesh FILE", None, unset="the capture's own", file=True)
     "mesh, in any place"
-    objects: Path | None = option("--objects FILE", None, unset="the capture's own", file=True)
-    "object names (objects.json), in any place"
+    objects: Path | Literal["auto"] | None = option(
+        "--objects auto|FILE", None, unset="the capture's own", file=True, words=(AUTO,)
+    )
+    """object names (objects.json), in any place; auto: whatever the capture says, objects are
+    planes, divided by colour, and what hangs together before them"""
     frames: Path | None = option("--frames DIR", None, unset="the capture's own")
     "folder of the pictures, in any place, for formats that name pictures but not their folder"
     crease_angle_deg: float = option("--crease-angle DEG", 40.0, (0, 180))
     "faces that meet at more degrees than this meet in a sharp edge"
     decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")
     "reduce the mesh to about N triangles"
-    min_component_area_m2: float = option("--min-component-area M2", 0.01)
+    min_component_area_m2: float | None = option(
+        "--min-component-area M2", None, unset="0.0001 of the mesh's area"
+    )
     "without labels, connected parts of at least this many m^2 become objects"
     assume_srgb: bool = option("--assume-srgb", False)
     "accept 8-bit photographs as sRGB; the result is then not radiometric"
-    encoding: str | None = option("--encoding NAME", None, unset="as the format says")
-    "colour space of the images by its OpenColorIO name, e.g. lin_ap1_scene"
+    encoding: str | None = option("--input-space --encoding NAME", None, unset="as the format says")
+    """colour space of the images by its OpenColorIO name: scene-linear (lin_ap1_scene), a camera's
+    logarithm (ARRI LogC4), or for 8-bit photographs a display's (srgb_p3d65_scene)"""
     exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
     """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
     or darker than the others do of the same surfaces is divided out"""
+    vignetting: Literal["report", "estimate"] = option("--vignetting", "report")
+    "report: how much all frames darken towards their corners is told; estimate: and divided out"
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )

@@ -19,7 +19,7 @@ from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.capture.develop import developed
 from usdbrdf.capture.native import refuse_taken, write_capture
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.capture_inputs import inputs_of_capture
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
@@ -44,6 +44,8 @@ def ingest(
         for key, value in asdict(options).items()
         if key not in ("mesh", "objects", "frames", "allow_outside")
     }
+    if options.objects == AUTO:
+        parameters["objects"] = AUTO
     chosen = choose_adapter(capture, adapter, plugins=plugins)
     inputs, places = inputs_of_capture(capture, options, asset, files_beside(chosen, capture))
     if chosen.package:
@@ -68,7 +70,7 @@ def ingest(
         images = [run.kept.get(file, Path(file)) for file in files]
         asked, told = asked_of_its_pixels(scan, images, options)
         if copy_to is not None:
-            write_capture(scan, images, copy_to)
+            write_capture(replace(scan, mesh=asked.mesh, objects=asked.objects), images, copy_to)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
@@ -79,7 +81,8 @@ def ingest(
         return {
             "adapter": scan.adapter,
             "frames": len(scan.frames),
-            "objects": len(scan.objects),
+            "objects": len(asked.objects),
+            "objects_from": scan.label_source,
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
@@ -91,5 +94,8 @@ def ingest(
     if copy_to is not None and not result.reran:
         scan = read_with(chosen, capture, options)
         scan = replace(scan, frames=developed(scan, asset.folder, lambda *_: None))
+        if options.objects == AUTO:
+            asked = asked_of_its_pixels(scan, scan.frames.image_paths, options)[0]
+            scan = replace(scan, mesh=asked.mesh, objects=asked.objects)
         write_capture(scan, scan.frames.image_paths, copy_to)
     return result

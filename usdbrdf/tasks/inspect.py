@@ -10,7 +10,8 @@ from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
-from usdbrdf.options import InspectOptions
+from usdbrdf.options import AUTO, InspectOptions
+from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.photometry import agreement_of_frames
 
 
@@ -26,6 +27,10 @@ def inspect(
     try:
         read = partial(read_frame, found.frames)
         agrees = agreement_of_frames(found.mesh, found.frames, read, capture)
+        if options.objects == AUTO:
+            own = len(found.mesh.triangles)
+            mesh, objects, _ = segmented(found.mesh, own, found.frames, read)
+            found = replace(found, mesh=mesh, objects=objects)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))
     return replace(found, agreement=agrees and agrees.ratio)

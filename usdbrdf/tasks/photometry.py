@@ -19,7 +19,9 @@ from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.tasks.objects import segmented
+from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,
@@ -44,8 +46,17 @@ def asked_of_its_pixels(
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
     told: dict[str, Any] = {"agreement": agrees and agrees.ratio}
+    scan, optics = asked_of_its_optics(scan, read, estimate=options.vignetting == "estimate")
+    told |= optics
+    if any(scan.frames.vignetting):
+        read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.exposure == "estimate":
         scan, told["estimated_exposures"] = estimated_exposures(scan, read)
+        read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
+    if options.objects == AUTO:
+        own = len(scan.mesh.triangles) if scan.turned_faces is None else len(scan.turned_faces)
+        mesh, objects, told["segmentation"] = segmented(scan.mesh, own, scan.frames, read)
+        scan = replace(scan, mesh=mesh, objects=objects)
     return scan, told
 
 
