@@ -171,6 +171,28 @@ class MergeBrackets(_Talking):
         return self.told({"capture": str(self.output), **found}, told)
 
 
+class DevelopRaw(_Talking):
+    """Develop camera raw files into a capture of radiance."""
+
+    capture: Path = option("SCAN", REQUIRED)
+    "folder with transforms.json, whose frames are raw files (DNG, CR3, NEF, ARW, ...)"
+    output: Path = option("-o --output DIR", REQUIRED)
+    "new folder for the capture of one EXR for each of them"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.native import refuse_taken
+            from usdbrdf.capture.raw_frames import develop_raw
+        refuse_taken(self.output, self.capture)
+        found = develop_raw(self.capture, self.output)
+        told = (
+            f"{self.output}: written, {found['frames']} frames over {found['stops']:.1f} stops; "
+            f"radiometric up to one scale; clipped {found['clipped_share']:.2%} of the pixels; "
+            f"white balance drifts by {found['white_balance_drift_stops']:.2f} stops"
+        )
+        return self.told({"capture": str(self.output), **found}, told)
+
+
 class _RunOnAsset(_Run):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder made by ingest"
@@ -355,6 +377,7 @@ class PluginPath(Command):
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
     MergeBrackets,
+    DevelopRaw,
     Evaluate,
     Compare,
     Relight,

@@ -37,7 +37,7 @@ _HALF_FROM, _HALF_UNTIL = 2.0**-14, 60_000.0
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
 # fmt: off
-_RAW_SUFFIXES = frozenset((
+RAW_SUFFIXES = frozenset((
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
 ))
@@ -183,10 +183,10 @@ def write_preview_png(path: Path, rgb8: Byte) -> None:
 def _open(path: Path, max_side: int) -> Any:
     """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
     part that has R, G and B, or the first if none has."""
-    if path.suffix.lower() in _RAW_SUFFIXES:
+    if path.suffix.lower() in RAW_SUFFIXES:
         raise ImageRefused(
-            f"{path}: camera raw files are not read (only their preview would be). Develop it "
-            "to a scene-linear EXR. [image.raw]"
+            f"{path}: camera raw files are not read here (only their preview would be). Let "
+            "`usdbrdf develop-raw` make a capture of radiance of them. [image.raw]"
         )
     try:
         status = path.stat()
