@@ -26,6 +26,7 @@ from usdbrdf.capture.checks import (
     check_frames,
     frames_from_records,
     rigid_records,
+    tagged_encoding,
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
@@ -322,9 +323,12 @@ def scan_from_parts(
     records         frames with pose and file; those without are in ``findings`` already
     read_geometry   called once the poses are known to be sound
     source          the file or folder that messages about the whole capture name
+    encoding        the options', the capture's or the usual one, before which the images' tags come
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
+    if options.encoding is None and encoding in ("lin_rec709_scene", PHOTOGRAPH_ENCODING):
+        encoding = tagged_encoding(records, encoding, findings, source)
     findings.frames = frames_from_records(records, encoding=encoding, radiometric=radiometric)
     known: set[Path] = set()
     for record in records:

@@ -33,6 +33,16 @@ _NAMES = {
     "lin_rec709_scene": ("lin_rec709_scene", "lin_rec709_srgb", "lin_rec709"),
     "srgb_rec709_scene": ("srgb_rec709_scene", "srgb_tx"),
 }
+# x, y of red, green, blue and white (SMPTE ST 2065-1, Academy S-2014-004, ITU-R BT.709 and BT.2020,
+# SMPTE EG 432-1), and by how much numbers in files are off.
+_CHROMATICITIES = {
+    "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
+    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767),
+    "lin_p3d65_scene": (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
+    "lin_rec2020_scene": (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
+    "lin_rec709_scene": (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329),
+}
+_SAME_PLACE = 2e-3
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
@@ -54,6 +64,17 @@ def kind_of_encoding(encoding: str) -> Literal["linear", "log", "display"] | Non
     if space is None or space.getReferenceSpaceType() != ocio.REFERENCE_SPACE_SCENE:
         return None
     return _KINDS.get(space.getEncoding())
+
+
+def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
+    """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
+    says nothing that is known."""
+    if name and kind_of_encoding(name):
+        return name
+    for encoding, places in _CHROMATICITIES.items():
+        if chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE:
+            return encoding
+    return None
 
 
 def unknown_encoding(encoding: str) -> str:

@@ -85,6 +85,15 @@ def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
     return spec.full_width, spec.full_height, tuple(spec.channelnames)
 
 
+def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
+    """What an image's header says of its colour space: a name, "" without one; and x, y of red,
+    green, blue and white, () without these."""
+    spec = _open(path, MAX_SIDE).spec()
+    name, places = spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
+    sound = isinstance(places, tuple) and len(places) == 8
+    return str(name or ""), tuple(float(place) for place in places) if sound else ()
+
+
 def is_eight_bit(path: Path) -> bool:
     """Whether the image holds bytes, from the header alone."""
     return str(_open(path, MAX_SIDE).spec().format) == "uint8"

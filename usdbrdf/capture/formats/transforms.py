@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +29,7 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import ImageRefused, InputRefused
-from usdbrdf.files.colour import kind_of_encoding, unknown_encoding
+from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.files.paths import contained
@@ -86,7 +86,8 @@ def read(path: Path, options: IngestOptions) -> Scan:
     )
     stated = capture.document.get("encoding")
     if stated is not None and not (isinstance(stated, str) and kind_of_encoding(stated)):
-        said = f"encoding: {unknown_encoding(str(stated)[:40])} Correct it."
+        known = f"{', '.join(known_encodings())} and OpenColorIO's others"
+        said = f"encoding is {str(stated)[:40]!r}, none of {known}. Correct it."
         raise capture.refuse(said, "capture.format")
     if stated is not None and photographs != (kind_of_encoding(stated) == "display"):
         kind = "8-bit photographs" if photographs else "scene-linear images"
@@ -110,7 +111,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
             capture_root=source.parent,
             meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         ),
-        options,
+        options if stated is None else replace(options, encoding=encoding),
         findings,
         name=source.parent.name,
         adapter=NAME,
