@@ -97,7 +97,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
     for name, unit, default in (
         ("--wait S", "seconds", "(default: 0.0)"),
         ("--crease-angle DEG", "degrees", "(default: 40.0)"),
-        ("--min-component-area M2", "m^2", "(default: 0.0001 of the mesh's area)"),
+        ("--min-component-area M2", "m^2", "default: 0.0001 of the mesh's area"),
         ("--max-nonfinite SHARE", "share", "(default: 0.01)"),
         ("--meters-per-unit M", "metres", "default: as the format says"),
         ("--texel-size M", "metres", "default: what the frames' pixels cover of each chart"),
