@@ -165,8 +165,8 @@ class Photographs:
         of a radiometric photograph are too bright by, without unit: estimated from what others show
         of the same surfaces, or 1. The other radiances are those after it is divided out.""",
         samples="every", low=0)]
-    vignetting: Annotated[Sequence[float], Fact(CAPTURE, "vignetting", "double2", (0, 0), """k1, k2:
-        the lens passes exp(k1 r^2 + k2 r^4), r in half diagonals from the principal point.""")]
+    vignetting: Annotated[Sequence[float], Fact(CAPTURE, "vignetting", "double2", (0, 0), """k1, k2,
+        without unit: lenses pass exp(k1 r^2 + k2 r^4), r in half diagonals from the centre.""")]
     encoding: Annotated[str, Fact(CAPTURE, "encoding", "token", "lin_rec709_scene", """Colour space
         in which the image files are stored, in OpenColorIO's names. The textures are always
         lin_rec709_scene.""")]

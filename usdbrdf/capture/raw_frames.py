@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.capture.bracketed import copy_beside, frames_of_document
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
@@ -25,7 +26,7 @@ from usdbrdf.model.arrays import Double, Float
 from usdbrdf.untrusted.raw_files import RawPicture, raw_picture
 
 # Stops by which a frame's own white balance may differ before it is told.
-_DRIFT = 0.05
+_DRIFT = calibration.number("raw.drift")
 
 
 def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def transmission(frames: Frames, i: int) -> Float:
     across, down = np.arange(width) + 0.5 - cx, np.arange(height) + 0.5 - cy
     square = 4 * (across**2 + down[:, None] ** 2) / (width**2 + height**2)
     first, second = frames.vignetting
-    return np.exp(square * (first + square * second)).astype(np.float32)
+    return np.asarray(np.exp(square * (first + square * second)), np.float32)
 
 
 def read_recorded(

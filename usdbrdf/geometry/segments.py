@@ -125,7 +125,7 @@ def _noise(surface: _Surface) -> float:
     make up most of it; less where these are as large as things are."""
     order = np.argsort(surface.area, kind="stable")
     total = float(surface.area.sum())
-    half = np.searchsorted(surface.area[order].cumsum(), total / 2)
+    half = int(np.searchsorted(surface.area[order].cumsum(), total / 2))
     edge = float(np.sqrt(surface.area[order[min(half, len(order) - 1)]] * 4 / 3**0.5))
     return min(_EDGES_DEEP * edge, _PLANE_DEPTH * float(np.sqrt(total)))
 
@@ -199,16 +199,8 @@ def _carrying(surface: _Surface, region: Long, noise: float) -> list[int]:
     """The regions before which stands what grows out of them, the largest first."""
     area = np.bincount(region[region >= 0], surface.area[region >= 0], minlength=len(region))
     order = np.argsort(-area, kind="stable")[:_MOST_PLANES]
-    kept: list[int] = []
-    for number in order.tolist():
-        if area[number] <= 0 or (kept and area[number] < _LEAST_PLANE * area[kept[0]]):
-            break
-        # A scan of one thing has no plane that is much of it; what is tiny carries nothing.
-        if area[number] < _LEAST_PLANE * area[order[0]]:
-            break
-        if _carries(surface, region == number, noise):
-            kept.append(number)
-    return kept
+    large = order[area[order] >= max(_LEAST_PLANE * area[order[0]], np.finfo(np.float64).tiny)]
+    return [number for number in large.tolist() if _carries(surface, region == number, noise)]
 
 
 def _carries(surface: _Surface, own: Bool, noise: float) -> bool:

@@ -28,8 +28,7 @@ def inspect(
         read = partial(read_frame, found.frames)
         agrees = agreement_of_frames(found.mesh, found.frames, read, capture)
         if options.objects == AUTO:
-            own = len(found.mesh.triangles)
-            mesh, objects, _ = segmented(found.mesh, own, found.frames, read)
+            mesh, objects, _ = segmented(found.mesh, None, found.frames, read)
             found = replace(found, mesh=mesh, objects=objects)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))

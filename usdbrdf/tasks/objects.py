@@ -26,13 +26,14 @@ _FRAMES, _MOST_NUMBERS = 32, 1 << 26
 
 
 def segmented(
-    mesh: ScanMesh, own: int, frames: Frames, read: Callable[[int], FramePixels]
+    mesh: ScanMesh, turned: Bool | None, frames: Frames, read: Callable[[int], FramePixels]
 ) -> tuple[ScanMesh, tuple[ObjectLabel, ...], dict[str, Any]]:
     """The mesh divided into objects, these, and how many of each kind, for the record.
 
-    own   how many of the faces are the capture's; the others are second skins of some of these
-    read  the frames' pixels
+    turned  as of ``Scan``: as long as the capture's own faces, behind which come second skins
+    read    the frames' pixels
     """
+    own = len(mesh.triangles if turned is None else turned)
     rays = RayScene(mesh.points, mesh.triangles)
     most = max(1, _MOST_NUMBERS // (3 * len(mesh.triangles)))
     asked = spread_evenly(len(frames), min(_FRAMES, most))

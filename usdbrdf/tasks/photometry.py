@@ -48,15 +48,13 @@ def asked_of_its_pixels(
     told: dict[str, Any] = {"agreement": agrees and agrees.ratio}
     scan, optics = asked_of_its_optics(scan, read, estimate=options.vignetting == "estimate")
     told |= optics
-    if any(scan.frames.vignetting):
-        read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
+    read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.exposure == "estimate":
         scan, told["estimated_exposures"] = estimated_exposures(scan, read)
         read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.objects == AUTO:
-        own = len(scan.mesh.triangles) if scan.turned_faces is None else len(scan.turned_faces)
-        mesh, objects, told["segmentation"] = segmented(scan.mesh, own, scan.frames, read)
-        scan = replace(scan, mesh=mesh, objects=objects)
+        mesh, objects, found = segmented(scan.mesh, scan.turned_faces, scan.frames, read)
+        scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
     return scan, told
 
 

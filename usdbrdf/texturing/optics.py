@@ -16,7 +16,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
-from usdbrdf.model.arrays import Bool, Double, Float
+from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.agreement import SurfacePoints, seen_points
 from usdbrdf.transport.rays import RayScene
@@ -70,8 +70,8 @@ def squared_radius(
     intrinsics: tuple[float, float, float, float],
     width: int,
     height: int,
-    column: Double,
-    row: Double,
+    column: Double | Long,
+    row: Double | Long,
 ) -> Double:
     """Of pixels, from the principal point, in half diagonals of the picture."""
     _, _, cx, cy = intrinsics
@@ -96,18 +96,19 @@ def falloff_of_frames(samples: Samples) -> Falloff | None:
 
 
 def _coefficients(value: Double, radius2: Double, known: Bool) -> tuple[float, float]:
-    weight = known.astype(np.float64)
+    weight: Double = known.astype(np.float64)
     value = np.where(known, value, 0)
     powers = (radius2, radius2**2)
-    found = np.zeros(2)
+    found: Double = np.zeros(2)
     for _ in range(_STEPS):
         left = _without_means(value, weight)
         basis = np.stack([_without_means(p, weight)[known] for p in powers], axis=1)
         root = np.sqrt(weight[known])[:, None]
-        found = np.linalg.lstsq(root * basis, (root[:, 0] * left[known]), rcond=None)[0]
+        solved = np.linalg.lstsq(root * basis, root[:, 0] * left[known], rcond=None)[0]
+        found = np.asarray(solved, np.float64)
         off = np.zeros_like(value)
         off[known] = left[known] - basis @ found
-        weight = known * np.minimum(1, _OUTLYING / np.maximum(np.abs(off), 1e-9))
+        weight = np.where(known, np.minimum(1, _OUTLYING / np.maximum(np.abs(off), 1e-9)), 0)
     return float(found[0]), float(found[1])
 
 
