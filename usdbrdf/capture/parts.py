@@ -471,7 +471,8 @@ def radiance_encoding(
     kind = kind_of_encoding(encoding)
     if kind is None:
         raise UsageError(
-            f"--encoding: {unknown_encoding(encoding)} Use one of {', '.join(known_encodings())}, "
+            f"--encoding {encoding!r}: {unknown_encoding(encoding)} Use one of "
+            f"{', '.join(known_encodings())}, "
             "or another of OpenColorIO's studio configuration. [usage.option]"
         )
     if photographs != (kind == "display"):
