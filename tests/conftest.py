@@ -69,7 +69,6 @@ NIGHTLY = (
     "physics/test_recovery.py::"
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
-    "tasks/test_scale.py::test_ten_centimetres_and_a_hundred_metres_give_the_same_numbers",
 )
 
 
