@@ -31,7 +31,7 @@ COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 NAMES = (
     *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare", "relight"),
     *("package", "validate", "rules", "adapters", "plugin-path", "inspect", "merge-brackets"),
-    *("report", "view"),
+    *("report", "view", "develop-raw"),
 )
 
 
@@ -97,7 +97,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
     for name, unit, default in (
         ("--wait S", "seconds", "(default: 0.0)"),
         ("--crease-angle DEG", "degrees", "(default: 40.0)"),
-        ("--min-component-area M2", "m^2", "(default: 0.01)"),
+        ("--min-component-area M2", "m^2", "default: 0.0001 of the mesh's area"),
         ("--max-nonfinite SHARE", "share", "(default: 0.01)"),
         ("--meters-per-unit M", "metres", "default: as the format says"),
         ("--texel-size M", "metres", "default: what the frames' pixels cover of each chart"),

@@ -27,7 +27,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 
 # --- The arrows. A room may import what it names here, and all rooms that those may. -------------
 
-GROUND = {"calibration", "errors", "identity", "kernel", "options"}
+GROUND = {"calibration", "errors", "identity", "kernel", "option", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
 READERS = {"delivery", "evaluation", "page", "relighting", "validation"}
@@ -36,7 +36,8 @@ ARROWS: dict[str, set[str]] = {
     "errors": set(),
     "identity": set(),
     "calibration": set(),
-    "options": {"model", "calibration"},
+    "option": {"errors"},
+    "options": {"model", "calibration", "option"},
     "kernel": {"identity"},
     "model": {"errors"},
     "files": {"model"},
@@ -94,6 +95,7 @@ IMPORTERS: dict[str, set[str]] = {
     "pxr": {"asset/", "untrusted/", "delivery/", "validation/"},
     "pycolmap": {"untrusted/"},
     "pye57": {"untrusted/"},
+    "rawpy": {"untrusted/"},
     "pymeshlab": {"geometry/mesh_filters.py"},
     "PyOpenColorIO": {"files/colour.py"},
     "pyoidn": {"transport/denoise.py"},
@@ -149,6 +151,7 @@ ENGINEERING: dict[str, str] = {
     "WIDTH": "pixels of a picture",
     "_ALONE": "mathematics: two of nine",
     "_AROUND": "codes that are taken together",
+    "_ASKED": "time",
     "_AT_A_TIME": "memory",
     "_BANDS": "discretisation of the sky",
     "_BATCH": "memory",
@@ -158,6 +161,7 @@ ENGINEERING: dict[str, str] = {
     "_BRIGHTEST": "steps of a search",
     "_CANDIDATES": "time",
     "_CLEAR": "codes of 8-bit images",
+    "_CLEARLY": "which of two readings of a format",
     "_COARSEST": "steps of a search",
     "_COLUMNS": "convention of a format",
     "_COUNTED_PIXELS": "time",
@@ -176,6 +180,7 @@ ENGINEERING: dict[str, str] = {
     "_FLIP": "convention of a format",
     "_FOCAL_LENGTHS": "limit of what is refused",
     "_FOLLOWED": "memory",
+    "_FRAMES": "time",
     "_FRAMES_OF_NOISE": "time",
     "_FULL_FRAME_MM": "convention of a format",
     "_GAP": "keeps lights off surfaces",
@@ -215,6 +220,7 @@ ENGINEERING: dict[str, str] = {
     "_MOST_ACROSS": "time",
     "_MOST_EFFECTS": "memory",
     "_MOST_MEASURED": "time",
+    "_MOST_NUMBERS": "memory",
     "_MOST_PASSES": "time",
     "_MOST_PIXELS": "memory",
     "_MOST_SAMPLES": "time",
@@ -228,6 +234,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_FRAMES": "memory",
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
+    "_PARTS": "blocks of a jackknife",
     "_PER_CODE": "time",
     "_PER_PIXEL": "bytes",
     "_PER_SEGMENT": "time: how many are asked",
@@ -273,6 +280,7 @@ ENGINEERING: dict[str, str] = {
     "_TIMES_FOR_CURVED": "rays: noise against time",
     "_TOUCHES": "numerics",
     "_TRACED": "time",
+    "_TURNS": "steps of a search",
     "_UNDECIDED": "codes of 8-bit images",
     "_UNPLACED": "mathematics: nothing moves",
     "_UPDATES": "steps of a search",

@@ -22,7 +22,8 @@ from typing import Annotated, Any, NamedTuple, get_origin
 from usdbrdf import options
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.job.interrupts import loading
-from usdbrdf.options import REQUIRED, Insert, Option, OptionField, Options, option_fields
+from usdbrdf.option import REQUIRED, Option, OptionField, Options, option_fields
+from usdbrdf.options import Insert
 
 EXIT_CODES = """exit codes:
   0 done   1 a defect of usdbrdf   2 wrong options   3 input refused (do not retry)

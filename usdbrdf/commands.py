@@ -16,7 +16,8 @@ from usdbrdf import options
 from usdbrdf.command_parser import Command
 from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show, tell
-from usdbrdf.options import REQUIRED, EditOptions, TalkOptions, option
+from usdbrdf.option import REQUIRED, option
+from usdbrdf.options import EditOptions, TalkOptions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -171,6 +172,28 @@ class MergeBrackets(_Talking):
             f"photographs over {found['stops']:.1f} stops; radiometric up to one scale; clipped in "
             f"all {found['clipped_share']:.2%}, contradicting each other "
             f"{found['contradicting_share']:.2%} of the pixels"
+        )
+        return self.told({"capture": str(self.output), **found}, told)
+
+
+class DevelopRaw(_Talking):
+    """Develop camera raw files into a capture of radiance."""
+
+    capture: Path = option("SCAN", REQUIRED)
+    "folder with transforms.json, whose frames are raw files (DNG, CR3, NEF, ARW, ...)"
+    output: Path = option("-o --output DIR", REQUIRED)
+    "new folder for the capture of one EXR for each of them"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.native import refuse_taken
+            from usdbrdf.capture.raw_frames import develop_raw
+        refuse_taken(self.output, self.capture)
+        found = develop_raw(self.capture, self.output)
+        told = (
+            f"{self.output}: written, {found['frames']} frames over {found['stops']:.1f} stops; "
+            f"radiometric up to one scale; clipped {found['clipped_share']:.2%} of the pixels; "
+            f"white balance drifts by {found['white_balance_drift_stops']:.2f} stops"
         )
         return self.told({"capture": str(self.output), **found}, told)
 
@@ -389,6 +412,7 @@ class PluginPath(Command):
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
     MergeBrackets,
+    DevelopRaw,
     Evaluate,
     Compare,
     Relight,

@@ -7,123 +7,22 @@ The frozen dataclasses are what the Python API takes; the command line and its h
 from __future__ import annotations
 
 import math
-import typing
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import field
 from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, Union, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal
 
 from usdbrdf import calibration
 from usdbrdf.errors import UsageError
+from usdbrdf.option import Options, option
 
 if TYPE_CHECKING:
     from usdbrdf.model.arrays import Double
 else:
     Double = Any  # its module loads NumPy, for which no list of options has to wait
 
-T = TypeVar("T")
-REQUIRED: Any = MISSING
 _COUNT = (1, 2**31 - 1)
 # Metres, or metres per unit: from an atom's size to more than the Earth's.
 _LENGTH = (1e-10, 1e10)
-
-
-class Option(NamedTuple):
-    """What is known of a field beside its type, its default and its meaning."""
-
-    names: tuple[str, ...]  # such as -o and --output; one word for what needs no name
-    unit: str  # of the value, or what kind of thing it is; "" for flags and choices
-    limits: tuple[float, float]  # of a number, both allowed
-    unset: str = ""  # what None, the default, amounts to
-    counts: tuple[int, ...] = ()  # how many numbers make up a value
-    file: bool = False  # a file must lie there before any work begins
-    none: str = ""  # the word for None on the command line
-    words: tuple[str, ...] = ()  # that may stand in the place of a file
-    shared: str = ""  # title in help, of what several tasks have
-    help: str = ""  # its meaning, if that is not below the field
-
-    @property
-    def name(self) -> str:
-        return self.names[-1]
-
-    @property
-    def placed(self) -> bool:
-        """Whether it is told by its place, without a name."""
-        return not self.name.startswith("-")
-
-
-def option(said: str, default: T, limits: Any = (-math.inf, math.inf), **more: Any) -> T:
-    """A dataclass field with an ``Option``; ``said`` holds its names and its unit."""
-    words = said.split()
-    names = tuple(word for word in words if word.startswith("-")) or tuple(words[:1])
-    told = Option(names, " ".join(words[len(names) :]), limits, **more)
-    return field(default=default, metadata={"option": told})
-
-
-class OptionField(NamedTuple):
-    """A field of an option class: its type without None, and its option; without option, ``kind``
-    is an option class too."""
-
-    name: str
-    kind: Any
-    default: Any
-    option: Option | None
-
-    @property
-    def choices(self) -> tuple[str, ...]:
-        return typing.get_args(self.kind) if typing.get_origin(self.kind) is Literal else ()
-
-    def check(self, value: Any, subject: str) -> None:
-        """Raise UsageError for a value that is none of the choices or out of the limits."""
-        if self.option is not None and self.option.words and not isinstance(value, Path):
-            if value not in self.option.words:
-                words = " or ".join(self.option.words)
-                raise UsageError(f"{subject}: expected {words}, or a Path. [usage.option]")
-            return
-        if value is None or self.option is None:
-            return
-        (low, high), counts = self.option.limits, self.option.counts
-        usable, expected = value in self.choices, ", ".join(self.choices)
-        if self.kind in (int, float) or counts:
-            numbers = value if counts else (value,)
-            usable = all(low <= n <= high and math.isfinite(n) for n in numbers)
-            usable &= not counts or len(numbers) in counts
-            expected = "a whole number" if self.kind is int else "a finite number"
-            expected = f"{' or '.join(map(str, counts))} finite numbers" if counts else expected
-            bounds = (("at least", low), ("at most", high))
-            told = [f"{word} {n:,}" for word, n in bounds if math.isfinite(n)]
-            expected += " of " * bool(told) + " and ".join(told)
-        elif not self.choices:
-            return
-        if not usable:
-            raise UsageError(f"{subject}: expected {expected}. [usage.option]")
-
-
-def option_fields(owner: type[Options]) -> list[OptionField]:
-    """All that can be said to an option class."""
-    types, found = typing.get_type_hints(owner), []
-    for item in fields(owner):
-        kind = types[item.name]
-        if typing.get_origin(kind) in (Union, UnionType):
-            kind = next(part for part in typing.get_args(kind) if part is not type(None))
-        found.append(OptionField(item.name, kind, item.default, item.metadata.get("option")))
-    return found
-
-
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """What option classes share: they are frozen dataclasses, whose values are checked when they
-    are made."""
-
-    def __init_subclass__(cls) -> None:
-        dataclass(cls, frozen=True, kw_only=True)
-
-    def __post_init__(self) -> None:
-        for item in option_fields(type(self)):
-            if item.option is not None:
-                value = getattr(self, item.name)
-                item.check(value, f"{item.option.name} {value}")
 
 
 # What may stand in the place of a picture of the surroundings.
@@ -142,6 +41,10 @@ def _environment() -> Surroundings:
     text = f"light from outside the scan: estimate: {told}; none; or a latitude-longitude picture"
     more = {"file": True, "words": (ESTIMATE, NO_LIGHT), "shared": "light transport", "help": text}
     return option("--environment estimate|none|HDR", ESTIMATE, **more)
+
+
+# What may stand in the place of a file with the objects' names.
+AUTO: Literal["auto"] = "auto"
 
 
 def _seed() -> int:
@@ -197,26 +100,34 @@ class IngestOptions(Options):
 
     mesh: Path | None = option("--mesh FILE", None, unset="the capture's own", file=True)
     "mesh, in any place"
-    objects: Path | None = option("--objects FILE", None, unset="the capture's own", file=True)
-    "object names (objects.json), in any place"
+    objects: Path | Literal["auto"] | None = option(
+        "--objects auto|FILE", None, unset="the capture's own", file=True, words=(AUTO,)
+    )
+    """object names (objects.json), in any place; auto: whatever the capture says, objects are
+    planes, divided by colour, and what hangs together before them"""
     frames: Path | None = option("--frames DIR", None, unset="the capture's own")
     "folder of the pictures, in any place, for formats that name pictures but not their folder"
     crease_angle_deg: float = option("--crease-angle DEG", 40.0, (0, 180))
     "faces that meet at more degrees than this meet in a sharp edge"
     decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")
     "reduce the mesh to about N triangles"
-    min_component_area_m2: float = option("--min-component-area M2", 0.01)
+    min_component_area_m2: float | None = option(
+        "--min-component-area M2", None, unset="0.0001 of the mesh's area"
+    )
     "without labels, connected parts of at least this many m^2 become objects"
     assume_srgb: bool = option("--assume-srgb", False)
     "accept 8-bit photographs as sRGB; the result is then not radiometric"
-    encoding: str | None = option("--encoding NAME", None, unset="as the format says")
-    "colour space of the images by its OpenColorIO name, e.g. lin_ap1_scene"
+    encoding: str | None = option("--input-space --encoding NAME", None, unset="as the format says")
+    """colour space of the images by its OpenColorIO name: scene-linear (lin_ap1_scene), a camera's
+    logarithm (ARRI LogC4), or for 8-bit photographs a display's (srgb_p3d65_scene)"""
     exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
     """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
     or darker than the others do of the same surfaces is divided out"""
     refine_poses: bool = option("--refine-poses", False)
     """let every camera take a small step after which its frame agrees better with the others about
     the mesh; the poses as captured are kept beside"""
+    vignetting: Literal["report", "estimate"] = option("--vignetting", "report")
+    "report: how much all frames darken towards their corners is told; estimate: and divided out"
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )

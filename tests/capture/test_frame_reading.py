@@ -53,6 +53,18 @@ def test_a_channel_that_half_floats_round_below_saturation_is_clipped(tmp_path):
     assert frame.valid.sum() == 7
 
 
+def test_a_cameras_logarithm_becomes_radiance_with_limits_of_radiance(tmp_path):
+    linear = np.full((2, 4, 3), 0.18, np.float32)
+    linear[0, 0], linear[0, 1] = 8.0, 0.002
+    stored = ((np.log2((2**18 - 16) / 117.45 * linear + 64) - 6) / 14) * 928 / 1023 + 95 / 1023
+    _write(tmp_path / "a.exr", stored.astype(np.float32), "float")
+    limits = {"saturation_radiance": 8.0, "noise_floor_radiance": 0.01}
+    frame = read_frame(_frames(tmp_path / "a.exr", "ARRI LogC4", **limits), 0)
+    assert np.allclose(frame.radiance, linear, rtol=2e-3)
+    assert np.argwhere(frame.clipped).tolist() == [[0, 0]]
+    assert np.argwhere(frame.dark).tolist() == [[0, 1]]
+
+
 def test_every_channel_must_rise_above_the_noise_floor(tmp_path):
     pixels = np.full((2, 4, 3), 1.0, np.float32)
     pixels[1, 2] = (1, 1, 0.01)

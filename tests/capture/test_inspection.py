@@ -128,6 +128,6 @@ def test_what_is_no_capture_is_refused_as_by_ingest(what, tmp_path, capsys):
 
 def test_wrong_options_stay_wrong(capture):
     with pytest.raises(UsageError, match="--encoding"):
-        inspect(capture.folder, InspectOptions(encoding="acescg"))
+        inspect(capture.folder, InspectOptions(encoding="acesfilm"))
     with pytest.raises(UsageError, match="not installed"):
         inspect(capture.folder, InspectOptions(), "colmap9")

@@ -29,6 +29,14 @@ def test_connected_parts_come_largest_first_and_the_small_ones_together():
     assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_what_is_too_small_for_an_object_does_not_depend_on_the_unit(unit):
+    sides = [unit * side for side in (0.005, 2, 1, 0.005)]
+    split = segmentation(_squares(sides), None, table_path=None, min_area=None)
+    assert [name for name, _ in split.labels] == ["part_001", "part_002", "rest"]
+    assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
+
+
 @pytest.mark.fault("G9")
 def test_one_large_part_is_one_object():
     split = segmentation(_squares([2, 0.05]), None, table_path=None, min_area=0.01)

@@ -188,7 +188,7 @@ def test_frames_without_saturation_are_accepted_with_a_warning(capture):
     assert any("no saturation_radiance" in warning for warning in scan.warnings)
 
 
-@pytest.mark.parametrize("encoding", ["acescg", "srgb_rec709_scene"])
+@pytest.mark.parametrize("encoding", ["acesfilm", "srgb_rec709_scene"])
 def test_an_encoding_that_cannot_be_is_a_usage_error(capture, encoding):
     with pytest.raises(UsageError, match=rf"--encoding '?{encoding}.*\[usage.option\]"):
         read_scan(capture.folder, IngestOptions(encoding=encoding))

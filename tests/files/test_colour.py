@@ -7,7 +7,13 @@ import pytest
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files import colour
-from usdbrdf.files.colour import known_encodings, to_display_srgb8, to_working_space
+from usdbrdf.files.colour import (
+    kind_of_encoding,
+    known_encodings,
+    to_display_srgb8,
+    to_working_space,
+    unknown_encoding,
+)
 
 
 def srgb_from_linear(linear):
@@ -52,8 +58,10 @@ def test_non_contiguous_pixels(ramp):
 
 
 def test_unknown_encoding_names_the_known():
-    with pytest.raises(InputRefused, match=r"'AdobeRGB'.+lin_rec709_scene.+\[colour\.encoding\]$"):
-        to_working_space(np.zeros((1, 1, 3), np.float32), "AdobeRGB")
+    with pytest.raises(
+        InputRefused, match=r"'AdobeRGB 7'.+lin_rec709_scene.+\[colour\.encoding\]$"
+    ):
+        to_working_space(np.zeros((1, 1, 3), np.float32), "AdobeRGB 7")
 
 
 def test_wrong_shape():
@@ -74,6 +82,53 @@ def test_display_of_what_is_no_number(ramp):
 
 
 def test_older_opencolorio_has_the_newest_config_of_its_own():
-    names = ["cg-config-v2.1.0_aces-v1.3_ocio-v2.3", "cg-config-v10.0.0_x", "studio-config-v11"]
-    assert colour._pick_config(names) == "cg-config-v10.0.0_x"
+    names = ["studio-config-v2.1.0_aces-v1.3", "studio-config-v10.0.0_x", "cg-config-v11"]
+    assert colour._pick_config(names) == "studio-config-v10.0.0_x"
     assert colour._pick_config([*names, colour._CONFIG]) == colour._CONFIG
+
+
+def _logc4(linear):
+    """ARRI, LogC4 Specification (2022), 2.2."""
+    a, b, c = (2**18 - 16) / 117.45, (1023 - 95) / 1023, 95 / 1023
+    return (np.log2(a * linear + 64) - 6) / 14 * b + c
+
+
+def _slog3(linear):
+    """Sony, Technical Summary for S-Gamut3.Cine/S-Log3 (2014), above its linear part."""
+    return (420 + np.log10((linear + 0.01) / (0.18 + 0.01)) * 261.5) / 1023
+
+
+def _acescct(linear):
+    """Academy S-2016-001, above its linear part."""
+    return (np.log2(linear) + 9.72) / 17.52
+
+
+@pytest.mark.parametrize(
+    ("name", "encoded"),
+    [
+        ("ARRI LogC4", _logc4),
+        ("arri_logc4", _logc4),
+        ("S-Log3 S-Gamut3.Cine", _slog3),
+        ("ACEScct", _acescct),
+    ],
+)
+def test_logarithms_of_cameras_are_decoded(name, encoded):
+    grey = np.array([0.02, 0.18, 0.9, 4.0, 20.0])
+    stored = np.repeat(encoded(grey)[None, :, None], 3, axis=2).astype(np.float32)
+    assert kind_of_encoding(name) == "log"
+    # Grey is grey in every primaries whose white is the same after adaptation.
+    assert np.allclose(to_working_space(stored, name)[0, :, 1], grey, rtol=2e-3)
+
+
+def test_photographs_of_a_wider_display():
+    assert kind_of_encoding("srgb_p3d65_scene") == "display"
+    encoded = srgb_from_linear(np.array([[[0.5, 0.2, 0.1]]])).astype(np.float32)
+    as_linear = to_working_space(np.array([[[0.5, 0.2, 0.1]]], np.float32), "lin_p3d65_scene")
+    assert np.allclose(to_working_space(encoded, "srgb_p3d65_scene"), as_linear, atol=1e-5)
+
+
+def test_a_name_that_is_nearly_right_is_told():
+    assert kind_of_encoding("ARRI LogC5") is None
+    assert "'ARRI LogC4'" in unknown_encoding("ARRI LogC5")
+    assert kind_of_encoding("Raw") is None
+    assert kind_of_encoding("sRGB - Display") is None

@@ -135,6 +135,10 @@ class LabelledObject:
         such as chair or wall; empty where the capture has none.""")]
     identifier: Annotated[str, Fact(OBJECT, "identifier", "token", "", """Legal identifier, unique
         in the asset: names the object's material and its textures.""")]
+    label_source: Annotated[str, Fact(OBJECT, "labelSource", "token", "capture", """Who divided the
+        scan into objects: the capture; or we did: connected parts; segmented: planes, divided by
+        the frames' colours, and what hangs together before them.""",
+        tokens=("capture", "connected", "segmented"))] = "capture"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +165,8 @@ class Photographs:
         of a radiometric photograph are too bright by, without unit: estimated from what others show
         of the same surfaces, or 1. The other radiances are those after it is divided out.""",
         samples="every", low=0)]
+    vignetting: Annotated[Sequence[float], Fact(CAPTURE, "vignetting", "double2", (0, 0), """k1, k2,
+        without unit: lenses pass exp(k1 r^2 + k2 r^4), r in half diagonals from the centre.""")]
     encoding: Annotated[str, Fact(CAPTURE, "encoding", "token", "lin_rec709_scene", """Colour space
         in which the image files are stored, in OpenColorIO's names. The textures are always
         lin_rec709_scene.""")]

@@ -213,7 +213,8 @@ def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
 
     assert adapter.module is not None
     for named in (path, options.mesh, options.objects, options.frames):
-        refuse_nameless(named)
+        if isinstance(named, Path):
+            refuse_nameless(named)
     try:
         scan = adapter.module.read(path, options)
         if not isinstance(scan, Scan):

@@ -62,12 +62,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             frames.append({**entry, "file_path": name})
             clipped.append(shares[0])
             ghosts.append(shares[1])
-        for key, usual in (("mesh", "mesh.ply"), ("objects", "objects.json")):
-            beside = contained(source.parent, str(document.get(key, usual)))
-            if beside.is_file():
-                place = contained(staged, str(document.get(key, usual)))
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(beside, place)
+        copy_beside(source, document, staged)
         write_json(staged / "transforms.json", {**document, "frames": frames})
     ranges = [float(b.exposures[0] / b.exposures[-1]) for b in brackets]
     return {
@@ -78,6 +73,16 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         "contradicting_share": float(np.mean(ghosts)),
         "contradicting_share_of_worst": float(np.max(ghosts)),
     }
+
+
+def copy_beside(source: Path, document: Any, folder: Path) -> None:
+    """Copy the mesh and the objects that a transforms.json has beside it into another folder."""
+    for key, usual in (("mesh", "mesh.ply"), ("objects", "objects.json")):
+        beside = contained(source.parent, str(document.get(key, usual)))
+        if beside.is_file():
+            place = contained(folder, str(document.get(key, usual)))
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(beside, place)
 
 
 def _merged(
@@ -112,14 +117,20 @@ def _codes(bracket: Bracket) -> Byte:
     return aligned(np.array(pictures), [path.name for path in bracket.images])[0]
 
 
-def _brackets(source: Path, document: Any) -> list[Bracket]:
-    """The brackets of a document, in its order."""
+def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:
+    """The entries of a transforms.json; InputRefused where it has none."""
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputRefused(
             f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
             "capture's own document. [capture.format]"
         )
+    return frames
+
+
+def _brackets(source: Path, document: Any) -> list[Bracket]:
+    """The brackets of a document, in its order."""
+    frames = frames_of_document(source, document)
     views: dict[str, tuple[Mapping[str, Any], list[Any]]] = {}
     for frame in frames:
         listed = frame.get("brackets")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +15,9 @@ import numpy as np
 from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.colour import encoding_of_tag, kind_of_encoding
 from usdbrdf.files.frames import FramePixels, read_frame
-from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.files.images import MAX_SIDE, colour_tag, image_size
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
@@ -192,6 +194,24 @@ def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
             "radiometric with --assume-srgb. [capture.ldr]"
         )
     return True
+
+
+def tagged_encoding(
+    records: Sequence[FrameRecord], usual: str, findings: Findings, source: Path
+) -> str:
+    """The colour space that the first image says it has, of which the user is told; ``usual`` where
+    it says none of the same kind."""
+    tag: str | None = None
+    with suppress(ImageRefused):  # of which the reader of its pixels will tell
+        tag = encoding_of_tag(*colour_tag(records[0].image_path)) if records else None
+    kinds = [kind_of_encoding(encoding) == "display" for encoding in (tag or usual, usual)]
+    if tag is None or tag == usual or kinds[0] != kinds[1]:
+        return usual
+    findings.warn(
+        f"{source.name}: the images say that their colour space is {tag}, and are read so. State "
+        "--input-space if they are not. [capture.encoding]"
+    )
+    return tag
 
 
 def rigid_records(

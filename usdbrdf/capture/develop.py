@@ -23,7 +23,8 @@ from numba import prange
 from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import CLIPPED_SHARE, PHOTOGRAPH_ENCODING, read_recorded
+from usdbrdf.files.colour import kind_of_encoding
+from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
 from usdbrdf.files.images import needs_float, read_exr, write_exr
 from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
@@ -57,7 +58,7 @@ def frames_of_photographs(
     plain = [not record.lens.bends and record.mask_path is None for record in records]
     if all(plain):
         return photographs, (), np.arange(len(records))
-    if photographs.encoding == PHOTOGRAPH_ENCODING:
+    if kind_of_encoding(photographs.encoding) != "linear":
         plain = [False] * len(records)
     numbers, paths, views = [], [], list[View | None]()
     poses, intrinsics, sizes = [], [], []
@@ -122,11 +123,11 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
         place(str(frames.image_paths[i]), partial(_write_frame, frames, i, view))
     for cache in (_recorded, _places, mask_at_size):
         cache.cache_clear()
-    linear = frames.encoding == PHOTOGRAPH_ENCODING
+    stays = kind_of_encoding(frames.encoding) == "linear"
     return replace(
         frames,
         image_paths=tuple(folder / path for path in frames.image_paths),
-        encoding="lin_rec709_scene" if linear else frames.encoding,
+        encoding=frames.encoding if stays else "lin_rec709_scene",
     )
 
 
@@ -144,13 +145,13 @@ def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
     saturation = float(frames.saturation_radiance[i])
     source = _recorded(view.photograph, view.mask, frames.encoding, saturation)
     image = resampled(source, view, frames.camera(i), saturation)
-    linear = frames.encoding == PHOTOGRAPH_ENCODING
+    stays = kind_of_encoding(frames.encoding) == "linear"
     write_exr(
         path,
         image,
         half=not needs_float(np.nan_to_num(image)),
         holes=True,
-        encoding="lin_rec709_scene" if linear else frames.encoding,
+        encoding=frames.encoding if stays else "lin_rec709_scene",
     )
 
 

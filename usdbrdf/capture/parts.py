@@ -9,10 +9,11 @@ from dataclasses import replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import NamedTuple, ParamSpec
+from typing import Literal, NamedTuple, ParamSpec
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.capture.camera_checks import (
     drop_cameras_inside,
     refuse_rays_that_miss,
@@ -25,11 +26,12 @@ from usdbrdf.capture.checks import (
     check_frames,
     frames_from_records,
     rigid_records,
+    tagged_encoding,
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
 from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
-from usdbrdf.files.colour import known_encodings
+from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
 from usdbrdf.files.images import exif_exposure
@@ -42,12 +44,14 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Frames, Scan, frames_at
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
 P = ParamSpec("P")
 _MAX_OBJECTS = 65_535
+_LEAST_PART = calibration.number("objects.least_part")
+_ONE_OBJECT = (ObjectLabel(identifier="scan", label="scan"),)
 
 
 class LabelTable(NamedTuple):
@@ -95,12 +99,13 @@ def label_table(path: Path) -> LabelTable:
 
 
 def segmentation(
-    mesh: FileMesh, table: LabelTable | None, *, table_path: Path | None, min_area: float
+    mesh: FileMesh, table: LabelTable | None, *, table_path: Path | None, min_area: float | None
 ) -> Segmentation:
     """Objects of a mesh: by the table's or the file's labels, else by connected parts.
 
     Ids without an entry are called ``object_<id>``; negative ids mean unlabelled. Parts smaller
-    than ``min_area`` (scene units squared) are gathered in one object, ``rest``.
+    than ``min_area`` (scene units squared; None: a share of the mesh's) are gathered in one object,
+    ``rest``.
     """
     face_id = mesh.face_label
     if table is not None and table.face_id is not None:
@@ -131,13 +136,15 @@ def segmentation(
     return Segmentation(face_object.astype(np.int32), tuple(labels))
 
 
-def _connected_parts(mesh: FileMesh, min_area: float) -> Segmentation:
+def _connected_parts(mesh: FileMesh, min_area: float | None) -> Segmentation:
     """Parts joined by position, largest first; one object where no second one is large enough."""
     connected = connected_triangles(welded_ids(mesh.points)[mesh.triangles])
     parts, part_of_face = np.unique(connected, return_inverse=True)
     area = np.bincount(
         part_of_face, weights=doubled_areas(mesh.points, mesh.triangles) / 2, minlength=len(parts)
     )
+    if min_area is None:
+        min_area = _LEAST_PART * float(area.sum())
     order = np.argsort(-area, kind="stable")
     large = order[area[order] >= min_area][:_MAX_OBJECTS]
     if len(large) < 2:
@@ -200,13 +207,22 @@ def geometry_from_usd(
             f"{path.name}: {len(found.objects)} objects have been made from face subsets, so the "
             "asset holds the meshes itself instead of referring to them. [stage.subsets]"
         )
-    whole = path.resolve() if found.object_prims else None
-    return replace(found, has_normals=~missing, usd_geometry=whole)
+    if options.objects == AUTO:
+        findings.warn(
+            f"{path.name}: objects are segmented anew, so the asset holds the meshes itself "
+            "instead of referring to them. [objects.auto]"
+        )
+        whole = replace(mesh, face_object=np.zeros_like(mesh.face_object))
+        found = replace(
+            found, mesh=whole, objects=_ONE_OBJECT, object_prims=(), label_source="segmented"
+        )
+    place = path.resolve() if found.object_prims else None
+    return replace(found, has_normals=~missing, usd_geometry=place)
 
 
 def geometry_from_file(
     mesh_path: Path,
-    objects: Path | Callable[[FileMesh], LabelTable] | None,
+    objects: Path | Literal["auto"] | Callable[[FileMesh], LabelTable] | None,
     options: IngestOptions,
     findings: Findings,
     *,
@@ -216,7 +232,7 @@ def geometry_from_file(
     """Read, check, segment and clean a mesh.
 
     objects          objects.json; or what knows the objects of the mesh that was read, an id for
-                     each of its triangles; or None
+                     each of its triangles; or None. Options that ask to segment it come first
     capture_root     folder inside which a USD file may refer to others
     meters_per_unit  of the adapter, for areas in square metres; the options' comes first
     """
@@ -230,18 +246,22 @@ def geometry_from_file(
             f"{mesh_path.name}: {broken} of {len(mesh.kept)} faces had NaN corners or pointed to "
             "vertices that do not exist, and have been removed. [mesh.broken]"
         )
+    if options.objects == AUTO:
+        objects, mesh = None, replace(mesh, face_label=np.zeros(len(mesh.triangles), np.int64))
     objects_path = objects if isinstance(objects, Path) else None
     table = label_table(objects_path) if objects_path is not None else None
-    if objects is not None and not isinstance(objects, Path):
+    if callable(objects):
         table = objects(mesh)
         mesh, table = replace(mesh, face_label=table.face_id), table._replace(face_id=None)
+    least = options.min_component_area_m2
     split = segmentation(
         mesh,
         table,
         table_path=objects_path,
-        min_area=options.min_component_area_m2 / (options.meters_per_unit or meters_per_unit) ** 2,
+        min_area=least and least / (options.meters_per_unit or meters_per_unit) ** 2,
     )
-    if mesh.face_label is None and (table is None or table.face_id is None):
+    unlabelled = mesh.face_label is None and (table is None or table.face_id is None)
+    if unlabelled:
         findings.warn(
             f"{mesh_path.name}: no object labels; {len(split.labels)} objects have been made from "
             "connected parts. [objects.none]"
@@ -256,7 +276,9 @@ def geometry_from_file(
     for name, number in clean.counts.items():
         findings.count(name, number)
     face_object, labelled = objects_with_faces(clean.face_object, split.labels)
+    source = "connected" if unlabelled else "capture"
     return ScanGeometry(
+        label_source="segmented" if options.objects == AUTO else source,
         mesh=ScanMesh(
             points=clean.points,
             triangles=clean.triangles,
@@ -301,9 +323,12 @@ def scan_from_parts(
     records         frames with pose and file; those without are in ``findings`` already
     read_geometry   called once the poses are known to be sound
     source          the file or folder that messages about the whole capture name
+    encoding        the options', the capture's or the usual one, before which the images' tags come
     meters_per_unit, up_axis   the format's own; the geometry's and the options' come first
     """
     total = len(records) + len(findings.dropped)
+    if options.encoding is None and encoding in ("lin_rec709_scene", PHOTOGRAPH_ENCODING):
+        encoding = tagged_encoding(records, encoding, findings, source)
     findings.frames = frames_from_records(records, encoding=encoding, radiometric=radiometric)
     known: set[Path] = set()
     for record in records:
@@ -357,6 +382,7 @@ def scan_from_parts(
         object_prims=geometry.object_prims,
         views=tuple(views[i] for i in kept) if any(views) else (),
         turned_faces=sides.turned,
+        label_source=geometry.label_source,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )
@@ -426,18 +452,20 @@ def _exposure_of_file(path: Path) -> float | None:
 def radiance_encoding(
     options: IngestOptions, *, photographs: bool, stated: str | None = None
 ) -> str:
-    """Colour space of the images: the options', that which the capture states (one of
-    ``known_encodings``), or the usual one; UsageError where the options contradict the images."""
+    """Colour space of the images: the options', that which the capture states, or the usual one;
+    UsageError where the options contradict the images."""
     usual = PHOTOGRAPH_ENCODING if photographs else "lin_rec709_scene"
     encoding = options.encoding or stated or usual
-    if encoding not in known_encodings():
+    kind = kind_of_encoding(encoding)
+    if kind is None:
         raise UsageError(
-            f"--encoding {encoding!r}: not known. Use one of {', '.join(known_encodings())}. "
-            "[usage.option]"
+            f"--encoding {encoding!r}: {unknown_encoding(encoding)} Use one of "
+            f"{', '.join(known_encodings())}, "
+            "or another of OpenColorIO's studio configuration. [usage.option]"
         )
-    if photographs != (encoding == PHOTOGRAPH_ENCODING):
-        kind = "8-bit photographs" if photographs else "scene-linear images"
+    if photographs != (kind == "display"):
+        what = "8-bit photographs" if photographs else "scene-linear images"
         raise UsageError(
-            f"--encoding {encoding}: the images are {kind}. Leave the option out. [usage.option]"
+            f"--encoding {encoding}: the images are {what}. Leave the option out. [usage.option]"
         )
     return encoding

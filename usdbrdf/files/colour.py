@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from difflib import get_close_matches
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,14 @@ from usdbrdf.model.arrays import Float
 
 WORKING_SPACE = "lin_rec709_scene"
 DISPLAY_SPACE = "srgb_rec709_scene"
-_CONFIG = "cg-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
+_CONFIG = "studio-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
+_KIND_OF_CONFIG = "studio-config-v"
+# How OpenColorIO calls what a space's values are.
+_KINDS: dict[str, Literal["linear", "log", "display"]] = {
+    "scene-linear": "linear",
+    "log": "log",
+    "sdr-video": "display",
+}
 # Our names, and what configs older than the pinned one call the same space.
 _NAMES = {
     "lin_ap0_scene": ("lin_ap0_scene", "lin_ap0"),
@@ -25,22 +33,67 @@ _NAMES = {
     "lin_rec709_scene": ("lin_rec709_scene", "lin_rec709_srgb", "lin_rec709"),
     "srgb_rec709_scene": ("srgb_rec709_scene", "srgb_tx"),
 }
+# x, y of red, green, blue and white (SMPTE ST 2065-1, Academy S-2014-004, ITU-R BT.709 and BT.2020,
+# SMPTE EG 432-1), and by how much numbers in files are off.
+_CHROMATICITIES = {
+    "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
+    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767),
+    "lin_p3d65_scene": (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
+    "lin_rec2020_scene": (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.329),
+    "lin_rec709_scene": (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329),
+}
+_SAME_PLACE = 2e-3
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
 
 
 def known_encodings() -> tuple[str, ...]:
-    """The names that ``to_working_space`` understands."""
+    """The names for spaces of images that are asked for most; ``kind_of_encoding`` knows more."""
     return tuple(sorted(_NAMES))
+
+
+@cache
+def kind_of_encoding(encoding: str) -> Literal["linear", "log", "display"] | None:
+    """What the values of a colour space are, by its OpenColorIO name: proportional to radiance, a
+    camera's or ACES' logarithm of it, or made for a display as photographs are. None where
+    OpenColorIO's studio configuration has no such space of scenes."""
+    if encoding in _NAMES:
+        return "display" if encoding == DISPLAY_SPACE else "linear"
+    space = _config().getColorSpace(encoding)
+    if space is None or space.getReferenceSpaceType() != ocio.REFERENCE_SPACE_SCENE:
+        return None
+    return _KINDS.get(space.getEncoding())
+
+
+def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
+    """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
+    says nothing that is known."""
+    if name and kind_of_encoding(name):
+        return name
+    for encoding, places in _CHROMATICITIES.items():
+        if chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE:
+            return encoding
+    return None
+
+
+def unknown_encoding(encoding: str) -> str:
+    """A sentence that tells of the names which are most alike."""
+    spaces = list(_config().getColorSpaces())
+    known = [name for s in spaces for name in (s.getName(), *s.getAliases())]
+    usable = [name for name in known if kind_of_encoding(name)]
+    of = {name.lower(): name for name in usable}
+    near = [of[name] for name in get_close_matches(encoding.lower(), of, n=3, cutoff=0.5)]
+    like = f" Alike are {', '.join(map(repr, near))}." if near else ""
+    return f"colour space {encoding!r} is not known.{like}"
 
 
 def to_working_space(pixels: Float, encoding: str) -> Float:
     """A copy of (H, W, 3) float32 pixels as linear Rec.709; negative and large values pass."""
-    if encoding not in _NAMES:
+    if kind_of_encoding(encoding) is None:
         raise InputRefused(
-            f"colour space {encoding!r} is not known. Use one of {', '.join(known_encodings())}. "
-            "[colour.encoding]"
+            f"{unknown_encoding(encoding)} Use one of {', '.join(known_encodings())}, or another "
+            "of OpenColorIO's studio configuration. [colour.encoding]"
         )
     return _converted(pixels, encoding, WORKING_SPACE)
 
@@ -81,11 +134,10 @@ def _converted(pixels: Float, source: str, target: str) -> Float:
 
 @cache
 def _processor(source: str, target: str) -> Any:
-    built_in = ocio.BuiltinConfigRegistry().getBuiltinConfigs()
-    config = ocio.Config.CreateFromBuiltinConfig(_pick_config([entry[0] for entry in built_in]))
-    names = []
+    config, names = _config(), []
     for encoding in (source, target):
-        known = [name for name in _NAMES[encoding] if config.getColorSpace(name) is not None]
+        called = _NAMES.get(encoding, (encoding,))
+        known = [name for name in called if config.getColorSpace(name) is not None]
         if not known:
             raise InputRefused(
                 f"colour space {encoding!r} is not in this OpenColorIO ({ocio.__version__}). "
@@ -97,9 +149,15 @@ def _processor(source: str, target: str) -> Any:
     return processor.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
 
 
+@cache
+def _config() -> Any:
+    built_in = ocio.BuiltinConfigRegistry().getBuiltinConfigs()
+    return ocio.Config.CreateFromBuiltinConfig(_pick_config([entry[0] for entry in built_in]))
+
+
 def _pick_config(available: list[str]) -> str:
     """The pinned configuration, or in an older OpenColorIO the newest one of its kind."""
     if _CONFIG in available:
         return _CONFIG
-    kind = [name for name in available if name.startswith("cg-config-v")]
+    kind = [name for name in available if name.startswith(_KIND_OF_CONFIG)]
     return max(kind, key=lambda name: [int(number) for number in re.findall(r"\d+", name)])

@@ -11,7 +11,7 @@ from threading import Lock
 
 import numpy as np
 
-from usdbrdf.files.colour import to_working_space
+from usdbrdf.files.colour import kind_of_encoding, to_working_space
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
@@ -101,9 +101,12 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
-    photograph = frames.encoding == PHOTOGRAPH_ENCODING
+    linear = kind_of_encoding(frames.encoding) == "linear"
+    radiance = to_working_space(recorded, frames.encoding) if linear else recorded
+    if any(frames.vignetting):
+        radiance = radiance / transmission(frames, i)[..., None]
     return FramePixels(
-        radiance=recorded if photograph else to_working_space(recorded, frames.encoding),
+        radiance=radiance,
         valid=~(unknown | clipped | dark),
         clipped=clipped,
         dark=dark,
@@ -112,18 +115,31 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     )
 
 
+def transmission(frames: Frames, i: int) -> Float:
+    """(H, W) float32: which share of the light the lens passes to each pixel of frame ``i``."""
+    width, height = (int(side) for side in frames.resolution[i])
+    _, _, cx, cy = frames.intrinsics[i]
+    across, down = np.arange(width) + 0.5 - cx, np.arange(height) + 0.5 - cy
+    square = 4 * (across**2 + down[:, None] ** 2) / (width**2 + height**2)
+    first, second = frames.vignetting
+    return np.asarray(np.exp(square * (first + square * second)), np.float32)
+
+
 def read_recorded(
     path: Path, encoding: str, saturation: float, gain: float = 1.0
 ) -> tuple[Float, Bool, int]:
-    """The radiance (H, W, 3) that an image records, in its own primaries, NaN where it is unknown;
-    where that is (H, W): some channel is NaN, infinite or clearly negative; and how many pixels had
-    a channel a little below zero.
+    """The radiance (H, W, 3) that an image records, NaN where it is unknown; where that is (H, W):
+    some channel is NaN, infinite or clearly negative; and how many pixels had a channel a little
+    below zero. Of a linear image in its own primaries, of others in those of Rec.709.
 
     saturation, gain: of the frame, see ``Frames``. Channels down to -1e-3 of the frame's median are
     ringing and become 0.
     """
     recorded = read_radiance(path)
-    if encoding == PHOTOGRAPH_ENCODING:
+    kind = kind_of_encoding(encoding)
+    if kind == "log":
+        recorded = to_working_space(recorded, encoding)
+    if kind == "display":
         # Radiance is value * reference exposure / exposure time. The adapter wrote that factor into
         # the saturation; unlike a median of exposure times it stays when frames are left out.
         scale = np.float32(saturation / PHOTOGRAPH_SATURATION)

@@ -38,7 +38,7 @@ _HALF_FROM, _HALF_UNTIL = 2.0**-14, 60_000.0
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
 # fmt: off
-_RAW_SUFFIXES = frozenset((
+RAW_SUFFIXES = frozenset((
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
 ))
@@ -84,6 +84,15 @@ def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
     """Width and height of the display window and the channel names, from the header alone."""
     spec = _open(path, MAX_SIDE).spec()
     return spec.full_width, spec.full_height, tuple(spec.channelnames)
+
+
+def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
+    """What an image's header says of its colour space: a name, "" without one; and x, y of red,
+    green, blue and white, () without these."""
+    spec = _open(path, MAX_SIDE).spec()
+    name, places = spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
+    sound = isinstance(places, tuple) and len(places) == 8
+    return str(name or ""), tuple(float(place) for place in places) if sound else ()
 
 
 def is_eight_bit(path: Path) -> bool:
@@ -217,10 +226,10 @@ def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
 def _open(path: Path, max_side: int) -> Any:
     """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
     part that has R, G and B, or the first if none has."""
-    if path.suffix.lower() in _RAW_SUFFIXES:
+    if path.suffix.lower() in RAW_SUFFIXES:
         raise ImageRefused(
-            f"{path}: camera raw files are not read (only their preview would be). Develop it "
-            "to a scene-linear EXR. [image.raw]"
+            f"{path}: camera raw files are not read here (only their preview would be). Let "
+            "`usdbrdf develop-raw` make a capture of radiance of them. [image.raw]"
         )
     try:
         status = path.stat()

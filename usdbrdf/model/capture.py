@@ -28,13 +28,14 @@ class Frames:
     exposure_time         (N,) float64, seconds (1 where unknown)
     saturation_radiance   (N,) float64: a channel >= 0.998 of it is clipped
     noise_floor_radiance  (N,) float64: a channel below it is noise
-    encoding              colour space of the stored images, in OpenColorIO's names:
-                          "lin_rec709_scene", "lin_ap1_scene" or "srgb_rec709_scene"
+    encoding              colour space of the stored images, in OpenColorIO's names
     radiometric           False where the images are low dynamic range photographs
     photographs           what the images were resampled from, N absolute paths, None where an image
                           is the photograph itself; () where all are
     masks                 whose black pixels these images do not have, in the same way
     lenses                the lenses of these photographs in words, "" where there is none
+    vignetting            k1, k2: the lens passes exp(k1 rho^2 + k2 rho^4) of the light, rho in half
+                          diagonals of the image from the principal point; it is to be divided out
     gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
                           by, to be divided out; the limits above are those of what is left
     captured_pose         (N, 4, 4) float64 or None: world_from_camera before it was refined
@@ -54,6 +55,7 @@ class Frames:
     lenses: tuple[str, ...] = ()
     gain: Double | None = None
     captured_pose: Double | None = None
+    vignetting: tuple[float, float] = (0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -123,6 +125,7 @@ class Scan:
                    yet to be written into (``capture.develop``)
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
+    label_source   who divided it into objects, see ``ScanGeometry``
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -139,5 +142,6 @@ class Scan:
     object_prims: tuple[str, ...] = ()
     views: tuple[View | None, ...] = ()
     turned_faces: Bool | None = None
+    label_source: str = "capture"
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

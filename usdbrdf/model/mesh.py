@@ -48,6 +48,8 @@ class ScanGeometry:
                               itself)
     meters_per_unit, up_axis  "Y" or "Z"; None where the file does not say
     warnings                  sentences about what was left out or simplified
+    label_source              who divided it into objects: "capture"; or we did, into "connected"
+                              parts; or it is yet to be "segmented"
     """
 
     mesh: ScanMesh
@@ -58,6 +60,7 @@ class ScanGeometry:
     meters_per_unit: float | None = None
     up_axis: str | None = None
     warnings: tuple[str, ...] = ()
+    label_source: str = "capture"
 
 
 @dataclass(frozen=True, kw_only=True)

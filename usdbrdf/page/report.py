@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from usdbrdf.asset.header import read_header
@@ -18,12 +19,11 @@ from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
 from usdbrdf.asset.review import changes_since, read_review
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.capture.parts import frames_at
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.job.stamp import code_version
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.capture import Frames, frames_at
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
 from usdbrdf.page.objects import object_rows
@@ -111,13 +111,14 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     where = objects_in_frames(
         seen.lit.rays, atlas.scene.face_object, len(words), frames_at(frames, chosen)
     )
-    views = _asked_views(place, atlas, options)
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
-    if options.evaluation is None:
-        shown, rows = rendered_views(seen, views)
-    else:
-        shown, rows = evaluated_views(options.evaluation, place)
+    with TemporaryDirectory(prefix="usdbrdf-") as folder:
+        views = _asked_views(place, atlas, options, Path(folder))
+        if options.evaluation is None:
+            shown, rows = rendered_views(seen, views)
+        else:
+            shown, rows = evaluated_views(options.evaluation, place)
     return {
         "name": place.name,
         "version": code_version(),
@@ -162,11 +163,12 @@ def _frames_to_search(count: int, fits: Sequence[FittedObject]) -> list[int]:
     return sorted({*spread_evenly(count, _SEARCHED), *targets})
 
 
-def _asked_views(asset: Asset, atlas: AssetMaps, options: ReportOptions) -> Views:
-    """Those of the document that was named, else the capture's frames."""
+def _asked_views(asset: Asset, atlas: AssetMaps, options: ReportOptions, folder: Path) -> Views:
+    """Those of the document that was named, which may need ``folder`` for frames of lenses, else
+    the capture's frames."""
     if options.views is not None:
         return photographs_of_views(
-            options.views, asset, atlas.stage, atlas.scene, options.allow_outside
+            options.views, asset, atlas.stage, atlas.scene, folder, options.allow_outside
         )
     names = tuple(path.name for path in atlas.frames.image_paths)
     return Views(names=names, frames=atlas.frames)

@@ -13,7 +13,6 @@ import numpy as np
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.views import Views
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.capture.parts import frames_at
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation import report as figures
 from usdbrdf.evaluation.evaluate_views import (
@@ -28,6 +27,7 @@ from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Byte
+from usdbrdf.model.capture import frames_at
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.page.pictures import as_bytes, data_uri
 

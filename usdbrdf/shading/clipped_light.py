@@ -73,6 +73,7 @@ def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> Cl
     found: list[tuple[float, int, float, bool, Long]] = []
     measured, clipped = coverage.measured, coverage.clipped
     bright = radiance.max(axis=1)
+    reach = _AROUND * float(np.sqrt(texels.area.sum()))
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
         candidates = own[clipped[own]]
@@ -85,7 +86,7 @@ def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> Cl
             bound, lamp = float(bright[part][clipped[part]].max()), bool(whole)
             if not lamp:  # one that stands out from what is around it
                 distance, _ = cKDTree(texels.position[part]).query(texels.position[around])
-                near = bright[around[distance < _AROUND]]
+                near = bright[around[distance < reach]]
                 lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
     found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]

@@ -37,7 +37,7 @@ def inputs_of_capture(
         usd = mesh.suffix.lower() in USD_SUFFIXES
         layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
         inputs["mesh"] = hash_of_files(layers)
-    if objects is not None and objects.is_file():
+    if isinstance(objects, Path) and objects.is_file():
         inputs["objects"] = hash_of_files([objects])
     named = {"mesh": mesh.resolve()} if mesh is not None else {}
     places = {"capture": capture.resolve()} | named | outside

@@ -20,7 +20,7 @@ from usdbrdf.capture.develop import developed
 from usdbrdf.capture.native import refuse_taken, write_capture
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.capture_inputs import inputs_of_capture
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
@@ -45,6 +45,8 @@ def ingest(
         for key, value in asdict(options).items()
         if key not in ("mesh", "objects", "frames", "allow_outside")
     }
+    if options.objects == AUTO:
+        parameters["objects"] = AUTO
     chosen = choose_adapter(capture, adapter, plugins=plugins)
     inputs, places = inputs_of_capture(capture, options, asset, files_beside(chosen, capture))
     if chosen.package:
@@ -70,7 +72,7 @@ def ingest(
         images = [run.kept.get(file, Path(file)) for file in files]
         asked, told = asked_of_its_pixels(scan, images, options)
         if copy_to is not None:
-            write_capture(_as_posed(scan, asked), images, copy_to)
+            write_capture(_as_asked(scan, asked), images, copy_to)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
@@ -81,7 +83,8 @@ def ingest(
         return {
             "adapter": scan.adapter,
             "frames": len(scan.frames),
-            "objects": len(scan.objects),
+            "objects": len(asked.objects),
+            "objects_from": scan.label_source,
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
@@ -94,15 +97,14 @@ def ingest(
         scan = read_with(chosen, capture, options)
         frames = developed(scan.frames, scan.views, asset.folder, lambda *_: None)
         scan = replace(scan, frames=frames)
-        again = options.refine_poses
+        again = options.refine_poses or options.objects == AUTO
         asked = asked_of_its_pixels(scan, frames.image_paths, options)[0] if again else scan
-        write_capture(_as_posed(scan, asked), frames.image_paths, copy_to)
+        write_capture(_as_asked(scan, asked), frames.image_paths, copy_to)
     return result
 
 
-def _as_posed(scan: Scan, asked: Scan) -> Scan:
-    """The scan, whose files are copied as they are, with refined poses."""
+def _as_asked(scan: Scan, asked: Scan) -> Scan:
+    """The scan, whose files are copied as they are, with the poses and objects that were found."""
     refined, captured = asked.frames.world_from_camera, asked.frames.captured_pose
-    return replace(
-        scan, frames=replace(scan.frames, world_from_camera=refined, captured_pose=captured)
-    )
+    frames = replace(scan.frames, world_from_camera=refined, captured_pose=captured)
+    return replace(scan, frames=frames, mesh=asked.mesh, objects=asked.objects)

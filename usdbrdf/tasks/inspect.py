@@ -14,7 +14,8 @@ from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.model.capture import frames_at
-from usdbrdf.options import InspectOptions
+from usdbrdf.options import AUTO, InspectOptions
+from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
 
 
@@ -32,6 +33,11 @@ def inspect(
             frames = developed_in(frames_at(found.frames, asked), views, Path(folder))
             read = partial(read_frame, frames)
             agrees = agreement_of_frames(found.mesh, frames, read, capture)
+            if options.objects == AUTO:
+                every = developed_in(found.frames, found.views, Path(folder))
+                read = partial(read_frame, every)
+                mesh, objects, _ = segmented(found.mesh, None, every, read)
+                found = replace(found, mesh=mesh, objects=objects)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))
     return replace(found, agreement=agrees and agrees.ratio)

@@ -19,7 +19,9 @@ from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.tasks.objects import segmented
+from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import Read, with_refined_poses
 from usdbrdf.texturing.agreement import (
     Agreement,
@@ -43,11 +45,17 @@ def asked_of_its_pixels(
     what was found, for the record."""
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
-    told: dict[str, Any] = {"agreement": agrees and agrees.ratio}
+    scan, told = asked_of_its_optics(scan, read, estimate=options.vignetting == "estimate")
+    told["agreement"] = agrees and agrees.ratio
+    read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.refine_poses:
         scan, told["refined_poses"] = with_refined_poses(scan, read)
     if options.exposure == "estimate":
         scan, told["estimated_exposures"] = estimated_exposures(scan, read)
+        read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
+    if options.objects == AUTO:
+        mesh, objects, found = segmented(scan.mesh, scan.turned_faces, scan.frames, read)
+        scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
     return scan, told
 
 

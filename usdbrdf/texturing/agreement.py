@@ -54,7 +54,7 @@ def logarithms_in_frame(
     """(P,) float32 logarithm of what a frame shows at each point, the mean of R, G and B over 3 x 3
     pixels; NaN where it shows nothing valid."""
     found = np.full(len(surface.point), np.nan, np.float32)
-    seen, column, row = _seen(surface, rays, camera)
+    seen, column, row = seen_points(surface, rays, camera)
     level = pixels.radiance.mean(axis=2)
     level = np.where(pixels.valid & (level > 0), level, np.nan)
     around = [level[row + down, column + right] for down in (-1, 0, 1) for right in (-1, 0, 1)]
@@ -62,7 +62,7 @@ def logarithms_in_frame(
     return found
 
 
-def _seen(surface: SurfacePoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
+def seen_points(surface: SurfacePoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
     """Which points (P,) a camera sees, from in front, and of these column and row."""
     way = surface.point - camera.eye
     distance = np.linalg.norm(way, axis=1)

@@ -117,6 +117,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
         adapter=scan.adapter,
         radiometric=frames.radiometric,
         counts=scan.counts,
+        objects_from=scan.label_source,
         scopes=scopes.names,
         competing_bindings=competing or None,
     )
@@ -138,7 +139,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
             input_usd.weaken_bindings(layer, mesh, source, scopes.root)
             own = face_object == i
             input_usd.author_overrides(layer, at, mesh, normals[own], turned[own])
-            _author_label(over(layer, at), scan.objects[i])
+            _author_label(over(layer, at), scan.objects[i], scan.label_source)
     else:
         _author_meshes(layer, scopes, scan)
     define(layer, scopes.path("cameras"), "Scope")
@@ -155,11 +156,15 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     export(layer, path, folder=folder)
 
 
-def _author_label(prim: Sdf.PrimSpec, found: ObjectLabel) -> None:
+def _author_label(prim: Sdf.PrimSpec, found: ObjectLabel, source: str) -> None:
     """What makes a mesh one of our objects, as USD can hold it."""
     label, class_name = readable_label(found.label), readable_label(found.class_name)
-    identifier = found.identifier
-    author_record(prim, LabelledObject(label=label, class_name=class_name, identifier=identifier))
+    author_record(
+        prim,
+        LabelledObject(
+            label=label, class_name=class_name, identifier=found.identifier, label_source=source
+        ),
+    )
     prim.SetInfo("displayName", label)
     if class_name:
         apply_schema(prim, "SemanticsLabelsAPI:class")
@@ -179,7 +184,7 @@ def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
             prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
             prim.SetInfo("kind", "component")
             _author_mesh(prim, mesh, faces)
-            _author_label(prim, label)
+            _author_label(prim, label, scan.label_source)
 
 
 def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:

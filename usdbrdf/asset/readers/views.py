@@ -30,6 +30,7 @@ from usdbrdf.capture.checks import (
 from usdbrdf.capture.develop import developed_in, frames_of_photographs
 from usdbrdf.capture.formats.transforms import frame_records
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
 from usdbrdf.model.camera import Camera
@@ -107,7 +108,8 @@ def photographs_of_views(
     total = len(records) + len(findings.dropped)
     encoding = captured.encoding
     if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
-        encoding = PHOTOGRAPH_ENCODING
+        if kind_of_encoding(encoding) != "display":
+            encoding = PHOTOGRAPH_ENCODING
         records = [_as_the_captures_photographs(r, captured) for r in records]
     _refuse_none(len(records), findings, source)
     taken = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
@@ -147,7 +149,7 @@ def _rigid_records(
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
     """8-bit record with its limits in the unit that ingest gave the capture's photographs."""
     # What was resampled from photographs is linear.
-    if captured.encoding != PHOTOGRAPH_ENCODING and not captured.photographs:
+    if kind_of_encoding(captured.encoding) != "display" and not captured.photographs:
         raise InputRefused(
             f"{record.image_path}: an 8-bit photograph, but the capture's images are "
             f"{captured.encoding}. Use views of the same kind. [evaluate.views]"

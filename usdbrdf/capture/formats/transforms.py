@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -29,9 +29,8 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import ImageRefused, InputRefused
-from usdbrdf.files.colour import known_encodings
+from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.frames import PHOTOGRAPH_ENCODING
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
@@ -87,8 +86,12 @@ def read(path: Path, options: IngestOptions) -> Scan:
     photographs = refuse_photographs(
         [r.image_path for r in records], assume_srgb=options.assume_srgb
     )
-    stated = _stated(capture, "encoding", known_encodings())
-    if stated is not None and photographs != (stated == PHOTOGRAPH_ENCODING):
+    stated = capture.document.get("encoding")
+    if stated is not None and not (isinstance(stated, str) and kind_of_encoding(stated)):
+        known = f"{', '.join(known_encodings())} and OpenColorIO's others"
+        said = f"encoding is {str(stated)[:40]!r}, none of {known}. Correct it."
+        raise capture.refuse(said, "capture.format")
+    if stated is not None and photographs != (kind_of_encoding(stated) == "display"):
         kind = "8-bit photographs" if photographs else "scene-linear images"
         said = f"encoding is {stated!r}, but the images are {kind}. Remove or correct it."
         raise capture.refuse(said, "capture.format")
@@ -117,7 +120,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
             capture_root=source.parent,
             meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         ),
-        options,
+        options if stated is None else replace(options, encoding=encoding),
         findings,
         name=source.parent.name,
         adapter=NAME,
@@ -457,7 +460,7 @@ def _stated(capture: _Capture, key: str, known: tuple[str, ...]) -> str | None:
     return word
 
 
-def _objects(capture: _Capture) -> Path | None:
+def _objects(capture: _Capture) -> Path | Literal["auto"] | None:
     if capture.options.objects is not None:
         return capture.options.objects
     path = _beside(capture, "objects", "objects.json")

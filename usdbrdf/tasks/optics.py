@@ -1,0 +1,63 @@
+"""Vignetting and drift of the white balance: told, and the former divided out on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.files.frames import FramePixels, read_frames
+from usdbrdf.job.progress import progress, warn
+from usdbrdf.model.capture import Scan
+from usdbrdf.texturing.agreement import points_of_surface
+from usdbrdf.texturing.optics import (
+    Samples,
+    balance_drift,
+    drifts,
+    falloff_of_frames,
+    samples_in_frame,
+)
+from usdbrdf.transport.rays import RayScene
+
+# Frames that are asked, and how many are named.
+_ASKED, _LISTED = 32, 6
+
+
+def asked_of_its_optics(
+    scan: Scan, read: Callable[[int], FramePixels], *, estimate: bool
+) -> tuple[Scan, dict[str, Any]]:
+    """The scan, its frames' vignetting to be divided out if ``estimate``; and what was found, of
+    which the user is told where it is much: stops that corners are darker by, and that the balance
+    of red or blue to green is off by in the worst frame."""
+    frames, mesh = scan.frames, scan.mesh
+    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+    asked = spread_evenly(len(frames), _ASKED)
+    images = read_frames(read, asked)
+    shown = progress(images, total=len(asked), label="optics", unit="frames")
+    columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in shown]
+    logarithm, radius2 = (np.stack(each, axis=1) for each in zip(*columns, strict=True))
+    samples = Samples(logarithm, radius2)
+    falloff, drift = falloff_of_frames(samples), balance_drift(samples)
+    told: dict[str, Any] = {"vignetting_stops": falloff and round(falloff.stops, 3)}
+    told["white_balance_drift_stops"] = None if drift is None else round(float(drift.max()), 3)
+    if falloff is not None and falloff.is_clear:
+        done = "that was divided out" if estimate else "--vignetting estimate divides it out"
+        warn(
+            f"{scan.source.name}: all frames are {falloff.stops:.2f} stops darker in their corners "
+            f"than in the middle (error {falloff.error:.2f}); {done}. [capture.vignetting]"
+        )
+        if estimate:
+            scan = replace(scan, frames=replace(frames, vignetting=falloff.coefficients))
+    if drift is not None and drifts(drift).any():
+        off = [frames.image_paths[asked[k]].name for k in np.flatnonzero(drifts(drift))]
+        named = ", ".join(off[:_LISTED])
+        more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
+        warn(
+            f"{scan.source.name}: the white balance of {len(off)} of {len(asked)} frames is off "
+            f"that of the others, by {drift.max():.2f} stops at most: {named}{more}. Develop "
+            "all frames with one balance. [capture.balance]"
+        )
+    return scan, told
