@@ -210,8 +210,8 @@ def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
         state = asset / STATE_FOLDER
         with suppress(OSError):
             if state in made and [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]:
-                shutil.rmtree(state / "stamps", ignore_errors=True)
-                shutil.rmtree(state / "work", ignore_errors=True)
+                for name in ("stamps", "work", "cache"):
+                    shutil.rmtree(state / name, ignore_errors=True)
                 _remove_empty(state, made)
         raise
 
