@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec
+from typing import NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -337,9 +337,9 @@ def scan_from_parts(
         findings.count("frames_looked_at", len(findings.looked_at))
     # From here on the faces of a photograph count one by one.
     total += len(kept) - len(usable)
-    frames, used = frames_at(frames, kept), [rigid[photograph_of[i]].name for i in kept]
+    frames, used = frames.at(kept), [rigid[photograph_of[i]].name for i in kept]
     sides, outside = _sides(geometry, frames, used, findings)
-    frames, kept = frames_at(frames, outside), [kept[i] for i in outside]
+    frames, kept = frames.at(outside), [kept[i] for i in outside]
     findings.refuse_too_few_frames(source, total)
     findings.warn_of_dropped_frames(source, total)
     return Scan(
@@ -357,6 +357,7 @@ def scan_from_parts(
         object_prims=geometry.object_prims,
         views=tuple(views[i] for i in kept) if any(views) else (),
         turned_faces=sides.turned,
+        has_normals=geometry.has_normals,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )
@@ -375,7 +376,7 @@ def _sides(
     sides = seen(frames)
     outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
     if 0 < len(outside) < len(frames):
-        sides = seen(frames_at(frames, outside))
+        sides = seen(frames.at(outside))
     turned, both = int(sides.turned.sum()), int(sides.both.sum())
     findings.count("faces_turned", turned)
     findings.count("faces_of_two_sides", both)
@@ -388,18 +389,6 @@ def _sides(
         # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
         sides = replace(sides, both=np.zeros_like(sides.both))
     return sides, outside
-
-
-def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
-    """The frames with these indices, in this order."""
-    rows = np.asarray(indices, np.int64)
-    columns: dict[str, Any] = {
-        k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
-    }
-    for name in ("image_paths", "photographs", "masks", "lenses"):
-        found = getattr(frames, name)
-        columns[name] = tuple(found[i] for i in rows) if found else ()
-    return replace(frames, **columns)
 
 
 def as_photographs(

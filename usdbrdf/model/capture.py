@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from usdbrdf.model.arrays import Bool, Double, Int
 from usdbrdf.model.camera import Camera
@@ -33,6 +37,8 @@ class Frames:
     lenses                the lenses of these photographs in words, "" where there is none
     gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
                           by, to be divided out; the limits above are those of what is left
+    lightings             the lightings of the scene that the frames show, N names, those of one
+                          after each other; () where there is but one
     """
 
     image_paths: tuple[Path, ...]
@@ -48,6 +54,7 @@ class Frames:
     masks: tuple[Path | None, ...] = ()
     lenses: tuple[str, ...] = ()
     gain: Double | None = None
+    lightings: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -63,6 +70,24 @@ class Frames:
         given = self.photographs or (None,) * len(self)
         images = tuple(p or image for p, image in zip(given, self.image_paths, strict=True))
         return replace(self, image_paths=images)
+
+    def at(self, indices: Sequence[int]) -> Frames:
+        """The frames with these indices, in this order."""
+        rows = np.asarray(indices, np.int64)
+        columns: dict[str, Any] = {
+            k: v[rows] for k, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
+        for name in ("image_paths", "photographs", "masks", "lenses", "lightings"):
+            found = getattr(self, name)
+            columns[name] = tuple(found[i] for i in rows) if found else ()
+        return replace(self, **columns)
+
+    def of_lighting(self, name: str) -> range:
+        """The numbers of the frames that show one lighting; of all where there is but one."""
+        if not self.lightings:
+            return range(len(self))
+        first = self.lightings.index(name)
+        return range(first, first + self.lightings.count(name))
 
     def camera(self, i: int) -> Camera:
         """The camera of frame i, named after its image."""
@@ -105,6 +130,7 @@ class Scan:
                    yet to be written into (``capture.develop``)
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
+    has_normals    (F,) bool: faces whose normals are the file's; None: of none
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -121,5 +147,6 @@ class Scan:
     object_prims: tuple[str, ...] = ()
     views: tuple[View | None, ...] = ()
     turned_faces: Bool | None = None
+    has_normals: Bool | None = None
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

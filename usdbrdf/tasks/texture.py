@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.layers.task_layers import write_texturing_layer
+from usdbrdf.asset.layers.task_layers import write_texturing_layer, write_uv_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
-from usdbrdf.asset.readers.scene import given_corner_uv
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task, warned
-from usdbrdf.texturing.footprints import texel_sizes_from_frames
+from usdbrdf.tasks.unwrap import atlas_of_lightings, laid_out
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
-from usdbrdf.texturing.passes import most_texels
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:
-    """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
+    """Unwrap every object, project the frames, write texturing.usda and its EXR maps; of one of
+    several lightings, which are unwrapped together before, its own layer and maps."""
     maps = AssetMaps(open_weaker(asset, "texturing"))
     task = Task(
         asset=asset,
@@ -39,33 +37,23 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
-        scene, frames = maps.scene, maps.frames
-        rays = RayScene(scene.points, scene.triangles)
-        if options.texel_size:
-            sizes = TexelSizes.even(scene, options.texel_size)
-        else:
-            most = options.max_texels or most_texels(options.memory)
-            sizes = texel_sizes_from_frames(scene, rays, frames, most)
-        given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
-        charts = run.checkpoint("charts", lambda: charts_of_scene(scene, given, sizes))
-        scene = replace(scene, corner_uv=charts["corner_uv"])
-        surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)
-        sides = sizes.of_objects(scene)
+        frames, rays = maps.frames, RayScene(maps.scene.points, maps.scene.triangles)
+        atlas = atlas_of_lightings(maps) if asset.lighting else laid_out(run, maps, rays, options)
+        scene, sides = atlas.scene, atlas.sides
+        surface = TexturedScene(scene, texels_from_atlas(scene, atlas.resolution), rays)
         side = 1000 * float(np.median(sides))
         say(f"texture: {len(surface.texels):,} texels of {side:.3g} mm, {len(frames)} frames")
         found = lit_texture_from_frames(run, surface, frames, options.quantile, options.memory)
         doubts = warned(found.doubts())
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, sides, options.quantile)
-        write_texturing_layer(
-            run.output(f"layers/{asset.layer('texturing').name}"),
-            run.output(f"layers/{asset.uv_layer.name}"),
-            task.draft,
-            objects,
-            maps.stage,
-        )
+        if not asset.lighting:
+            uv = run.output(f"layers/{asset.uv_layer.name}")
+            write_uv_layer(uv, task.draft, objects, maps.stage)
+        layer = run.output(f"layers/{asset.layer('texturing').name}")
+        write_texturing_layer(layer, task.draft, objects)
         view = overview(scene, rays, frames)
-        view.write(run.output("previews/lit.png"), surface.texels, found.lit)
+        view.write(run.output(asset.preview("lit")), surface.texels, found.lit)
         return {
             "texel_size": float(np.median(sides)),
             "texels": len(surface.texels),

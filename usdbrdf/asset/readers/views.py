@@ -26,7 +26,6 @@ from usdbrdf.capture.checks import (
     rigid_records,
 )
 from usdbrdf.capture.formats.transforms import frame_records
-from usdbrdf.capture.parts import frames_at
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
@@ -113,7 +112,7 @@ def photographs_of_views(
     findings.warn_of_dropped_frames(source, total)
     for sentence in findings.warnings:
         warn(sentence)
-    return Views(names=tuple(names[i] for i in usable), frames=frames_at(frames, usable))
+    return Views(names=tuple(names[i] for i in usable), frames=frames.at(usable))
 
 
 def _rigid_records(
