@@ -43,6 +43,7 @@ SLOW = (
     "test_cli.py",
     "test_convert.py",
     "test_identity.py",
+    "test_lightings.py",
     "test_units.py",
 )
 
