@@ -87,7 +87,10 @@ def fitted(
 
     def fit_one(i: int) -> ObjectFit:
         mixture = effort.mixture
-        return fit_objects.fit_object(lit.scene, reader, survey, i, options, mixture=mixture)
+        lightings = [fit_objects.Lighting(lit.scene, survey)]
+        return fit_objects.fit_object(
+            lit.scene.lobe, lightings, reader, i, options, mixture=mixture
+        )
 
     fit_one(0)  # compiles
     objects = {}

@@ -45,6 +45,7 @@ SLOW = (
     "test_cli.py",
     "test_convert.py",
     "test_identity.py",
+    "test_lightings.py",
     "test_units.py",
     "texturing/test_earlier.py",
     "texturing/test_pose_steps.py",

@@ -21,6 +21,7 @@ from usdbrdf.asset.layers.task_layers import (
     write_material_layer,
     write_shading_layer,
     write_texturing_layer,
+    write_uv_layer,
 )
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.properties import (
@@ -201,7 +202,8 @@ class Built:
             write_scan_layer(path, self.scan, draft)
         elif role == "texturing":
             scanned = open_weaker(self.asset, "texturing")
-            write_texturing_layer(path, self.asset.uv_layer, draft, self.textured, scanned)
+            write_uv_layer(self.asset.uv_layer, draft, self.textured, scanned)
+            write_texturing_layer(path, draft, self.textured)
         elif role == "shading":
             write_shading_layer(path, draft, self.shaded, self.outside)
             self.write_lights()

@@ -77,8 +77,6 @@ class _Run(_Talking):
 
 
 class _OnCapture(_Talking):
-    capture: Path = option("SCAN", REQUIRED)
-    "capture folder or its main file"
     adapter: str | None = option(
         "--adapter NAME", None, unset="recognised by its content", shared="ingest"
     )
@@ -88,6 +86,9 @@ class _OnCapture(_Talking):
 
 
 class _RunOnCapture(_OnCapture, _Run):
+    capture: tuple[Path, ...] = option("SCAN", REQUIRED)
+    """capture folder or its main file; several of one scene, with the same mesh and objects, are
+    its lightings and get the names of their folders"""
     output: Path = option("-o --output ASSET", REQUIRED)
     "asset folder, made if it is not there"
 
@@ -95,6 +96,8 @@ class _RunOnCapture(_OnCapture, _Run):
 class Inspect(_OnCapture):
     """Say what a capture holds and what convert would refuse; nothing is written."""
 
+    capture: Path = option("SCAN", REQUIRED)
+    "capture folder or its main file"
     inspect: options.InspectOptions
 
     def run(self) -> int:

@@ -59,6 +59,11 @@ def _memory() -> float | None:
     return option("--memory GIB", None, (1e-3, 2**20), help=f"{use} as that asks for", **more)
 
 
+def _lighting() -> str | None:
+    text = "which of several lightings is looked at"
+    return option("--lighting NAME", None, unset="the one it opens in", help=text)
+
+
 def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
     text = f"let {who} name files in this folder too; may be given again"
     return option("--allow-outside DIR", (), unset="none", help=text)
@@ -268,6 +273,7 @@ class EvaluateOptions(Options):
     "points that a rendered pixel is the mean of; a square number"
     rays: int = option("--rays N", 144, (8, 1 << 24))
     "rays per pixel for the specular light, shared among its points"
+    lighting: str | None = _lighting()
     environment: Surroundings = _environment()
     seed: int = _seed()
     truth: Path | None = option("--truth FOLDER", None, unset="none")
@@ -345,6 +351,7 @@ class Insert(Options):
 class RelightOptions(Options):
     """What is rendered, in which light."""
 
+    lighting: str | None = _lighting()
     lights: Path | None = option("--lights FILE", None, unset="capture", none="capture")
     """capture: the recovered emitters; or a USD file with lights or glowing meshes, or a
     latitude-longitude .exr or .hdr, in their place"""
@@ -389,6 +396,7 @@ class PackageOptions(Options):
     "reduce textures to this longer side"
     look: str | None = option("--look NAME", None, unset="the one it opens in")
     "the look that is packed"
+    lighting: str | None = _lighting()
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
 

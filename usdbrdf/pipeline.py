@@ -9,12 +9,16 @@ step, look, override in edits.usda, and go on.
     shade    L_d          -> shading.usda    irradiance S by ray tracing, albedo = pi L_d / S
     fit      frames       -> material.usda   roughness and specular of each object; with these, L_d
                                              and albedo again, without specular light
+
+Of several captures of one scene, in as many lightings, texture and shade make a layer for each, and
+fit one material of all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
@@ -29,17 +33,20 @@ from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
-from usdbrdf.options import ConvertOptions, HandEdits
+from usdbrdf.options import ConvertOptions, HandEdits, ShadeOptions, TextureOptions
 from usdbrdf.tasks.fit import fit as fit_task
+from usdbrdf.tasks.fit import refuse_one_frame
 from usdbrdf.tasks.ingest import ingest as ingest_task
 from usdbrdf.tasks.shade import shade as shade_task
+from usdbrdf.tasks.task import in_each_lighting
 from usdbrdf.tasks.texture import texture as texture_task
+from usdbrdf.tasks.unwrap import unwrap
 
 P = ParamSpec("P")
 
 
 def convert(
-    capture: str | Path,
+    capture: str | Path | Sequence[str | Path],
     output: str | Path,
     options: ConvertOptions | None = None,
     *,
@@ -51,7 +58,8 @@ def convert(
 ) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
-    capture   folder or file that one of the adapters reads
+    capture   folder or file that one of the adapters reads; or several, that share mesh and
+              objects: one scene in as many lightings, which get the names of their folders
     output    asset folder, made if absent; its root layer is OUTPUT/<name>.usda
     adapter   name of the one that reads the capture; None: the first that recognises it, among
               those of other packages too if ``plugins``
@@ -62,11 +70,14 @@ def convert(
     valid before, and the same call again goes on where it stopped.
     """
     chosen = options or ConvertOptions()
+    paths = [capture] if isinstance(capture, (str, Path)) else [*capture]
+    if len(paths) > 1:
+        refuse_one_frame(chosen.fit)
     with working_on(
         output, hand_edits=hand_edits, wait_s=wait_s, without_lock=without_lock
     ) as asset:
         return {
-            "ingest": ingest(Path(capture), asset, chosen.ingest, adapter, plugins=plugins),
+            "ingest": ingest([*map(Path, paths)], asset, chosen.ingest, adapter, plugins=plugins),
             "texture": texture(asset, chosen.texture),
             "shade": shade(asset, chosen.shade),
             "fit": fit(asset, chosen.fit),
@@ -125,13 +136,24 @@ def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
         with working_on(asset.folder):
             result = task(*given, **named)
         if not result.reran:
-            say(f"{task.__name__}: up to date")
+            say(f"{task.__name__.strip('_')}: up to date")
         return result
 
     return run
 
 
+def _texture(asset: Asset, options: TextureOptions) -> TaskResult:
+    if not asset.lightings:
+        return texture_task(asset, options)
+    shared, found = unwrap(asset, options), in_each_lighting(texture_task, asset, options)
+    return replace(found, reran=shared.reran or found.reran)
+
+
+def _shade(asset: Asset, options: ShadeOptions) -> TaskResult:
+    return in_each_lighting(shade_task, asset, options)
+
+
 ingest = _on_its_folder(ingest_task)
-texture = _on_its_folder(texture_task)
-shade = _on_its_folder(shade_task)
+texture = _on_its_folder(_texture)
+shade = _on_its_folder(_shade)
 fit = _on_its_folder(fit_task)

@@ -131,7 +131,7 @@ def test_every_attribute_is_known_and_documented(name):
 
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one; one of its
-    objects is made a metal, and its photographs were taken through a lens."""
+    objects is made a metal, and its photographs were taken through a lens, by day."""
     verify()
     frames = built.scan.frames
     paths = frames.image_paths
@@ -144,6 +144,8 @@ def test_what_is_declared_is_authored_and_the_reverse(built):
     built.write_layer("material")
     built.outside = sky_of(built.asset)
     built.write_layer("shading")
+    built.scan = replace(built.scan, frames=replace(frames, lightings=("day",) * len(frames)))
+    built.write_layer("scan")
     authored = {}
     declared = {
         name: (fact.type, VARIABILITY[fact.is_uniform])

@@ -11,7 +11,13 @@ import pytest
 
 from usdbrdf.material import fit_views
 from usdbrdf.material.conductor import conductor_of
-from usdbrdf.material.fit_objects import FirstLook, ObjectFit, fitted_by_likelier_lobe, judged
+from usdbrdf.material.fit_objects import (
+    FirstLook,
+    Lighting,
+    ObjectFit,
+    fitted_by_likelier_lobe,
+    judged,
+)
 from usdbrdf.material.fit_views import SampledObject
 from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.model.scene import SceneObject
@@ -126,20 +132,20 @@ def test_the_scene_has_the_lobe_that_explains_its_views(paper: float, other: flo
         **dict.fromkeys(names),  # type: ignore[arg-type]
     )
     shown = SimpleNamespace(texel=np.array([1, 0, 0]))
-    survey = SimpleNamespace(target=np.array([3, -1]), observations=shown)
-    run = _Run(paper, other)
+    survey = SimpleNamespace(target=np.array([3, -1]), shown=np.ones(2), observations=shown)
+    lightings, run = [Lighting(lit, survey)], _Run(paper, other)  # type: ignore[arg-type]
 
-    def fitted(options: FitOptions) -> tuple[LitScene, list[ObjectFit]]:
-        return fitted_by_likelier_lobe(run, lit, None, survey, options)  # type: ignore[arg-type]
+    def fitted(options: FitOptions) -> tuple[int, list[ObjectFit]]:
+        return fitted_by_likelier_lobe(run, lightings, None, options)  # type: ignore[arg-type]
 
-    scene, found = fitted(FitOptions())
-    assert scene.lobe == chosen
+    lobe, found = fitted(FitOptions())
+    assert lobe == chosen
     assert found[0].evidence == (paper if chosen == PAPER else other)
     assert found[0][:2] == (0.1, 0.5)
     assert found[0][7:10] == (0.12, 0.45, 0.6)
     assert (found[0].target, found[0].num_samples) == (3, 40)
     assert np.isnan(found[1].phi)
-    assert fitted(FitOptions(lobe="paper"))[0].lobe == PAPER
+    assert fitted(FitOptions(lobe="paper"))[0] == PAPER
 
 
 def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.MonkeyPatch):
@@ -150,6 +156,6 @@ def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.Monkey
         return _lobe(0.05), None
 
     monkeypatch.setattr(fit_views, "fit_lobe", fit_lobe)
-    sampled = SampledObject(*[None] * 2, [], [], None)  # type: ignore[arg-type]
-    assert list(fit_views.fit_kinds(None, sampled, [PAPER, DIELECTRIC], 0)) == [PAPER]  # type: ignore[arg-type]
+    sampled = SampledObject([], None, (), [], None)  # type: ignore[arg-type]
+    assert list(fit_views.fit_kinds(sampled, [PAPER, DIELECTRIC], 0)) == [PAPER]
     assert tried == [None]

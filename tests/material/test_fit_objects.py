@@ -44,8 +44,9 @@ def test_blas_keeps_to_one_thread_while_objects_are_fitted(monkeypatch: pytest.M
         **dict.fromkeys(names),  # type: ignore[arg-type]
     )
     survey = SimpleNamespace(observations=SimpleNamespace(texel=np.array([2, 2, 0])))
+    lightings = [fit_objects.Lighting(lit, survey)]  # type: ignore[arg-type]
     run, options = _Run(), fit_objects.FitOptions(method="paper")
-    _, found = fit_objects.fitted_by_likelier_lobe(run, lit, None, survey, options)  # type: ignore[arg-type]
+    _, found = fit_objects.fitted_by_likelier_lobe(run, lightings, None, options)  # type: ignore[arg-type]
     assert found[1].cost == -1  # taken from an interrupted run
     assert sorted(run.saved) == ["object-0", "object-2", "object-3"]
     for i in (0, 2, 3):

@@ -27,7 +27,7 @@ from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material import refine
-from usdbrdf.material.refine import Lobes, Refined, refined_irradiance, refined_light
+from usdbrdf.material.refine import Lighting, Lobes, Refined, refined_irradiance, refined_light
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading import shaded
 from usdbrdf.transport.environment import black_environment
@@ -86,7 +86,9 @@ def _dielectric(phi: Float, psi: Float) -> Lobes:
 
 def _refined_light(run: TaskRun, atlas: AssetMaps, lit: LitScene, frames: Frames) -> Refined:
     reader, lobes = FrameReader(frames, most_bytes=0), _lobes(atlas)
-    return refined_light(run, lit, reader, atlas, lobes, "none", None, 0)
+    lighting = Lighting("", lit, atlas, range(len(frames)))
+    (found,) = refined_light(run, [lighting], reader, lobes, "none", None, 0)
+    return found
 
 
 def _irradiance(

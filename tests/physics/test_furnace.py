@@ -13,7 +13,7 @@ from tests.physics.surfaces import World, box, estimates, quad, room, world_of
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import TexelSizes, unwrap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.shaded import albedo_from_irradiance
+from usdbrdf.shading.base_color import albedo_from_irradiance
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
 

@@ -200,7 +200,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
     sampled, used = sampled_object(lit, observed, smoothing, cameras.__getitem__, SPHERE)
     assert sampled is not None
     assert used > 500
-    found, _ = fit_views(lit, lambda: sampled, 0)
+    found, _ = fit_views(lit.lobe, lambda: sampled, 0)
     assert found.phi == pytest.approx(phi, abs=0.04)
     assert found.psi == pytest.approx(psi, abs=0.1)
     assert found.evidence > 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from usdbrdf.shading.shaded import albedo_from_irradiance
+from usdbrdf.shading.base_color import albedo_from_irradiance
 
 
 def test_the_albedo_of_a_lambertian_surface():

@@ -78,7 +78,8 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
         return relative_path(copied.get(os.path.realpath(file), file), asset.folder)
 
     # The tool's own sublayers stay where they are: they are in the stage anyway.
-    own = {f"./{sub.name}" for sub in (asset.uv_layer, asset.lights_layer, asset.materialx_layer)}
+    lights = (one.lights_layer for one in asset.in_each_lighting)
+    own = {f"./{sub.name}" for sub in (asset.uv_layer, asset.materialx_layer, *lights)}
     text.subLayerPaths = [sub for sub in layer.subLayerPaths if sub not in own]
     UsdUtils.ModifyAssetPaths(text, from_new_place)
     text.documentation = (

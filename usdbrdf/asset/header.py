@@ -30,12 +30,13 @@ class StageHeader:
     end: float = 1.0
 
     @staticmethod
-    def of_scan(name: str, scan: Scan) -> StageHeader:
+    def of_scan(name: str, *scans: Scan) -> StageHeader:
+        """Of a scan, or of several whose frames follow each other."""
         return StageHeader(
             name=name,
-            meters_per_unit=scan.meters_per_unit,
-            up_axis=scan.up_axis,
-            end=float(max(1, len(scan.frames))),
+            meters_per_unit=scans[0].meters_per_unit,
+            up_axis=scans[0].up_axis,
+            end=float(max(1, sum(len(scan.frames) for scan in scans))),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import posixpath
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pxr import Sdf, Tf
@@ -16,14 +16,22 @@ from usdbrdf.job.stamp import read_stamp, stamp_path
 
 # The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
+# The variant set that chooses among several lightings of a scene.
+LIGHTING = "lighting"
 
 
 @dataclass(frozen=True)
 class Asset:
-    """An asset folder and the name of its default prim, which is also its root layer's name."""
+    """An asset folder and the name of its default prim, which is also its root layer's name.
+
+    lighting  of an asset that shows its scene in several, the one whose layers and maps are meant:
+              all but the scan, the texture coordinates and the materials lie once for each. ""
+              means what all have in common, which is everything where there is but one.
+    """
 
     folder: Path
     name: str
+    lighting: str = ""
 
     @staticmethod
     def at(folder: Path) -> Asset:
@@ -59,6 +67,27 @@ class Asset:
         return asset
 
     @property
+    def lightings(self) -> tuple[str, ...]:
+        """The lightings of the scene, as ingest recorded them; () where there is but one."""
+        scan = self.layer("scan")
+        record = open_metadata(scan).customLayerData.get("usdbrdf", {}) if scan.is_file() else {}
+        return tuple(record.get("lightings", ()))
+
+    @property
+    def in_each_lighting(self) -> tuple[Asset, ...]:
+        """Itself in each of its lightings; itself where there is but one."""
+        return tuple(replace(self, lighting=name) for name in self.lightings) or (self,)
+
+    def in_lighting(self, name: str | None) -> Asset:
+        """Itself in the lighting of a name, which None leaves to the root layer's selection.
+        UsageError where it has no such lighting."""
+        known = self.lightings
+        if name is not None and name not in known:
+            has = f"the asset has {', '.join(known)}" if known else "the asset has but one lighting"
+            raise UsageError(f"--lighting {name}: {has}. [asset.lighting]")
+        return replace(self, lighting=name or "")
+
+    @property
     def root_layer(self) -> Path:
         return self.folder / f"{self.name}.usda"
 
@@ -74,7 +103,7 @@ class Asset:
     @property
     def lights_layer(self) -> Path:
         """Emitters, sky and sun as UsdLux lights: a sublayer of shading.usda that may be muted."""
-        return self.folder / "layers" / "lights.usda"
+        return self.folder / "layers" / f"lights{self._of_lighting}.usda"
 
     @property
     def materialx_layer(self) -> Path:
@@ -83,7 +112,13 @@ class Asset:
 
     def layer(self, role: str) -> Path:
         """Path of a task's layer; ``role`` is one of ``ROLES``."""
-        return self.folder / "layers" / f"{role}.{'usdc' if role == 'scan' else 'usda'}"
+        if role == "scan":
+            return self.folder / "layers" / "scan.usdc"
+        return self.folder / "layers" / f"{role}{self._of_lighting}.usda"
+
+    @property
+    def _of_lighting(self) -> str:
+        return f".{self.lighting}" if self.lighting else ""
 
     def refuse_output(self, output: Path, rule: str) -> None:
         """UsageError for a place inside the folder: what reads an asset leaves it as it is."""
@@ -95,22 +130,30 @@ class Asset:
 
     def texture(self, identifier: str, aov: str) -> str:
         """Path of an object's map, relative to the asset folder."""
-        return f"textures/{identifier}.{aov}.exr"
+        return f"{self._textures}/{identifier}.{aov}.exr"
+
+    @property
+    def _textures(self) -> str:
+        return f"textures/{self.lighting}" if self.lighting else "textures"
+
+    def preview(self, name: str) -> str:
+        """Path of a picture for people, relative to the asset folder."""
+        return f"previews/{self.lighting}/{name}.png" if self.lighting else f"previews/{name}.png"
 
     @property
     def sky(self) -> str:
         """Path of the picture of the surroundings, relative to the asset folder."""
-        return "textures/outside.sky.exr"
+        return f"{self._textures}/outside.sky.exr"
 
     @property
     def sky_confidence(self) -> str:
         """Path of the picture that tells how each direction of ``sky`` is known."""
-        return "textures/outside.sky_confidence.exr"
+        return f"{self._textures}/outside.sky_confidence.exr"
 
     def textures(self, *aovs: str) -> list[Path]:
         """All objects' maps of these AOVs that are there, in the order of their names."""
         endings = tuple(f".{aov}.exr" for aov in aovs)
-        files = (self.folder / "textures").glob("*.exr")
+        files = (self.folder / self._textures).glob("*.exr")
         return sorted(file for file in files if endings and file.name.endswith(endings))
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Ar, Usd, UsdGeom
 
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import LIGHTING, Asset
 from usdbrdf.asset.properties import Aov
 from usdbrdf.asset.readers.scene import (
     aov_path,
@@ -127,8 +127,19 @@ class AssetMaps:
 
     @cached_property
     def frames(self) -> Frames:
-        """The photographs, poses in metres."""
+        """The photographs, poses in metres, of the lighting that the stage is in."""
+        return self.all_frames.at(self.own_frames)
+
+    @cached_property
+    def all_frames(self) -> Frames:
+        """Those of all lightings."""
         return frames_from_stage(self.stage)
+
+    @property
+    def own_frames(self) -> range:
+        """The numbers of ``frames`` among those of all lightings."""
+        lighting = self.stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection()
+        return self.all_frames.of_lighting(str(lighting))
 
     @cached_property
     def scene(self) -> Scene:
@@ -180,6 +191,13 @@ class AssetMaps:
     def traced_irradiance(self) -> Float:
         """(T, 3) W/m^2: S before the lightmap filter, of assets whose shading used one."""
         return self.map("irradiance_raw")
+
+    @property
+    def irradiance_error(self) -> Float:
+        """(T,): standard deviation of S as it was traced, relative to it."""
+        level = np.maximum(self.irradiance.mean(axis=1), 1e-30)
+        error: Float = np.sqrt((self.map("stderr") ** 2).mean(axis=1)) / level
+        return error
 
     @cached_property
     def emission(self) -> Float:

@@ -184,6 +184,9 @@ class Photographs:
         photograph: its curve and its numbers that are not 0, in pixels fx, fy, cx and cy; k, d, p
         and s are radial, dividing, tangential and prism terms as OpenCV has them.""",
         samples="changes", when=lambda taken: any(taken.lens))]
+    lighting: Annotated[Sequence[str], Fact(CAPTURE, "lighting", "string", "", """Which lighting of
+        the scene the photograph shows, a variant of the set lighting; empty where there is but
+        one.""", samples="changes", when=lambda taken: any(taken.lighting))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,14 +215,18 @@ class MeasuredObject:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TexturedObject(MeasuredObject):
-    """Result of the task texture for one object."""
-
+class UnwrappedObject(MeasuredObject):
+    """One object's place in its textures."""
     corner_uv: Float  # (F, 3, 2) float32 in [0, 1], v up, per triangle corner of the object
     texel_size: Annotated[float, Fact(TEXTURING, "texelSize", "float", 0.0, """Edge length of a
         texel on the surface, in metres whatever the stage's units.""", low=0)]
     resolution: Annotated[tuple[int, int], Fact(TEXTURING, "resolution", "int2", (0, 0), """Width
         and height of the object's textures in texels.""", low=0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TexturedObject(UnwrappedObject):
+    """Result of the task texture for one object."""
     seen_fraction: Annotated[float, Fact(TEXTURING, "seenFraction", "float", 0.0, """Share of the
         object's texels that at least one photograph measured; 0 to 1, without unit.""",
         low=0, high=1)]

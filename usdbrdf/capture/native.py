@@ -55,7 +55,8 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         copies = zip(images, names, strict=True)
         for image, name in progress(copies, total=len(names), label="frames", unit="files"):
             shutil.copyfile(image, staged / name)
-        write_ply(staged / "mesh.ply", scan.mesh.points[: _own_points(scan)], *_faces(scan))
+        points = scan.mesh.points[: captured_points(scan)]
+        write_ply(staged / "mesh.ply", points, *captured_faces(scan))
         objects = [
             {"id": i, "name": label.label, "class_name": label.class_name}
             for i, label in enumerate(scan.objects)
@@ -111,12 +112,12 @@ def _own_faces(scan: Scan) -> int:
     return len(scan.mesh.triangles) if scan.turned_faces is None else len(scan.turned_faces)
 
 
-def _own_points(scan: Scan) -> int:
+def captured_points(scan: Scan) -> int:
     """The same of its points: each face of a second skin has three of its own."""
     return len(scan.mesh.points) - 3 * (len(scan.mesh.triangles) - _own_faces(scan))
 
 
-def _faces(scan: Scan) -> tuple[Int, Int]:
+def captured_faces(scan: Scan) -> tuple[Int, Int]:
     """Triangles (F, 3) as the capture winds them, and their objects (F,)."""
     count = _own_faces(scan)
     triangles = scan.mesh.triangles[:count].copy()

@@ -42,7 +42,7 @@ from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cam
 from usdbrdf.geometry.unwrap import connected_triangles
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
-from usdbrdf.model.capture import Frames, Scan, frames_at
+from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
@@ -362,9 +362,9 @@ def scan_from_parts(
         findings.count("frames_looked_at", len(findings.looked_at))
     # From here on the faces of a photograph count one by one.
     total += len(kept) - len(usable)
-    frames, used = frames_at(frames, kept), [rigid[photograph_of[i]].name for i in kept]
+    frames, used = frames.at(kept), [rigid[photograph_of[i]].name for i in kept]
     sides, outside = _sides(geometry, frames, used, findings)
-    frames, kept = frames_at(frames, outside), [kept[i] for i in outside]
+    frames, kept = frames.at(outside), [kept[i] for i in outside]
     findings.refuse_too_few_frames(source, total)
     findings.warn_of_dropped_frames(source, total)
     return Scan(
@@ -383,6 +383,7 @@ def scan_from_parts(
         views=tuple(views[i] for i in kept) if any(views) else (),
         turned_faces=sides.turned,
         label_source=geometry.label_source,
+        has_normals=geometry.has_normals,
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )
@@ -401,7 +402,7 @@ def _sides(
     sides = seen(frames)
     outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
     if 0 < len(outside) < len(frames):
-        sides = seen(frames_at(frames, outside))
+        sides = seen(frames.at(outside))
     turned, both = int(sides.turned.sum()), int(sides.both.sum())
     findings.count("faces_turned", turned)
     findings.count("faces_of_two_sides", both)

@@ -230,7 +230,7 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     files outside of its folder.
     """
     options = options or PackageOptions()
-    asset = Asset.made(folder)
+    asset = Asset.made(folder).in_lighting(options.lighting)
     options = replace(options, textures=_texture_format(output, asset, options))
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)

@@ -66,7 +66,7 @@ def evaluate(
     Raises UsdBrdfError; ``output`` is then as it was.
     """
     chosen = options or EvaluateOptions()
-    place, atlas = measured_atlas(Path(asset))
+    place, atlas = measured_atlas(Path(asset), chosen.lighting)
     with (
         report.output_folder(Path(output), DOCUMENT, (place,)) as work,
         TemporaryDirectory(prefix="usdbrdf-") as folder,
@@ -85,6 +85,7 @@ def evaluate(
         report.write_plot(work / "evaluation.png", rows)
         found = {
             "asset": place.name,
+            **({"lighting": chosen.lighting} if chosen.lighting else {}),
             "views": Path(views).name,
             "samples_per_pixel": chosen.samples_per_pixel,
             "rays": chosen.rays,
@@ -100,9 +101,9 @@ def evaluate(
     return found
 
 
-def measured_atlas(folder: Path) -> tuple[Asset, AssetMaps]:
+def measured_atlas(folder: Path, lighting: str | None = None) -> tuple[Asset, AssetMaps]:
     """The maps of an asset that all steps have been through, without the artist's layer."""
-    asset = Asset.made(folder)
+    asset = Asset.made(folder).in_lighting(lighting)
     return asset, AssetMaps(open_measured(asset))
 
 

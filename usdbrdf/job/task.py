@@ -16,6 +16,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from glob import escape as glob_escape
 from itertools import groupby
@@ -91,6 +92,7 @@ class TaskRun:
         # When a running computation's state was saved last, and how long that took: the first is
         # saved at once, which tells.
         self._saved = -math.inf, 0.0
+        self._part = ""
         for path in self._checkpoints.iterdir():
             match = _NAME.fullmatch(path.name)
             if match is None:
@@ -98,6 +100,13 @@ class TaskRun:
                 continue
             index = match["index"]
             self._files[unquote(match["key"]), int(index) if index else None] = path
+
+    def part(self, name: str) -> TaskRun:
+        """The same run, whose checkpoints are named apart: for work that is done several times
+        over. "" is the run itself."""
+        own = copy(self)
+        own._part = f"{name}:" if name else ""
+        return own
 
     def output(self, relative: str) -> Path:
         """Where to write the file that will be published as ASSET/``relative``."""
@@ -149,6 +158,7 @@ class TaskRun:
 
     def checkpoint_if(self, key: str, index: int | None = None) -> dict[str, Array] | None:
         """The arrays saved under ``key`` by this or an interrupted run, bit for bit, or None."""
+        key = self._part + key
         path = self._files.get((key, index))
         if path is None:
             return None
@@ -160,6 +170,7 @@ class TaskRun:
 
     def save(self, key: str, arrays: Mapping[str, Array], index: int | None = None) -> None:
         """Store arrays; the file is there under its final name only once it is complete."""
+        key = self._part + key
         stem = quote(key, safe="") + (f"@{index:09d}" if index is not None else "")
         with temporary_beside(self._checkpoints / "arrays.npz") as staged:
             save_arrays(staged, arrays)
@@ -173,7 +184,7 @@ class TaskRun:
     def latest(self, key: str) -> tuple[int, dict[str, Array]] | None:
         """Index and arrays of the newest intact state that ``save_latest`` stored, or None."""
         for index in sorted(
-            (i for k, i in self._files if k == key and i is not None), reverse=True
+            (i for k, i in self._files if k == self._part + key and i is not None), reverse=True
         ):
             arrays = self.checkpoint_if(key, index)
             if arrays is not None:
@@ -184,7 +195,7 @@ class TaskRun:
         """Store the state of a running computation after step ``index``; older ones are deleted."""
         self.save(key, arrays, index)
         for known in list(self._files):
-            if known[0] == key and known[1] not in (None, index):
+            if known[0] == self._part + key and known[1] not in (None, index):
                 self._files.pop(known).unlink(missing_ok=True)
 
     def save_latest_in_time(

@@ -23,7 +23,14 @@ from usdbrdf.material.fit_target import (
     count_frame,
     fit_target_frame,
 )
-from usdbrdf.material.fit_views import MIXTURE, SampledObject, fit_kinds, fit_views, sampled_object
+from usdbrdf.material.fit_views import (
+    MIXTURE,
+    SampledObject,
+    fit_kinds,
+    fit_views,
+    joined_object,
+    sampled_object,
+)
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
     LobeEstimate,
@@ -51,12 +58,21 @@ _COUNTED_PIXELS = 80_000
 @dataclass(frozen=True, kw_only=True)
 class Survey:
     """What one pass over the frames gathers: per object the target frame, which shows its highlight
-    best (-1: none), and, as the method needs, the observations of followed texels, and by how many
-    pixels the pictures were smoothed (NaN: they do not tell)."""
+    best (-1: none), and how much of it; and, as the method needs, the observations of followed
+    texels, and by how many pixels the pictures were smoothed (NaN: they do not tell)."""
 
     target: Int
+    shown: Float
     observations: Observations
     smoothing: float
+
+
+class Lighting(NamedTuple):
+    """A scene in one light, what the frames that show it so told, and S (T, 3), W/m^2, in it."""
+
+    lit: LitScene
+    survey: Survey
+    irradiance: Float | None = None
 
 
 class ObjectFit(NamedTuple):
@@ -107,34 +123,47 @@ class ObjectFit(NamedTuple):
 
 
 def survey_frames(
-    run: TaskRun, lit: LitScene, usable: Bool, reader: FrameReader, options: FitOptions
+    run: TaskRun,
+    lit: LitScene,
+    usable: Bool,
+    reader: FrameReader,
+    options: FitOptions,
+    own: range | None = None,
 ) -> Survey:
     """Gather all that the fits need of the frames, which are read once.
 
-    usable (T,): measured by frames, and no lamp
+    usable (T,): measured by frames, and no lamp; own: the frames that show the scene in this light,
+    None for all
     """
     frames = reader.frames
+    own = own or range(len(frames))
 
     def gather() -> dict[str, Array]:
         by_views = options.method == "views"
         followed = usable & lit.texels.interior & by_views
-        follower = Follower(lit, followed, len(frames), options.seed)
+        follower = Follower(lit, followed, len(own), options.seed)
         counts = []
-        images = read_frames(reader.read, range(len(frames)))
-        for i, pixels in progress(images, total=len(frames), label="fit: survey", unit="frames"):
+        images = read_frames(reader.read, own)
+        for i, pixels in progress(images, total=len(own), label="fit: survey", unit="frames"):
             if by_views:
                 noise_floor = float(frames.noise_floor_radiance[i])
                 follower.add(_view(frames, i, pixels), pixels.clipped, noise_floor)
             else:
                 stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
                 counts.append(count_frame(lit, pixels.valid, frames.camera(i), stride))
-        target = follower.target_frames() if by_views else choose_target_frames(counts)[0]
-        smoothing = np.array(follower.smoothing)
-        return {"target": target, "smoothing": smoothing, **follower.chosen(options.seed)._asdict()}
+        target, shown = follower.target_frames() if by_views else choose_target_frames(counts)
+        observed = follower.chosen(options.seed)
+        return {
+            "target": np.where(target >= 0, own.start + target, -1).astype(np.int32),
+            "shown": shown,
+            "smoothing": np.array(follower.smoothing),
+            **observed._replace(frame=own.start + observed.frame)._asdict(),
+        }
 
     found = run.checkpoint("survey", gather)
-    target, smoothing = found.pop("target"), float(found.pop("smoothing"))
-    return Survey(target=target, smoothing=smoothing, observations=Observations(**found))
+    target, shown, smoothing = (found.pop(name) for name in ("target", "shown", "smoothing"))
+    observations = Observations(**found)
+    return Survey(target=target, shown=shown, smoothing=float(smoothing), observations=observations)
 
 
 def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
@@ -173,41 +202,35 @@ _PAPER_CLEARER = calibration.number("fit.paper_clearer")
 
 
 def fitted_by_likelier_lobe(
-    run: TaskRun,
-    lit: LitScene,
-    reader: FrameReader,
-    survey: Survey,
-    options: FitOptions,
-    irradiance: Float | None = None,
-) -> tuple[LitScene, list[ObjectFit]]:
-    """The scene with the kind of lobe that its surfaces have, and ``fit_object`` of every object
-    with that.
+    run: TaskRun, lightings: Sequence[Lighting], reader: FrameReader, options: FitOptions
+) -> tuple[int, list[ObjectFit]]:
+    """The kind of lobe that the scene's surfaces have, and ``fit_object`` of every object with
+    that.
 
     Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
     the model of facets, unless the paper's explains the views of all objects clearly better.
     """
-    sizes = _sizes(lit, survey)
+    sizes = _sizes(lightings)
     looks: list[FirstLook | None] = [None] * len(sizes)
     kinds = [PAPER]
     if options.method == "views":
         kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
-        looks = list(first_looks(run, lit, reader, survey, kinds, options.seed))
+        looks = list(first_looks(run, lightings, reader, kinds, options.seed))
     clearer = sum(_paper_explains_more(look.lobes) for look in looks if look)
     paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
-    lit = replace(lit, lobe=PAPER if paper else DIELECTRIC)
+    lobe = PAPER if paper else DIELECTRIC
 
     def work(i: int) -> dict[str, Array]:
-        return fit_object(lit, reader, survey, i, options, irradiance, looks[i]).arrays()
+        return fit_object(lobe, lightings, reader, i, options, looks[i]).arrays()
 
     found = _of_each_object(run, "object", sizes, work, label="fit")
-    return lit, [ObjectFit.from_arrays(one).rounded() for one in found]
+    return lobe, [ObjectFit.from_arrays(one).rounded() for one in found]
 
 
 def first_looks(
     run: TaskRun,
-    lit: LitScene,
+    lightings: Sequence[Lighting],
     reader: FrameReader,
-    survey: Survey,
     kinds: Sequence[int],
     seed: int,
 ) -> list[FirstLook]:
@@ -215,11 +238,11 @@ def first_looks(
     whose rays are the same."""
 
     def work(i: int) -> dict[str, Array]:
-        sampled, number = _sampled(lit, reader, survey, i, MIXTURE)
-        lobes = fit_kinds(lit, sampled, kinds, first_seed(seed)) if sampled else {}
+        sampled, number = _sampled(lightings, reader, i, MIXTURE)
+        lobes = fit_kinds(sampled, kinds, first_seed(seed)) if sampled else {}
         return FirstLook(lobes, number).arrays()
 
-    found = _of_each_object(run, "look", _sizes(lit, survey), work, label="fit: first look")
+    found = _of_each_object(run, "look", _sizes(lightings), work, label="fit: first look")
     return [FirstLook.from_arrays(one) for one in found]
 
 
@@ -261,39 +284,48 @@ def _of_each_object(
     return [done[i] for i in range(count)]
 
 
-def _sizes(lit: LitScene, survey: Survey) -> list[int]:
+def _sizes(lightings: Sequence[Lighting]) -> list[int]:
     """How many observations there are of each object."""
-    texels = lit.texels
-    owner = texels.object_index()[survey.observations.texel]
-    sizes: list[int] = np.bincount(owner, minlength=len(texels.resolution)).tolist()
-    return sizes
+    sizes = np.zeros(len(lightings[0].lit.scene.objects), np.int64)
+    for lit, survey, _ in lightings:
+        owner = lit.texels.object_index()[survey.observations.texel]
+        sizes += np.bincount(owner, minlength=len(sizes))
+    return [*map(int, sizes)]
 
 
 def _sampled(
-    lit: LitScene, reader: FrameReader, survey: Survey, index: int, mixture: Mixture
+    lightings: Sequence[Lighting], reader: FrameReader, index: int, mixture: Mixture
 ) -> tuple[SampledObject | None, int]:
-    own = survey.observations.of_texels(lit.texels.of_object(index))
-    return sampled_object(lit, own, survey.smoothing, reader.frames.camera, index, mixture)
+    """What all lightings show of an object, and the number of samples."""
+    found, camera_of = [], reader.frames.camera
+    for lit, survey, irradiance in lightings:
+        own = survey.observations.of_texels(lit.texels.of_object(index))
+        found.append(
+            sampled_object(lit, own, survey.smoothing, camera_of, index, mixture, irradiance)
+        )
+    sampled = joined_object([one for one, _ in found if one])
+    return sampled, len(sampled.samples.texel) if sampled else sum(number for _, number in found)
 
 
 def fit_object(
-    lit: LitScene,
+    lobe: int,
+    lightings: Sequence[Lighting],
     reader: FrameReader,
-    survey: Survey,
     index: int,
     options: FitOptions,
-    irradiance: Float | None = None,
     look: FirstLook | None = None,
     mixture: Mixture = MIXTURE,
 ) -> ObjectFit:
-    """The lobe of one object by the chosen method, of the scene's kind.
+    """The lobe of one object by the chosen method, of a kind (``brdf``).
 
-    irradiance: see fit_views. look: what has been fitted already. mixture: see sampled_object.
+    lightings: one alone where the method takes one frame. look: what has been fitted already.
+    mixture: see sampled_object.
     """
+    survey = max((one.survey for one in lightings), key=lambda survey: survey.shown[index])
     target = int(survey.target[index])
     if options.method != "views":
-        return _fit_of_frame(lit, reader, target, index, options)
-    prepared = cache(lambda: _sampled(lit, reader, survey, index, mixture))
+        return _fit_of_frame(lightings[0].lit, reader, target, index, options)
+    prepared = cache(lambda: _sampled(lightings, reader, index, mixture))
     used = look.num_samples if look else prepared()[1]
     if not (look.lobes if look else prepared()[0]):
         return ObjectFit(num_samples=used, target=target)
@@ -303,10 +335,10 @@ def fit_object(
         assert found is not None
         return found
 
-    first = look.lobes.get(lit.lobe) if look else None
-    lobe, metal = fit_views(lit, sampled, options.seed, first, irradiance)
+    first = look.lobes.get(lobe) if look else None
+    fitted, metal = fit_views(lobe, sampled, options.seed, first)
     found = ObjectFit(
-        *lobe[:7], lobe.phi_median, lobe.psi_median, lobe.psi_upper,
+        *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
         num_samples=used, target=target,
     )  # fmt: skip
     if not metal:

@@ -41,27 +41,87 @@ _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 
 
+class SampledPart(NamedTuple):
+    """The samples of an object in one lighting.
+
+    observed    those whose footprint lies on the object as a whole
+    footprints  surface points of each sample, for the usual width and, on curved objects, others
+    irradiance  (P, 3), W/m^2, S at each sample's texel; None where it is not known
+    """
+
+    lit: LitScene
+    observed: Observations
+    footprints: list[SurfacePoints]
+    irradiance: Float | None
+
+
 class SampledObject(NamedTuple):
     """What the fits of one object are made of.
 
-    observed    samples whose footprint lies on the object as a whole
-    samples     the same, with their errors
-    footprints  surface points of each sample, for the usual width and, on curved objects, others
-    likely      of each of the footprints, before the samples are asked
-    mixture     the rays of each point
+    parts    its samples in each lighting that shows it
+    samples  all of these after each other, with their errors; a texel's diffuse radiance is another
+             in each lighting, so it counts as many
+    widths   standard deviations of the footprints in pixels, for which all parts have points
+    likely   of each of these, before the samples are asked
+    mixture  the rays of each point
     """
 
-    observed: Observations
+    parts: list[SampledPart]
     samples: ViewSamples
-    footprints: list[SurfacePoints]
+    widths: tuple[float, ...]
     likely: list[float]
     mixture: Mixture
 
-    def basis(self, lit: LitScene, points: SurfacePoints, seed: int) -> Basis:
+    def basis(self, width: int, seed: int) -> Basis:
         """Views of a texel share their random numbers: what they have in common then cancels in
         their differences, which are all that is fitted."""
-        stream = self.samples.texel
-        return lobe_basis(lit, points, len(stream), seed, self.mixture, stream)
+        ends = np.cumsum([len(part.observed.texel) for part in self.parts])
+        streams = np.split(self.samples.texel, ends[:-1])
+        of_parts = [
+            lobe_basis(part.lit, part.footprints[width], len(stream), seed, self.mixture, stream)
+            for part, stream in zip(self.parts, streams, strict=True)
+        ]
+        if len(of_parts) == 1:
+            return of_parts[0]
+
+        def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
+            bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
+            return np.concatenate(bases), np.concatenate(slopes)
+
+        return basis
+
+    @property
+    def irradiance(self) -> Float | None:
+        """(P, 3), W/m^2, of all samples; None where it is not known of all."""
+        known = [part.irradiance for part in self.parts if part.irradiance is not None]
+        return np.concatenate(known) if len(known) == len(self.parts) else None
+
+
+def joined_object(several: Sequence[SampledObject]) -> SampledObject | None:
+    """One object as several lightings show it; None if none does.
+
+    Parts whose samples allow fewer footprints than those of most samples are left out.
+    """
+    if len(several) < 2:
+        return several[0] if several else None
+    most = max(several, key=lambda one: len(one.samples.texel))
+    several = [one for one in several if len(one.widths) >= len(most.widths)]
+    sizes = [len(one.samples.texel) for one in several]
+    texels = np.cumsum([0, *(int(one.samples.texel.max()) + 1 for one in several[:-1])])
+    samples = ViewSamples(
+        texel=np.concatenate(
+            [one.samples.texel + n for one, n in zip(several, texels, strict=False)]
+        ),
+        frame=np.concatenate([one.samples.frame for one in several]),
+        position=np.concatenate([one.samples.position for one in several]),
+        radiance=np.concatenate([one.samples.radiance for one in several]),
+        noise=np.concatenate([one.samples.noise for one in several]),
+        cell=float(np.average([one.samples.cell for one in several], weights=sizes)),
+    )
+    count = len(most.widths)
+    likely = np.average([one.likely[:count] for one in several], axis=0, weights=sizes)
+    parts = [part for one in several for part in one.parts]
+    return SampledObject(parts, samples, most.widths, likely.tolist(), most.mixture)
 
 
 def sampled_object(
@@ -71,13 +131,14 @@ def sampled_object(
     camera_of: Callable[[int], Camera],
     index: int,
     mixture: Mixture = MIXTURE,
+    irradiance: Float | None = None,
 ) -> tuple[SampledObject | None, int]:
     """Object ``index`` as its observations show it, and the number of samples; None if too few.
 
     smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
     themselves are not needed.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
-    fifteen times; curved objects have more.
+    fifteen times; curved objects have more. irradiance (T, 3): S, W/m^2.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -103,18 +164,23 @@ def sampled_object(
         mixture = mixture._replace(per_lobe=times * mixture.per_lobe, lights=times * mixture.lights)
     widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX)[: len(footprints)]
     likely = [_likely(width, smoothing) for width in widths]
-    return SampledObject(observed, samples, footprints, likely, mixture), len(observed.texel)
+    incoming = None if irradiance is None else irradiance[observed.texel]
+    parts = [SampledPart(lit, observed, footprints, incoming)]
+    return SampledObject(parts, samples, widths, likely, mixture), len(observed.texel)
 
 
 def fit_kinds(
-    lit: LitScene, sampled: SampledObject, kinds: Sequence[int], seed: int, repeats: int = 1
+    sampled: SampledObject, kinds: Sequence[int], seed: int, repeats: int = 1
 ) -> dict[int, LobeEstimate]:
     """The lobe of the first kind, and where that shows, those of the others from the same rays."""
     bases = [
-        [sampled.basis(lit, points, number) for number in range(3 * seed, 3 * seed + 3)]
-        for points in sampled.footprints
+        [sampled.basis(width, number) for number in range(3 * seed, 3 * seed + 3)]
+        for width in range(len(sampled.widths))
     ]
-    blurs = [_deviation_of_normal(points) for points in sampled.footprints]
+    blurs = [
+        _deviation_of_normal(*(part.footprints[width] for part in sampled.parts))
+        for width in range(len(sampled.widths))
+    ]
     found: dict[int, LobeEstimate] = {}
     errors: ViewModel | None = None
     for kind in kinds:
@@ -132,36 +198,28 @@ def fit_kinds(
 
 
 def fit_views(
-    lit: LitScene,
-    sampled: Callable[[], SampledObject],
-    seed: int,
-    first: LobeEstimate | None = None,
-    irradiance: Float | None = None,
+    lobe: int, sampled: Callable[[], SampledObject], seed: int, first: LobeEstimate | None = None
 ) -> tuple[LobeEstimate, Conductor | None]:
-    """The lobe of the scene's kind, and the metal that explains the samples better, if one does.
+    """The lobe, of a kind (``brdf``), and the metal that explains the samples better, if one does;
+    where S is not known none is looked for.
 
     sampled: asked for where something is left to be traced. first: the fit with the rays of
-    ``first_seed(seed)``, if there is one. irradiance (T, 3): S, W/m^2; without it no metal is
-    looked for.
+    ``first_seed(seed)``, if there is one.
     """
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
-        return fit_kinds(lit, sampled(), [lit.lobe], own_seed, repeats)[lit.lobe]
+        return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe]
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
     bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE
-    if irradiance is None or not bright:
+    if not bright or (irradiance := sampled().irradiance) is None:
         return found, None
-    observed, samples, footprints = sampled()[:3]
-    kind = PAPER if lit.lobe == PAPER else CONDUCTOR
+    samples = sampled().samples
+    kind = PAPER if lobe == PAPER else CONDUCTOR
     one, other = (
-        partial(sampled().basis(lit, footprints[0], own_seed), kind)
-        for own_seed in range(3 * seed, 3 * seed + 2)
+        partial(sampled().basis(0, own_seed), kind) for own_seed in range(3 * seed, 3 * seed + 2)
     )
-    metal = conductor_of(
-        samples.radiance, samples.texel, irradiance[observed.texel], (one, other), found
-    )
-    return found, metal
+    return found, conductor_of(samples.radiance, samples.texel, irradiance, (one, other), found)
 
 
 def _footprints(
@@ -231,9 +289,9 @@ def _pixel_size(position: Float, frame: Int, camera_of: Callable[[int], Camera])
     return float(np.median(np.concatenate(sizes)))
 
 
-def _deviation_of_normal(points: SurfacePoints) -> float:
+def _deviation_of_normal(*points: SurfacePoints) -> float:
     """Median standard deviation of the normal, in radians per axis, over a sample's points."""
-    normal = points.normal.reshape(-1, len(RINGS), 3)
+    normal = np.concatenate([some.normal for some in points]).reshape(-1, len(RINGS), 3)
     spread = ((normal - normal.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)
     return float(np.sqrt(np.median(spread) / 2))
 

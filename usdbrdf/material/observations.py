@@ -252,9 +252,9 @@ class Follower:
         """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
         return smoothing_of(self._noise_in_windows)
 
-    def target_frames(self) -> Int:
+    def target_frames(self) -> tuple[Int, Double]:
         """Per object, the frame in which its followed texels mirror most light beyond what each of
-        them mirrors on the mean; -1 where none does, or nothing was followed."""
+        them mirrors on the mean, -1 where none does, or nothing was followed; and how much."""
         mean = self._light.sum(axis=0) / np.maximum(self._seen.sum(axis=0), 1)
         objects = len(self._lit.scene.objects)
         beyond = np.stack(
@@ -264,7 +264,8 @@ class Follower:
             ]
         )
         best = self._frame[beyond.argmax(axis=0)]
-        return np.where(beyond.max(axis=0) > 0, best, -1).astype(np.int32)
+        most = beyond.max(axis=0)
+        return np.where(most > 0, best, -1).astype(np.int32), most
 
     def _scores(self) -> Double:
         """How much the mirrored light changes between the views of each followed texel, over its

@@ -12,8 +12,9 @@ What their cure changes is small against S, so few rays do."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -26,7 +27,8 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.shaded import albedo_map, by_tiles, denoised_irradiance
+from usdbrdf.shading.base_color import Reflection, base_color_of
+from usdbrdf.shading.shaded import by_tiles, denoised_irradiance
 from usdbrdf.texturing.footprints import footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
@@ -123,6 +125,8 @@ class LightBefore(Protocol):
     emission    (T, 3) W/(m^2 sr): what shines by itself, zero elsewhere; emissive (T,): it does
     irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced_irradiance: before the lightmap
                 filter, where there was one
+    irradiance_error  (T,): standard deviation of S by its rays, relative to it; asked for where
+                several lightings are weighed
     """
 
     @property
@@ -139,12 +143,25 @@ class LightBefore(Protocol):
     def irradiance(self) -> Float: ...
     @property
     def traced_irradiance(self) -> Float: ...
+    @property
+    def irradiance_error(self) -> Float: ...
+
+
+class Lighting(NamedTuple):
+    """A scene in one light, what is known of it before, and its frames among all that are read;
+    name: "" for the only one."""
+
+    name: str
+    lit: LitScene
+    before: LightBefore
+    own: range
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refined:
     """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
-    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal."""
+    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal; of several
+    lightings the mean of what each tells, the same for all."""
 
     diffuse: Float
     irradiance: Float
@@ -153,46 +170,87 @@ class Refined:
 
 def refined_light(
     run: TaskRun,
-    lit: LitScene,
+    lightings: Sequence[Lighting],
     reader: FrameReader,
-    before: LightBefore,
     lobes: Lobes,
     lightmap_filter: str,
     memory: float | None,
     seed: int,
-) -> Refined:
-    """What the frames show of T texels without the specular light of the ``lobes``: L_d, S and base
-    colour; in as many passes over the frames as ``memory`` (GiB) asks for.
+) -> list[Refined]:
+    """What the frames of each lighting show of T texels without the specular light of the
+    ``lobes``: L_d, S and base colour; in as many passes over the frames as ``memory`` (GiB) asks
+    for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
     and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
     """
-    found = _means_without_lobes(run, lit, reader, before, lobes, memory, seed)
-    texels, emissive, observed = lit.texels, before.emissive, before.coverage.observed
-    known, level = np.isfinite(found.mean[:, 0]) & ~emissive, _level(before.lit)
+    need = _need([one.lit for one in lightings])
+    texels, found = lightings[0].lit.texels, []
+    for one in lightings:
+        means = _means_without_lobes(run.part(one.name), one, reader, lobes, need, memory, seed)
+        diffuse, error = _diffuse_of_means(one, means, lobes)
+        if len(lightings) > 1:
+            error = np.hypot(error, one.before.irradiance_error)
+        found.append((diffuse, error))
+    owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
+
+    def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
+        """Base colour, and of each lighting L_d with what it reflects where nobody looked."""
+        shown = [
+            Reflection(
+                radiance=diffuse,
+                irradiance=incoming,
+                error=error,
+                known=one.before.coverage.observed,
+                emissive=one.before.emissive,
+            )
+            for one, (diffuse, error), incoming in zip(lightings, found, irradiance, strict=True)
+        ]
+        base_color = base_color_of(texels, shown)
+        return base_color, [
+            np.where(
+                ~(one.known | one.emissive)[:, None],
+                base_color * one.irradiance / np.pi,
+                one.radiance,
+            )
+            for one in shown
+        ]
+
+    _, first = reflected([one.before.irradiance for one in lightings])
+    irradiance = []
+    for (name, lit, before, _), diffuse in zip(lightings, first, strict=True):
+        change = np.where(before.emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
+        traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
+        own = run.part(name)
+        irradiance.append(
+            refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
+        )
+    found = [(diffuse, error) for diffuse, (_, error) in zip(first, found, strict=True)]
+    base_color, shown = reflected(irradiance)
+    reflects = metal & ~np.all([one.before.emissive for one in lightings], axis=0)
+    base_color[reflects] = F0_OF_PSI * lobes.psi[owner[reflects]]
+    return [
+        Refined(diffuse=own.astype(np.float32), irradiance=incoming, base_color=base_color)
+        for own, incoming in zip(shown, irradiance, strict=True)
+    ]
+
+
+def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tuple[Float, Float]:
+    """L_d (T, 3) of a lighting without its specular light, and its standard deviation (T,)
+    relative to it, infinite where no frame measured it."""
+    texels, before = lighting.lit.texels, lighting.before
+    emissive, level = before.emissive, _level(before.lit)
+    known = np.isfinite(found.mean[:, 0]) & ~emissive
     filled_in = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
     diffuse = restored(texels, filled_in, known, found.variance * level**2, found.footprint)
     diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
     # What clips in every frame is at least as bright as that.
     clipped = before.coverage.clipped[:, None]
     diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
-    owner = texels.object_index()
-    metal = lobes.conducts[owner] & ~emissive
-    diffuse[metal] = 0
-    filled = ~(observed | emissive)[:, None]
-
-    def reflected(radiance: Float, irradiance: Float) -> tuple[Float, Float]:
-        """Base colour, and L_d with what it reflects where nobody looked."""
-        base_color, _ = albedo_map(texels, radiance, irradiance, observed, emissive)
-        return base_color, np.where(filled, base_color * irradiance / np.pi, radiance)
-
-    _, diffuse = reflected(diffuse, before.irradiance)
-    change = np.where(emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
-    traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
-    irradiance = refined_irradiance(run, lit, traced, change, lobes, lightmap_filter, seed)
-    base_color, diffuse = reflected(diffuse, irradiance)
-    base_color[metal] = F0_OF_PSI * lobes.psi[owner[metal]]
-    return Refined(diffuse=diffuse.astype(np.float32), irradiance=irradiance, base_color=base_color)
+    diffuse[lobes.conducts[texels.object_index()] & ~emissive] = 0
+    shown = np.maximum(found.mean.mean(axis=1), 1e-3)
+    error = np.where(known, np.sqrt(found.variance) / shown, np.inf)
+    return diffuse, error.astype(np.float32)
 
 
 def _level(lit: Float) -> Float:
@@ -204,15 +262,17 @@ def _level(lit: Float) -> Float:
 
 def _means_without_lobes(
     run: TaskRun,
-    lit: LitScene,
+    lighting: Lighting,
     reader: FrameReader,
-    before: LightBefore,
     lobes: Lobes,
+    need: BytesPerTexel,
     memory: float | None,
     seed: int,
 ) -> RobustMean:
-    """Of T texels the mean over all frames without their specular light, relative to ``_level`` of
-    their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks for."""
+    """Of T texels the mean over a lighting's frames without their specular light, relative to
+    ``_level`` of their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks
+    for."""
+    _, lit, before, own = lighting
     frames, texels = reader.frames, lit.texels
     owner, level, samples = texels.object_index(), _level(before.lit), before.samples
 
@@ -224,7 +284,7 @@ def _means_without_lobes(
         if saved is not None:
             start, observed = saved[0] + 1, MeanState(**saved[1])
         # The mean starts from its first samples, which must not all show one highlight.
-        order = spread_order(len(frames))[start:]
+        order = [own.start + i for i in spread_order(len(own))[start:]]
         sampled = samples_from_frames(lit, frames, read_frames(reader.read, order), part)
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
@@ -243,24 +303,30 @@ def _means_without_lobes(
             run.save_latest_in_time(name, done, observed._asdict)
         return robust_mean(observed)._asdict()
 
-    need = _need(lit)
     try:
-        groups = groups_of_texels(texels, lit.scene, frames, memory, need)
+        groups = groups_of_texels(texels, lit.scene, frames.at(own), memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
         warn(str(short))
         groups = smallest_groups(texels)
     return RobustMean(**in_passes(run, "means", groups, means))
 
 
-def frame_reader(lit: LitScene, frames: Frames, memory: float | None) -> FrameReader:
+def frame_reader(
+    lightings: Sequence[LitScene], frames: Frames, memory: float | None
+) -> FrameReader:
     """Keeps the frames for which refining leaves room in ``memory`` (GiB)."""
-    return FrameReader(frames, bytes_for_frames(lit.texels, lit.scene, frames, memory, _need(lit)))
+    lit, need = lightings[0], _need(lightings)
+    return FrameReader(frames, bytes_for_frames(lit.texels, lit.scene, frames, memory, need))
 
 
-def _need(lit: LitScene) -> BytesPerTexel:
-    """With the light, which lies beside scene and texels."""
-    light = lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
-    return _OF_REFINING._replace(always=_OF_REFINING.always + light // len(lit.texels))
+def _need(lightings: Sequence[LitScene]) -> BytesPerTexel:
+    """With the light, which lies beside scene and texels; of each lighting its own."""
+    light = sum(
+        lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
+        for lit in lightings
+    )
+    always = len(lightings) * _OF_REFINING.always + light // len(lightings[0].texels)
+    return _OF_REFINING._replace(always=always)
 
 
 def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:

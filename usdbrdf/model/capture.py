@@ -39,6 +39,8 @@ class Frames:
     gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
                           by, to be divided out; the limits above are those of what is left
     captured_pose         (N, 4, 4) float64 or None: world_from_camera before it was refined
+    lightings             the lightings of the scene that the frames show, N names, those of one
+                          after each other; () where there is but one
     """
 
     image_paths: tuple[Path, ...]
@@ -56,6 +58,7 @@ class Frames:
     gain: Double | None = None
     captured_pose: Double | None = None
     vignetting: tuple[float, float] = (0.0, 0.0)
+    lightings: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -72,6 +75,24 @@ class Frames:
         images = tuple(p or image for p, image in zip(given, self.image_paths, strict=True))
         return replace(self, image_paths=images)
 
+    def at(self, indices: Sequence[int]) -> Frames:
+        """The frames with these indices, in this order."""
+        rows = np.asarray(indices, np.int64)
+        columns: dict[str, Any] = {
+            k: v[rows] for k, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
+        for name in ("image_paths", "photographs", "masks", "lenses", "lightings"):
+            found = getattr(self, name)
+            columns[name] = tuple(found[i] for i in rows) if found else ()
+        return replace(self, **columns)
+
+    def of_lighting(self, name: str) -> range:
+        """The numbers of the frames that show one lighting; of all where there is but one."""
+        if not self.lightings:
+            return range(len(self))
+        first = self.lightings.index(name)
+        return range(first, first + self.lightings.count(name))
+
     def camera(self, i: int) -> Camera:
         """The camera of frame i, named after its image."""
         width, height = self.resolution[i].tolist()
@@ -82,18 +103,6 @@ class Frames:
             height=height,
             name=self.image_paths[i].name,
         )
-
-
-def frames_at(frames: Frames, indices: Sequence[int]) -> Frames:
-    """The frames with these indices, in this order."""
-    rows = np.asarray(indices, np.int64)
-    columns: dict[str, Any] = {
-        k: v[rows] for k, v in vars(frames).items() if isinstance(v, np.ndarray)
-    }
-    for name in ("image_paths", "photographs", "masks", "lenses"):
-        found = getattr(frames, name)
-        columns[name] = tuple(found[i] for i in rows) if found else ()
-    return replace(frames, **columns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +135,7 @@ class Scan:
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
     label_source   who divided it into objects, see ``ScanGeometry``
+    has_normals    (F,) bool: faces whose normals are the file's; None: of none
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
     """
@@ -143,5 +153,6 @@ class Scan:
     views: tuple[View | None, ...] = ()
     turned_faces: Bool | None = None
     label_source: str = "capture"
+    has_normals: Bool | None = None
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

@@ -23,7 +23,7 @@ from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.job.stamp import code_version
-from usdbrdf.model.capture import Frames, frames_at
+from usdbrdf.model.capture import Frames
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
 from usdbrdf.page.objects import object_rows
@@ -108,9 +108,7 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
     frames, found = atlas.frames, summaries(place)
     chosen = _frames_to_search(len(frames), known)
-    where = objects_in_frames(
-        seen.lit.rays, atlas.scene.face_object, len(words), frames_at(frames, chosen)
-    )
+    where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
     with TemporaryDirectory(prefix="usdbrdf-") as folder:
@@ -175,7 +173,7 @@ def _asked_views(asset: Asset, atlas: AssetMaps, options: ReportOptions, folder:
 
 
 def _overviews(frames: Frames) -> Frames:
-    return frames_at(frames, spread_evenly(len(frames), SHOWN))
+    return frames.at(spread_evenly(len(frames), SHOWN))
 
 
 def _maps(

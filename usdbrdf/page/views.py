@@ -27,7 +27,6 @@ from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Byte
-from usdbrdf.model.capture import frames_at
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.page.pictures import as_bytes, data_uri
 
@@ -69,9 +68,9 @@ def rendered_views(seen: ViewedAsset, views: Views) -> tuple[list[ShownView], li
     count = len(views.names)
     shown, plotted = spread_evenly(count, SHOWN), spread_evenly(count, _PLOTTED)
     taken = [*shown, *plotted]
-    asked = Views(names=tuple(views.names[i] for i in taken), frames=frames_at(views.frames, taken))
+    asked = Views(names=tuple(views.names[i] for i in taken), frames=views.frames.at(taken))
     widths = [SHOWN_WIDTH] * len(shown) + [_PLOTTED_WIDTH] * len(plotted)
-    exposure = exposure_of_views(frames_at(views.frames, shown))
+    exposure = exposure_of_views(views.frames.at(shown))
     scored = [
         replace(view, row={**view.row, "number": i})
         for view, i in zip(

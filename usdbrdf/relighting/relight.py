@@ -41,7 +41,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     of the asset is changed. Returns a summary of plain values.
     """
     options = options or RelightOptions()
-    asset = Asset.made(folder)
+    asset = Asset.made(folder).in_lighting(options.lighting)
     _check(options, output, asset)
     mitsuba, noise = mitsuba_variant(), chosen_filter(options.denoise)
     stage = open_edited(asset)

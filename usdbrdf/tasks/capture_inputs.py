@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from usdbrdf.asset.layout import Asset, relative_path
@@ -11,6 +11,21 @@ from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
+
+
+def inputs_of_captures(
+    captures: Mapping[str, tuple[Path, Sequence[Path]]], options: IngestOptions, asset: Asset
+) -> tuple[dict[str, str], dict[str, str]]:
+    """``inputs_of_capture`` of each lighting's capture and the files beside it, with the lighting's
+    name behind every label; of the only one, "", as they are."""
+    inputs: dict[str, str] = {}
+    places: dict[str, str] = {}
+    for lighting, (capture, beside) in captures.items():
+        behind = f".{lighting}" if lighting else ""
+        found = inputs_of_capture(capture, options, asset, beside)
+        for every, some in zip((inputs, places), found, strict=True):
+            every.update({f"{label}{behind}": value for label, value in some.items()})
+    return inputs, places
 
 
 def inputs_of_capture(

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.header import Draft, StageHeader
 from usdbrdf.asset.layers.scan_layer import (
+    check_lightings,
     check_root,
     write_edits,
-    write_pending_layer,
     write_root,
     write_scan_layer,
 )
-from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.capture.develop import developed
+from usdbrdf.capture.lightings import (
+    in_own_folder,
+    names_of_lightings,
+    refuse_other_scenes,
+    scan_of_lightings,
+)
 from usdbrdf.capture.native import refuse_taken, write_capture
+from usdbrdf.errors import UsageError
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import AUTO, IngestOptions
-from usdbrdf.tasks.capture_inputs import inputs_of_capture
+from usdbrdf.tasks.capture_inputs import inputs_of_captures
+from usdbrdf.tasks.layers_to_come import write_layers_to_come
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
 
 
 def ingest(
-    capture: Path,
+    capture: Path | Sequence[Path],
     asset: Asset,
     options: IngestOptions,
     adapter: str | None = None,
@@ -35,11 +44,20 @@ def ingest(
     plugins: bool = True,
     copy_to: Path | None = None,
 ) -> TaskResult:
-    """Read and check a capture and write it as the weakest layer of ``asset``, and as a capture of
-    our own format into the new folder ``copy_to``. Raises InputRefused for a capture that cannot be
-    used, OwnershipConflict where ``copy_to`` is taken; nothing is published then."""
+    """Read and check a capture, or several of one scene in as many lightings, and write it as the
+    weakest layer of ``asset``, and a single one as a capture of our own format into the new folder
+    ``copy_to``. Raises InputRefused for a capture that cannot be used, OwnershipConflict where
+    ``copy_to`` is taken or the asset is of other lightings; nothing is published then."""
+    paths = (capture,) if isinstance(capture, Path) else tuple(capture)
+    lightings = names_of_lightings(paths)
+    captures = dict(zip(lightings or ("",), paths, strict=True))
     if copy_to is not None:
-        refuse_taken(copy_to, capture)
+        if lightings:
+            raise UsageError(
+                "--write-capture: a capture has one lighting. Write them one by one. [usage.option]"
+            )
+        refuse_taken(copy_to, paths[0])
+    check_lightings(asset, lightings)
     parameters: dict[str, Any] = {
         key: str(value) if isinstance(value, Path) else value
         for key, value in asdict(options).items()
@@ -47,11 +65,15 @@ def ingest(
     }
     if options.objects == AUTO:
         parameters["objects"] = AUTO
-    chosen = choose_adapter(capture, adapter, plugins=plugins)
-    inputs, places = inputs_of_capture(capture, options, asset, files_beside(chosen, capture))
-    if chosen.package:
-        # Our own adapters change with the version of the code, which every stamp holds.
-        parameters["adapter_package"] = chosen.package
+    chosen = {
+        name: choose_adapter(path, adapter, plugins=plugins) for name, path in captures.items()
+    }
+    beside = {name: (path, files_beside(chosen[name], path)) for name, path in captures.items()}
+    inputs, places = inputs_of_captures(beside, options, asset)
+    # Our own adapters change with the version of the code, which every stamp holds.
+    packages = sorted({one.package for one in chosen.values() if one.package})
+    if packages:
+        parameters["adapter_package"] = ", ".join(packages)
     task = Task(
         asset=asset,
         name="ingest",
@@ -61,40 +83,43 @@ def ingest(
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
-        scan = read_with(chosen, capture, options)
-        warnings = warned(scan.warnings)
-        header = StageHeader.of_scan(asset.name, scan)
+        scans = {name: read_with(chosen[name], path, options) for name, path in captures.items()}
+        refuse_other_scenes(scans)
+        warnings = warned(sentence for scan in scans.values() for sentence in scan.warnings)
+        header = StageHeader.of_scan(asset.name, *scans.values())
         check_root(asset, header)
-        # Photographs through lenses become frames when nothing but pixels can be refused.
-        files = [str(path) for path in scan.frames.image_paths]
-        frames = developed(scan.frames, scan.views, asset.folder, run.output_kept)
-        scan = replace(scan, frames=frames)
-        images = [run.kept.get(file, Path(file)) for file in files]
-        asked, told = asked_of_its_pixels(scan, images, options)
-        if copy_to is not None:
-            write_capture(_as_asked(scan, asked), images, copy_to)
+        told: dict[str, Any] = {}
+        for name, scan in scans.items():
+            # Photographs through lenses become frames when nothing but pixels can be refused.
+            scan = in_own_folder(scan, name)
+            files = [str(path) for path in scan.frames.image_paths]
+            frames = developed(scan.frames, scan.views, asset.folder, run.output_kept)
+            scan = replace(scan, frames=frames)
+            images = [run.kept.get(file, Path(file)) for file in files]
+            scans[name], told[name] = asked_of_its_pixels(scan, images, options)
+            if copy_to is not None:
+                write_capture(_as_asked(scan, scans[name]), images, copy_to)
+        scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), asked, draft)
+        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
-        for role in ROLES[1:]:
-            name = f"layers/{asset.layer(role).name}"
-            write_pending_layer(run.output_once(name), role, header)
+        write_layers_to_come(run, asset, lightings, header)
         return {
-            "adapter": scan.adapter,
+            "adapter": ", ".join(dict.fromkeys(one.adapter for one in scans.values())),
             "frames": len(scan.frames),
-            "objects": len(asked.objects),
+            "objects": len(scan.objects),
             "objects_from": scan.label_source,
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,
             "warnings": warnings,
-            **told,
+            **({"lightings": told} if lightings else told[""]),
         }
 
     result = task.run(work)
     if copy_to is not None and not result.reran:
-        scan = read_with(chosen, capture, options)
+        scan = read_with(chosen[""], paths[0], options)
         frames = developed(scan.frames, scan.views, asset.folder, lambda *_: None)
         scan = replace(scan, frames=frames)
         again = options.refine_poses or options.objects == AUTO

@@ -13,7 +13,6 @@ from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
-from usdbrdf.model.capture import frames_at
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
@@ -30,7 +29,7 @@ def inspect(
         with TemporaryDirectory(prefix="usdbrdf-") as folder:
             asked = spread_evenly(len(found.frames), ASKED)
             views = [found.views[i] for i in asked] if found.views else []
-            frames = developed_in(frames_at(found.frames, asked), views, Path(folder))
+            frames = developed_in(found.frames.at(asked), views, Path(folder))
             read = partial(read_frame, frames)
             agrees = agreement_of_frames(found.mesh, frames, read, capture)
             if options.objects == AUTO:

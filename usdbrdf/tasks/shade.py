@@ -73,8 +73,8 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         lights = run.output(f"layers/{asset.lights_layer.name}")
         write_lights_layer(lights, task.draft, lamps, published, world_from_root(maps.stage))
         view = overview(maps.scene, maps.surface.rays, maps.frames)
-        view.write(run.output("previews/albedo.png"), maps.texels, shaded.albedo, exposure=1)
-        view.write(run.output("previews/irradiance.png"), maps.texels, shaded.irradiance)
+        view.write(run.output(asset.preview("albedo")), maps.texels, shaded.albedo, exposure=1)
+        view.write(run.output(asset.preview("irradiance")), maps.texels, shaded.irradiance)
         doubts = warned(shaded.doubts(identifiers := [item.identifier for item in objects]))
         found = {"denoise": lightmap_filter, "warnings": doubts}
         summary = shaded.summary(identifiers) | found

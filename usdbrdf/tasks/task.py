@@ -4,13 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.job.progress import warn
+from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import code_version
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
+
+Options = TypeVar("Options")
+
+
+def in_each_lighting(
+    task: Callable[[Asset, Options], TaskResult], asset: Asset, options: Options
+) -> TaskResult:
+    """What a task finds that is done for each lighting apart: of several under their names, with
+    all their warnings."""
+    several = asset.in_each_lighting
+    if not several[0].lighting:
+        return task(asset, options)
+    found = {}
+    for one in several:
+        say(f"{task.__name__}: in the lighting {one.lighting}")
+        found[one.lighting] = task(one, options)
+    warnings = [w for each in found.values() for w in each.summary.get("warnings", ())]
+    ran = [each for each in found.values() if each.reran]
+    return TaskResult(
+        summary={"lightings": {k: v.summary for k, v in found.items()}, "warnings": warnings},
+        reran=bool(ran),
+        reason=(ran or [*found.values()])[0].reason,
+    )
 
 
 def warned(doubts: Iterable[str]) -> list[str]:
@@ -36,7 +59,7 @@ class Task:
         """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
         return run_task(
             self.asset.folder,
-            self.name,
+            f"{self.name}@{self.asset.lighting}" if self.asset.lighting else self.name,
             order=1 + ROLES.index(self.role),
             parameters=self.parameters,
             inputs=self.inputs,

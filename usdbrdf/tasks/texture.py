@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.layers.task_layers import write_texturing_layer
+from usdbrdf.asset.layers.task_layers import write_texturing_layer, write_uv_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import TexturedObject
@@ -18,8 +18,8 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import TextureOptions
-from usdbrdf.tasks.atlas import new_charts
 from usdbrdf.tasks.task import Task, warned
+from usdbrdf.tasks.unwrap import charts_of_lightings, new_charts
 from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.lit_texture import LitTexture, lit_texture_from_frames
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -27,7 +27,8 @@ from usdbrdf.transport.rays import RayScene
 
 
 def texture(asset: Asset, options: TextureOptions) -> TaskResult:
-    """Unwrap every object, project the frames, write texturing.usda and its EXR maps."""
+    """Unwrap every object, project the frames, write texturing.usda and its EXR maps; of one of
+    several lightings, which are unwrapped together before, its own layer and maps."""
     maps = AssetMaps(open_weaker(asset, "texturing"))
     task = Task(
         asset=asset,
@@ -40,9 +41,11 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     def work(run: TaskRun) -> dict[str, Any]:
         scene, frames = maps.scene, maps.frames
         rays = RayScene(scene.points, scene.triangles)
-        going_on = GoingOn.of(
-            run, scene, frames, task.parameters, partial(new_charts, maps, rays, options)
-        )
+        if asset.lighting:
+            going_on = GoingOn.afresh(run, frames, charts_of_lightings(maps))
+        else:
+            new = partial(new_charts, maps, rays, options)
+            going_on = GoingOn.of(run, scene, frames, task.parameters, new)
         charts = going_on.charts
         scene = replace(scene, corner_uv=charts["corner_uv"])
         surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)
@@ -55,15 +58,13 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
         doubts = warned(found.doubts())
         writer = MapWriter(run, asset, scene, surface.texels)
         objects = _write_maps(writer, found, sides, options.quantile)
-        write_texturing_layer(
-            run.output(f"layers/{asset.layer('texturing').name}"),
-            run.output(f"layers/{asset.uv_layer.name}"),
-            task.draft,
-            objects,
-            maps.stage,
-        )
+        if not asset.lighting:
+            uv = run.output(f"layers/{asset.uv_layer.name}")
+            write_uv_layer(uv, task.draft, objects, maps.stage)
+        layer = run.output(f"layers/{asset.layer('texturing').name}")
+        write_texturing_layer(layer, task.draft, objects)
         view = overview(scene, rays, frames)
-        view.write(run.output("previews/lit.png"), surface.texels, found.lit)
+        view.write(run.output(asset.preview("lit")), surface.texels, found.lit)
         return {
             "texel_size": float(np.median(sides)),
             "texels": len(surface.texels),

@@ -30,10 +30,11 @@ _ATLAS, _STATISTICS = "texture-atlas", "texture-statistics"
 class GoingOn:
     """What a run of texturing has from the one before.
 
-    charts  of the atlas, see ``charts_of_scene``
-    order   of the frames, by their numbers
-    known   what each frame in this order is, as a hash of its file and its camera
-    atlas   what the statistics belong to, as a hash
+    charts   of the atlas, see ``charts_of_scene``
+    order    of the frames, by their numbers
+    known    what each frame in this order is, as a hash of its file and its camera
+    atlas    what the statistics belong to, as a hash
+    lasting  whether there is a run before and one to come
     """
 
     run: TaskRun
@@ -41,6 +42,7 @@ class GoingOn:
     order: list[int]
     known: list[str]
     atlas: str
+    lasting: bool = True
 
     @classmethod
     def of(
@@ -74,6 +76,13 @@ class GoingOn:
         cache.keep(run.asset, _ATLAS, {"made_for": made_for, "frames": known}, charts)
         return cls(run=run, charts=charts, order=order, known=known, atlas=atlas)
 
+    @classmethod
+    def afresh(cls, run: TaskRun, frames: Frames, charts: dict[str, Array]) -> GoingOn:
+        """All frames from the start on an atlas that others lay out."""
+        atlas = _hash_of([array.tobytes() for _, array in sorted(charts.items())])
+        order, known = [*range(len(frames))], _hashes_of_frames(frames)
+        return cls(run=run, charts=charts, order=order, known=known, atlas=atlas, lasting=False)
+
     def name(self, what: str) -> str:
         """Of a checkpoint that is of no use with another atlas or in another order."""
         return f"{what}-{_hash_of([self.atlas, *self.known])[:12]}"
@@ -81,7 +90,7 @@ class GoingOn:
     def statistics(self, part: slice) -> tuple[int, dict[str, Array]] | None:
         """How many of the first frames are in the statistics of some texels already, and these; the
         statistics of a number of frames alone are of no use for fewer."""
-        stored = cache.kept(self.run.asset, _named(part))
+        stored = cache.kept(self.run.asset, _named(part)) if self.lasting else None
         if stored is None or stored[0].get("atlas") != self.atlas:
             return None
         frames = stored[0].get("frames")
@@ -90,9 +99,9 @@ class GoingOn:
 
     def keep_statistics(self, part: slice, arrays: Mapping[str, Array]) -> None:
         """Those of all frames, for the next run."""
-        cache.keep(
-            self.run.asset, _named(part), {"atlas": self.atlas, "frames": self.known}, arrays
-        )
+        if self.lasting:
+            record = {"atlas": self.atlas, "frames": self.known}
+            cache.keep(self.run.asset, _named(part), record, arrays)
 
 
 def _named(part: slice) -> str:

@@ -14,7 +14,7 @@ from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
-from usdbrdf.model.capture import Frames, frames_at
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.exposures import Probes, contradicting_frames
@@ -102,7 +102,7 @@ def lit_texture_from_frames(
         going_on.keep_statistics(part, observed.arrays())
         return observed.measured(quantile)
 
-    frames = frames_at(frames, going_on.order)
+    frames = frames.at(going_on.order)
     groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
     return _filled_in(texels, found, contradicting_frames(frames, found.probes))

@@ -17,12 +17,12 @@ def sobol_bits(log2_count: int) -> Bits:
     Multidimensional Sampling", 2002) they stay one in each cell of every grid of 2**m cells."""
     index: Bits = np.arange(1 << log2_count, dtype=np.uint32)
     # In the order of Gray's code, in which one number follows from the one before it.
-    code = index ^ index >> 1
+    code: Bits = index ^ index >> np.uint32(1)
     points = np.zeros((len(index), 2), np.uint32)
     direction: Bits = np.full(2, 1 << 31, np.uint32)
     for bit in range(log2_count):
-        points ^= (code >> bit & 1)[:, None] * direction
-        direction = (direction >> 1) ^ (direction * np.array([0, 1], np.uint32))
+        points ^= (code >> np.uint32(bit) & np.uint32(1))[:, None] * direction
+        direction = direction >> np.uint32(1) ^ direction * np.array([0, 1], np.uint32)
     return points
 
 

@@ -41,12 +41,12 @@ class AssetStage:
 
         The record alone does not tell: an adopted copy of a layer of ours is the artist's.
         """
+        return tuple(layer for layer in self.layers if self._is_own(layer))
+
+    def _is_own(self, layer: Sdf.Layer) -> bool:
         folder = self.asset.folder / "layers" if self.asset else None
-        return tuple(
-            layer
-            for layer in self.layers
-            if record_of(layer) and layer.realPath and Path(layer.realPath).parent == folder
-        )
+        placed = layer.realPath and Path(layer.realPath).parent == folder
+        return bool(record_of(layer) and placed)
 
     @cached_property
     def asset_root(self) -> Sdf.Layer | None:
@@ -131,7 +131,8 @@ class AssetStage:
     def is_measured(self, attribute: Usd.Attribute) -> bool:
         """Whether the opinion that wins comes from a layer of ours, not from the artist."""
         stack = attribute.GetPropertyStack(Usd.TimeCode.Default())
-        return bool(stack) and stack[0].layer in self.own_layers
+        # Not all are in the root's layer stack: those of one of several lightings are referenced.
+        return bool(stack) and self._is_own(stack[0].layer)
 
     def own_variants(self, name: str) -> set[str]:
         """Those that layers of ours have of a set of the root prim; the artist may add others."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layout import ROLES, Asset, relative_path, storable_path
+from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import InputRefused, OwnershipConflict
@@ -103,6 +104,40 @@ def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
     export(layer, path, folder=path.parent)
 
 
+def check_lightings(asset: Asset, lightings: Sequence[str]) -> None:
+    """Raise if the asset is there and shows other lightings than these, or none by a name: what
+    was made of the others would stay in it. New ones may join."""
+    if not asset.layer("scan").is_file():
+        return
+    known = asset.lightings
+    if bool(known) != bool(lightings) or set(known) - set(lightings):
+        there = f"has the lightings {', '.join(known)}" if known else "has one lighting"
+        new = ", ".join(lightings) if lightings else "one alone"
+        raise OwnershipConflict(
+            f"{asset.folder}: the asset {there}, and this is to make it {new}. Name its captures "
+            "too, or convert into a new folder. [ownership.lightings]"
+        )
+
+
+def write_choice_of_lighting(
+    path: Path, role: str, asset: Asset, lightings: Sequence[str], header: StageHeader
+) -> None:
+    """The layer of a role that is made once for each lighting: the default prim takes the layer of
+    the one that is selected, of the variant set ``lighting``; first the first. Beside ``path`` lie
+    these layers, or empty ones. What all lightings have in common is a sublayer of texturing.usda.
+    """
+    layer = new_layer(header, Provenance(role=role, version=_VERSION))
+    root = Sdf.Path(f"/{header.name}")
+    for name in lightings:
+        variant = over(layer, str(root.AppendVariantSelection(LIGHTING, name)))
+        own = replace(asset, lighting=name).layer(role)
+        variant.referenceList.prependedItems = [Sdf.Reference(f"./{own.name}")]
+    if role == "texturing":
+        layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
+        layer.GetPrimAtPath(root).variantSelections[LIGHTING] = lightings[0]
+    export(layer, path, folder=path.parent)
+
+
 def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     """Write scan.usdc to ``path``; objects without a face are left out."""
     asset, folder, frames = draft.asset, draft.asset.layer("scan").parent, scan.frames
@@ -118,6 +153,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
         radiometric=frames.radiometric,
         counts=scan.counts,
         objects_from=scan.label_source,
+        lightings=list(dict.fromkeys(frames.lightings)) or None,
         scopes=scopes.names,
         competing_bindings=competing or None,
     )
@@ -259,7 +295,9 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
     images = [storable_path(path, folder) for path in frames.image_paths]
-    said: dict[str, Any] = {"image": images, "lens": frames.lenses}
+    said: dict[str, Any] = {
+        "image": images, "lens": frames.lenses, "lighting": frames.lightings,
+    }  # fmt: skip
     for name, files in (("photograph", frames.photographs), ("mask", frames.masks)):
         said[name] = [storable_path(file, folder) if file else "" for file in files]
     said["gain"] = [1.0] * len(frames) if frames.gain is None else frames.gain.tolist()

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,14 +59,17 @@ from usdbrdf.asset.layers.looks import (
     scale_texture,
     surface,
 )
-from usdbrdf.asset.layout import path_in_layer
+from usdbrdf.asset.layout import LIGHTING, Asset, path_in_layer
 from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit, shown_metal
 from usdbrdf.asset.properties import (
+    EMITTER,
     Colour,
     FittedObject,
     LightFromOutside,
+    MeasuredObject,
     ShadedObject,
     TexturedObject,
+    UnwrappedObject,
 )
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.model.arrays import Double
@@ -75,7 +78,6 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.transport.warps import axes_across
 
 Types = Sdf.ValueTypeNames
-THUMBNAIL = "previews/lit.png"  # in the asset folder
 # Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
 _PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
 ALBEDO, EMISSION = "albedo", "emission"
@@ -207,17 +209,15 @@ def _author_light(
     _author_pose(prim, np.linalg.inv(world_from_root) @ in_units)
 
 
-def write_texturing_layer(
-    path: Path, uv_path: Path, draft: Draft, objects: Sequence[TexturedObject], scanned: Usd.Stage
+def write_uv_layer(
+    path: Path, draft: Draft, objects: Sequence[UnwrappedObject], scanned: Usd.Stage
 ) -> None:
-    """Write texturing.usda to ``path``, and its sublayer of texture coordinates to ``uv_path``.
+    """Write the texture coordinates to ``path``; where several lightings have them in common also
+    what else is known of the objects' textures before any frame was looked at.
 
     scanned  the composed stage of the weaker layers
     """
-    asset, scopes = draft.asset, draft.scopes
-    folder = asset.layer("texturing").parent
-    coordinates, layer = draft.new_layer(), draft.new_layer()
-    layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
+    coordinates = draft.new_layer()
     with Sdf.ChangeBlock():
         for item in objects:
             # One value per triangle corner; equal values are stored once and indexed. Their type is
@@ -236,15 +236,27 @@ def write_texturing_layer(
             attribute(
                 prim, "primvars:st:indices", Types.IntArray, index.reshape(-1).astype(np.int32)
             )
+            if draft.asset.lightings:
+                author_record(prim, item)
+    export(coordinates, path, folder=draft.asset.uv_layer.parent)
+
+
+def write_texturing_layer(path: Path, draft: Draft, objects: Sequence[TexturedObject]) -> None:
+    """Write texturing.usda to ``path``; its sublayer is ``write_uv_layer``'s, or, of one of several
+    lightings, that of the layer which chooses among them."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    if not asset.lighting:
+        layer.subLayerPaths = [f"./{asset.uv_layer.name}"]
+    with Sdf.ChangeBlock():
+        for item in objects:
             author_record(over(layer, item.prim_path), item)
     # What browsers of assets show: the picture that the task writes beside the layer.
     root = layer.GetPrimAtPath(scopes.root)
     apply_schema(root, "AssetPreviewsAPI")
-    picture = {"defaultImage": Sdf.AssetPath(path_in_layer(THUMBNAIL))}
+    picture = {"defaultImage": Sdf.AssetPath(path_in_layer(asset.preview("lit")))}
     root.SetInfo("assetInfo", {"previews": {"thumbnails": {"default": picture}}})
     author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=LIT)
-    export(coordinates, uv_path, folder=folder)
-    export(layer, path, folder=folder)
+    export(layer, path, folder=asset.layer("texturing").parent)
 
 
 # What a renderer is asked for: name, type, source. Light path expressions say which paths count;
@@ -312,12 +324,49 @@ def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
         attribute(prim, "sourceType", Types.Token, source_type, uniform=True)
 
 
+def write_refined_layer(
+    path: Path, draft: Draft, objects: Sequence[MeasuredObject], fitted: Sequence[FittedObject]
+) -> None:
+    """Write what the task fit knows of one of several lightings to ``path``: the maps of the
+    ``objects``, looks that show them, and the colour of lamps that are dark in it."""
+    asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
+    for item in objects:
+        author_record(over(layer, item.prim_path), item)
+    own = _shading_layer(asset)
+    others = [_shading_layer(one) for one in replace(asset, lighting="").in_each_lighting]
+    for lamp in fitted:
+        if _emits(lamp, *others) and not _emits(lamp, own):
+            shown = (
+                preview_surface_from_fit(*lamp.shown, lamp.mapping) if lamp.is_known else NO_LOBE
+            )
+            material = scopes.path("materials", lamp.identifier)
+            _author_diffuse(layer, material, lamp, shown.diffuse, own)
+    author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=SHADED)
+    export(layer, path, folder=asset.layer("material").parent)
+
+
+def _shading_layer(asset: Asset) -> Sdf.Layer:
+    return Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
+
+
+def _emits(item: MeasuredObject, *shading: Sdf.Layer) -> bool:
+    """Whether an object shines as a whole in one of the lightings of these shading layers."""
+    radiance = f"{item.prim_path}.{EMITTER.attribute(EMITTER.key)}"
+    return any(layer.GetAttributeAtPath(radiance) is not None for layer in shading)
+
+
 def write_material_layer(
     path: Path, draft: Draft, objects: Sequence[FittedObject], *, materialx: Path | None = None
 ) -> None:
-    """Write material.usda to ``path``; with ``materialx``, that sublayer to there."""
+    """Write material.usda to ``path``; with ``materialx``, that sublayer to there. Of several
+    lightings it takes ``write_refined_layer``'s of the one that is selected, and has no colour of
+    objects that shine in any: their emission is all that leaves them then."""
     asset, scopes, layer = draft.asset, draft.scopes, draft.new_layer()
-    shading = Sdf.Layer.OpenAsAnonymous(str(asset.layer("shading")))
+    for one in (one for one in asset.in_each_lighting if one.lighting):
+        variant = Sdf.Path(scopes.root).AppendVariantSelection(LIGHTING, one.lighting)
+        refined = Sdf.Reference(f"./{one.layer('material').name}")
+        over(layer, str(variant)).referenceList.prependedItems = [refined]
+    shading = [_shading_layer(one) for one in asset.in_each_lighting]
     networks = {}
     for item in objects:
         material = scopes.path("materials", item.identifier)
@@ -329,11 +378,10 @@ def write_material_layer(
             shader = over(layer, f"{material}/{SURFACE}")
             author_inputs(shader, Types.Float, metallic=float(item.is_metal))
             author_inputs(shader, Types.Int, useSpecularWorkflow=0)
-        if item.is_metal:
-            texture = _author_metal(layer, material, item)
-        else:
-            texture = _author_colour(layer, material, item, shown.diffuse, shading)
-        if item.is_known and not shading.GetPrimAtPath(f"{material}/{EMISSION_TEXTURE}"):
+        apart = len(shading) > 1 and _emits(item, *shading)
+        texture = "" if apart else _author_diffuse(layer, material, item, shown.diffuse, shading[0])
+        glows = f"{material}/{EMISSION_TEXTURE}"
+        if item.is_known and not any(own.GetPrimAtPath(glows) for own in shading):
             networks[material] = (item, shown, texture)
     looks = aov_looks(layer, scopes, objects)
     for parameter, look in enumerate(("roughness", "specular")):
@@ -347,6 +395,15 @@ def write_material_layer(
             _author_network(beneath, material, item, shown, texture)
         export(beneath, materialx, folder=asset.materialx_layer.parent)
     export(layer, path, folder=asset.layer("material").parent)
+
+
+def _author_diffuse(
+    layer: Sdf.Layer, material: str, item: FittedObject, scale: float, shading: Sdf.Layer
+) -> str:
+    """A metal's reflectance, or the diffuse colour; returns its texture as ``_author_colour``."""
+    if item.is_metal:
+        return _author_metal(layer, material, item)
+    return _author_colour(layer, material, item, scale, shading)
 
 
 def _author_colour(

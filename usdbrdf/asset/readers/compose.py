@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
-from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
@@ -37,19 +38,31 @@ def open_weaker(asset: Asset, role: str) -> Usd.Stage:
     """The stage that the task of a role builds upon: only the layers weaker than its own. Never
     edits.usda: what an artist overrides must not flow back into the measurement.
     InputRefused where one of the tasks before has not run."""
-    return _sublayered(asset, _weaker_layers(asset, role))
+    return _in_lighting(_sublayered(asset, _weaker_layers(asset, role)), asset)
 
 
 def open_measured(asset: Asset) -> Usd.Stage:
-    """All layers that the tool wrote, without the artist's."""
-    return _sublayered(asset, [asset.layer(role) for role in ROLES])
+    """All layers that the tool wrote, without the artist's, in the asset's lighting."""
+    common = replace(asset, lighting="")
+    return _in_lighting(_sublayered(common, [common.layer(role) for role in ROLES]), asset)
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
     """The asset as everybody else opens it: the root layer, with the artist's opinions.
     InputRefused where it does not compose, or USD crashes on it."""
     try_in_child(asset.root_layer)
-    return open_stage(asset.root_layer)
+    return _in_lighting(open_stage(asset.root_layer), asset)
+
+
+def _in_lighting(stage: Usd.Stage, asset: Asset) -> Usd.Stage:
+    """With the asset's lighting selected, for this session alone, unless that is whichever is."""
+    if asset.lighting:
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            choice = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(LIGHTING)
+            # A stage of one lighting's own layers has none to choose from.
+            choice.AddVariant(asset.lighting)
+            choice.SetVariantSelection(asset.lighting)
+    return stage
 
 
 def warn_of_edits(asset: Asset) -> None:
@@ -135,7 +148,8 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
             )
     root = new_layer(read_header(layers[0]), Provenance(role="view", version="1"))
     # Texture coordinates are a sublayer of texturing.usda already.
-    root.subLayerPaths = [str(layer) for layer in reversed(layers) if layer != asset.uv_layer]
+    uv = None if asset.lighting else asset.uv_layer
+    root.subLayerPaths = [str(layer) for layer in reversed(layers) if layer != uv]
     return open_stage(root)
 
 
@@ -159,10 +173,12 @@ def hashes_of_inputs(
     }
     if picture and not picture.is_file():
         raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
+    behind = f".{asset.lighting}" if asset.lighting else ""
     by_label = {layer.name: sha256_of(layer) for layer in _weaker_layers(asset, role)}
-    return by_label | {label: hash_of_files(some) for label, some in files.items() if some}
+    return by_label | {f"{k}{behind}": hash_of_files(some) for k, some in files.items() if some}
 
 
 def _weaker_layers(asset: Asset, role: str) -> list[Path]:
     layers = [asset.layer(weaker) for weaker in ROLES[: ROLES.index(role)]]
-    return [*layers, asset.uv_layer] if role in ("shading", "material") else layers
+    unwrapped = role in ("shading", "material") or (asset.lighting and role == "texturing")
+    return [*layers, asset.uv_layer] if unwrapped else layers

@@ -71,7 +71,7 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
     paths = [asset_file(image, time) for time in times]
 
     def of_all(name: str, get: Callable[[Usd.Attribute, float], Any]) -> tuple[Any, ...]:
-        """What only photographs through lenses have; () where none is one."""
+        """What only some captures say of their photographs; () where this one does not."""
         attribute = camera.GetPrim().GetAttribute(CAPTURE.attribute(name))
         said = attribute and attribute.HasAuthoredValue()
         return tuple(get(attribute, time) for time in times) if said else ()
@@ -82,6 +82,7 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
         photographs=of_all("photograph", asset_file),
         masks=of_all("mask", asset_file),
         lenses=of_all("lens", lambda lens, time: str(lens.Get(time))),
+        lightings=of_all("lighting", lambda lighting, time: str(lighting.Get(time))),
         **read,
     )
 
@@ -275,6 +276,19 @@ def light_from_outside(stage: Usd.Stage) -> tuple[LightFromOutside, Path] | None
         return None
     file = asset_file(prim.GetAttribute(OUTSIDE.attribute(OUTSIDE.key)), Usd.TimeCode.Default())
     return (read_record(LightFromOutside, prim), file) if file else None
+
+
+def read_unwrapped(stage: Usd.Stage, prim_path: str) -> tuple[tuple[int, int], float]:
+    """Width and height of an object's textures, and the side of a texel in metres; InputRefused
+    where it was not unwrapped yet."""
+    prim = stage.GetPrimAtPath(prim_path)
+    size, side = (authored(prim, TEXTURING.attribute(n)) for n in ("resolution", TEXTURING.key))
+    if size is None or side is None:
+        raise InputRefused(
+            f"<{prim_path}>: the mesh has no textures of ours. Run `usdbrdf texture` again. "
+            "[stage.st]"
+        )
+    return (int(size[0]), int(size[1])), float(side)
 
 
 read_shading = partial(read_object, ShadedObject, SHADING)

@@ -34,7 +34,7 @@ from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames, frames_at
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
 from usdbrdf.options import IngestOptions
@@ -133,7 +133,7 @@ def photographs_of_views(
         warn(sentence)
     return Views(
         names=tuple(names[photograph_of[i]] + face for i, face in zip(kept, faces, strict=True)),
-        frames=developed_in(frames_at(frames, kept), views, folder),
+        frames=developed_in(frames.at(kept), views, folder),
     )
 
 

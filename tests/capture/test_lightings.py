@@ -1,0 +1,143 @@
+"""Captures of one scene in several lightings become one scan, or are refused in a sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes import edited, make_capture, write_ply
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.lightings import (
+    in_own_folder,
+    names_of_lightings,
+    refuse_other_scenes,
+    scan_of_lightings,
+)
+from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions()
+CREASE = OPTIONS.crease_angle_deg
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """The captures: by day, and by night, in which the lamp is dark and fewer frames were taken."""
+    dark = {"lamp": (0.1, 0.1, 0.1), "ceiling": (4.0, 4.0, 4.0)}
+    return (
+        make_capture(tmp_path / "by day", frames=12),
+        make_capture(tmp_path / "by night", frames=9, radiance=dark, exposure_times=(0.04,)),
+    )
+
+
+def _scans(*folders: Path) -> dict[str, Scan]:
+    names = names_of_lightings(folders)
+    return {name: read_scan(path, OPTIONS) for name, path in zip(names, folders, strict=True)}
+
+
+def test_lightings_have_the_names_of_their_folders(tmp_path):
+    folders = [tmp_path / name for name in ("by day", "2", "by night")]
+    for folder in folders:
+        folder.mkdir()
+    main = folders[2] / "transforms.json"
+    assert names_of_lightings([folders[0], folders[1], main]) == ("by_day", "_2", "by_night")
+    assert names_of_lightings(folders[:1]) == ()
+    (tmp_path / "other" / "BY DAY").mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"would be called BY_DAY.*\[lighting.name\]"):
+        names_of_lightings([tmp_path / "other" / "BY DAY", folders[0]])
+
+
+def test_frames_follow_each_other_and_know_their_lighting(pair):
+    scans = _scans(*(made.folder for made in pair))
+    scan = scan_of_lightings(scans, CREASE)
+    day, night = scans.values()
+    assert len(scan.frames) == 21
+    assert scan.frames.of_lighting("by_day") == range(12)
+    assert scan.frames.of_lighting("by_night") == range(12, 21)
+    for lighting, own in scans.items():
+        again = scan.frames.at(scan.frames.of_lighting(lighting))
+        assert again.image_paths == own.frames.image_paths
+        np.testing.assert_array_equal(again.world_from_camera, own.frames.world_from_camera)
+        np.testing.assert_array_equal(again.exposure_time, own.frames.exposure_time)
+        assert set(again.lightings) == {lighting}
+    np.testing.assert_array_equal(scan.mesh.triangles, day.mesh.triangles)
+    np.testing.assert_array_equal(scan.mesh.corner_normals, night.mesh.corner_normals)
+
+
+def test_of_one_nothing_changes(pair):
+    scan = read_scan(pair[0].folder, OPTIONS)
+    assert scan_of_lightings({"": scan}, CREASE) is scan
+    assert in_own_folder(scan, "") is scan
+    assert scan.frames.of_lighting("") == range(12)
+
+
+def test_gains_masks_and_lenses_of_some_are_none_of_the_others(pair):
+    scans = _scans(*(made.folder for made in pair))
+    night = scans["by_night"].frames
+    mask = tuple(Path("/mask.png") if i == 2 else None for i in range(9))
+    scans["by_night"] = replace(
+        scans["by_night"], frames=replace(night, gain=np.full(9, 2.0), masks=mask)
+    )
+    frames = scan_of_lightings(scans, CREASE).frames
+    np.testing.assert_array_equal(frames.gain, [1.0] * 12 + [2.0] * 9)
+    assert frames.masks == (None,) * 12 + mask
+    assert frames.photographs == ()
+
+
+def test_all_cameras_tell_which_side_of_a_face_is_the_surface(tmp_path):
+    """A sheet wound away from the cameras of the night, who alone see it."""
+    made = [make_capture(tmp_path / name, frames=12) for name in ("day", "night")]
+    # The box's faces the wrong way round.
+    box = made[0].face_object == made[0].names.index("box")
+    triangles = made[0].triangles.copy()
+    triangles[box] = triangles[box][:, [0, 2, 1]]
+    for capture in made:
+        write_ply(capture.folder / "mesh.ply", capture.points, triangles, capture.face_object)
+    scans = _scans(*(capture.folder for capture in made))
+    assert scans["night"].turned_faces[box].all()
+    day = scans["day"]
+    # As if no frame of the day had shown the box.
+    as_filed = replace(day.mesh, triangles=triangles)
+    unseen = replace(day, mesh=as_filed, turned_faces=np.zeros(len(triangles), bool))
+    refuse_other_scenes({**scans, "day": unseen})
+    scan = scan_of_lightings({**scans, "day": unseen}, CREASE)
+    np.testing.assert_array_equal(scan.turned_faces, scans["night"].turned_faces)
+    np.testing.assert_array_equal(scan.mesh.triangles, scans["night"].mesh.triangles)
+    np.testing.assert_allclose(scan.mesh.corner_normals, day.mesh.corner_normals, atol=1e-6)
+
+
+def test_another_mesh_is_refused(pair):
+    day, night = pair
+    moved = night.points + np.float32(0.01)
+    write_ply(night.folder / "mesh.ply", moved, night.triangles, night.face_object)
+    with pytest.raises(InputRefused, match=r"by night.*by day.*--mesh. \[lighting.mesh\]"):
+        refuse_other_scenes(_scans(day.folder, night.folder))
+
+
+def test_fewer_triangles_are_refused(pair):
+    day, night = pair
+    some = slice(0, -2)
+    write_ply(
+        night.folder / "mesh.ply", night.points, night.triangles[some], night.face_object[some]
+    )
+    with pytest.raises(InputRefused, match=r"triangles are others.*\[lighting.mesh\]"):
+        refuse_other_scenes(_scans(day.folder, night.folder))
+
+
+def test_other_objects_are_refused(pair):
+    day, night = pair
+    with edited(night.folder / "objects.json") as document:
+        document["objects"][0]["name"] = "carpet"
+    with pytest.raises(InputRefused, match=r"objects are others.*\[lighting.objects\]"):
+        refuse_other_scenes(_scans(day.folder, night.folder))
+
+
+def test_other_units_are_refused(pair):
+    scans = _scans(*(made.folder for made in pair))
+    scans["by_night"] = replace(scans["by_night"], meters_per_unit=0.01)
+    with pytest.raises(InputRefused, match=r"\[lighting.units\]"):
+        refuse_other_scenes(scans)

@@ -1,0 +1,219 @@
+"""One asset of a scene in two lightings: what is in it for each, what they share, what later runs
+do, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdShade
+
+import usdbrdf
+from tests.scenes import make_capture, poses_down_and_up
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.compose import open_edited, open_measured
+from usdbrdf.asset.readers.scene import aov_path, read_shading
+from usdbrdf.cli import main
+from usdbrdf.errors import OwnershipConflict, UsageError
+from usdbrdf.files.images import read_exr
+from usdbrdf.job.progress import set_quiet
+
+COARSE = ["-q", "--texel-size", "0.3", "--standard-error", "0.1", "--rays", "64"]
+COARSE += ["--environment", "none", "--denoise", "none"]
+# By day the lamp shines; by night it is dark and the box does.
+DAY = {"ceiling": (0.125, 0.125, 0.125)}
+NIGHT = {"lamp": (0.25, 0.2, 0.15), "box": (6.0, 6.0, 6.0), "ceiling": (0.1, 0.1, 0.1)}
+LIGHTINGS = ("day", "night")
+
+
+@pytest.fixture(autouse=True)
+def _quiet():
+    set_quiet(True)
+    yield
+    set_quiet(False)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return tmp_path_factory.mktemp("lightings")
+
+
+@pytest.fixture(scope="module")
+def captures(base) -> list[Path]:
+    made = {
+        name: make_capture(
+            base / name, subdivisions=2, poses=poses_down_and_up(6, 6), radiance=radiance
+        )
+        for name, radiance in zip(LIGHTINGS, (DAY, NIGHT), strict=True)
+    }
+    return [capture.folder for capture in made.values()]
+
+
+def _convert(captures: list[Path], folder: Path, *more: str) -> int:
+    return main(["convert", *map(str, captures), "-o", str(folder), *COARSE, *more])
+
+
+@pytest.fixture(scope="module")
+def asset(base, captures) -> Asset:
+    set_quiet(True)
+    assert _convert(captures, base / "made" / "room") == 0
+    return Asset.made(base / "made" / "room")
+
+
+def _colour(stage: Usd.Stage, name: str) -> list[str]:
+    """The prims that the diffuse and the emissive colour of an object's material come from."""
+    prim = stage.GetPrimAtPath(f"/room/geo/{name}")
+    surface = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+    inputs = [surface.GetInput(f"{kind}Color") for kind in ("diffuse", "emissive")]
+    return [str(own.GetValueProducingAttributes()[0].GetPrim().GetName()) for own in inputs]
+
+
+def test_each_lighting_has_layers_and_maps_of_its_own(asset):
+    assert asset.lightings == LIGHTINGS
+    layers = {path.name for path in (asset.folder / "layers").iterdir()}
+    each = {f"{role}.{name}.usda" for name in LIGHTINGS
+            for role in ("texturing", "shading", "lights", "material")}  # fmt: skip
+    shared = {"scan.usdc", "texturing_uv.usdc", "texturing.usda", "shading.usda", "material.usda"}
+    assert layers == each | shared
+    for name, wall in zip(LIGHTINGS, (0.25, 0.25), strict=True):
+        stage = open_edited(asset.in_lighting(name))
+        file = aov_path(stage, "/room/geo/floor", "lit")
+        assert file == asset.folder / "textures" / name / "floor.lit.exr"
+        shown = read_exr(file)[..., 0]
+        assert np.median(shown) == pytest.approx(wall, rel=0.02)
+        assert (asset.folder / "previews" / name / "lit.png").is_file()
+
+
+def test_the_root_layer_opens_in_the_first_and_others_can_be_chosen(asset):
+    stage = open_edited(asset)
+    choice = stage.GetDefaultPrim().GetVariantSet("lighting")
+    assert choice.GetVariantNames() == [*LIGHTINGS]
+    assert choice.GetVariantSelection() == "day"
+    assert read_shading(stage, "/room/geo/lamp").radiance[0] == pytest.approx(8, rel=0.01)
+    choice.SetVariantSelection("night")
+    assert read_shading(stage, "/room/geo/box").radiance[0] == pytest.approx(6, rel=0.01)
+    assert not read_shading(stage, "/room/geo/lamp").emitter
+
+
+def test_all_lightings_show_one_base_colour_and_one_lobe(asset):
+    found = []
+    for name in LIGHTINGS:
+        stage = open_edited(asset.in_lighting(name))
+        files = [aov_path(stage, f"/room/geo/{o}", "base_color") for o in ("floor", "lamp")]
+        lobes = [stage.GetAttributeAtPath(f"/room/geo/floor.usdBrdf:fit:{n}").Get()
+                 for n in ("phi", "psi")]  # fmt: skip
+        found.append((files, lobes))
+        assert _colour(stage, "floor") == ["BaseColorTexture", "PreviewSurface"]
+    assert found[0] == found[1]
+    assert found[0][0][0] == asset.folder / "textures" / "floor.base_color.exr"
+
+
+def test_a_lamp_has_the_colour_that_it_shows_when_it_is_dark(asset):
+    day, night = (AssetMaps(open_measured(asset.in_lighting(name))) for name in LIGHTINGS)
+    names = [obj.label for obj in day.scene.objects]
+    lamp, box = (day.texels.of_object(names.index(name)) for name in ("lamp", "box"))
+    assert day.emissive[lamp].all()
+    assert night.emissive[box].all()
+    base_color = day.map("base_color")
+    for own, dark in ((lamp, night), (box, day)):
+        seen = dark.coverage.measured[own]
+        expected = np.pi * dark.map("diffuse") / dark.map("refined_irradiance")
+        expected = np.clip(expected, 0, 1)[own][seen]
+        assert expected.max() > 0
+        np.testing.assert_allclose(base_color[own][seen], expected, rtol=0.02, atol=2e-3)
+    # Its emission is all that leaves it, where it shines.
+    for name, shines, dark in (("day", "lamp", "box"), ("night", "box", "lamp")):
+        stage = open_edited(asset.in_lighting(name))
+        assert _colour(stage, shines) == ["PreviewSurface", "EmissionTexture"]
+        assert _colour(stage, dark) == ["BaseColorTexture", "PreviewSurface"]
+
+
+def test_frames_are_those_of_the_lighting(asset, captures):
+    for name, capture in zip(LIGHTINGS, captures, strict=True):
+        maps = AssetMaps(open_measured(asset.in_lighting(name)))
+        assert {path.parents[1] for path in maps.frames.image_paths} == {capture}
+    assert len(maps.all_frames) == 24
+    assert maps.own_frames == range(12, 24)
+    stage = open_edited(asset)
+    assert stage.GetEndTimeCode() == 24
+
+
+def test_the_asset_keeps_all_rules(asset, capsys):
+    capsys.readouterr()
+    assert main(["validate", str(asset.folder)]) == 0
+    assert "error" not in capsys.readouterr().out
+
+
+def test_a_second_run_does_only_what_is_missing_and_of_one_lighting_alone(asset, captures):
+    again = usdbrdf.convert(captures, asset.folder, _options())
+    assert [name for name, result in again.items() if result.reran] == []
+    assert again["shade"].summary["lightings"]["day"]["emitters"] == ["lamp"]
+    textures = asset.folder / "textures"
+    lost = textures / "night" / "floor.albedo.exr"
+    content = lost.read_bytes()
+    lost.unlink()
+    before = {path: path.stat().st_ino for path in (textures / "day").iterdir()}
+    after = usdbrdf.convert(captures, asset.folder, _options())
+    assert [name for name, result in after.items() if result.reran] == ["shade"]
+    assert lost.read_bytes() == content
+    assert {path: path.stat().st_ino for path in (textures / "day").iterdir()} == before
+
+
+def _options() -> usdbrdf.ConvertOptions:
+    shade = usdbrdf.ShadeOptions(
+        sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64),
+        environment="none",
+        denoise="none",
+    )
+    return usdbrdf.ConvertOptions(
+        texture=usdbrdf.TextureOptions(texel_size=0.3),
+        shade=shade,
+        fit=usdbrdf.FitOptions(environment="none"),
+    )
+
+
+def test_views_are_evaluated_in_the_lighting_that_is_named(asset, captures, tmp_path):
+    places = [tmp_path / name for name in LIGHTINGS]
+    for name, capture, place in zip(LIGHTINGS, captures, places, strict=True):
+        given = ["--views", str(capture / "transforms.json"), "--lighting", name]
+        rays = ["--samples-per-pixel", "1", "--rays", "8", "--environment", "none"]
+        assert main(["evaluate", str(asset.folder), *given, *rays, "-q", "-o", str(place)]) == 0
+        found = json.loads((place / "evaluation.json").read_text())
+        assert found["lighting"] == name
+        # The radiance of objects is a number, so L_d shows the frames but for edges.
+        assert found["summary"]["l2_shown"]["baseline"] < 0.2
+    with pytest.raises(UsageError, match=r"the asset has day, night. \[asset.lighting\]"):
+        asset.in_lighting("dawn")
+
+
+def test_other_lightings_need_another_folder(base, asset, captures):
+    with pytest.raises(OwnershipConflict, match=r"has the lightings day, night.*lightings\]"):
+        usdbrdf.convert(captures[0], asset.folder, _options())
+    other = base / "dusk"
+    shutil.copytree(captures[1], other)
+    with pytest.raises(OwnershipConflict, match=r"\[ownership.lightings\]"):
+        usdbrdf.convert([captures[0], other], asset.folder, _options())
+
+
+def test_one_frame_of_one_lighting_is_not_fitted(base, captures):
+    options = usdbrdf.ConvertOptions(fit=usdbrdf.FitOptions(method="paper"))
+    with pytest.raises(UsageError, match=r"--fit paper.*\[usage.option\]"):
+        usdbrdf.convert(captures, base / "none", options)
+    assert not (base / "none").exists()
+
+
+def test_a_single_capture_knows_nothing_of_lightings(base, captures):
+    with usdbrdf.working_on(base / "single") as single:
+        usdbrdf.ingest(captures[0], single, usdbrdf.IngestOptions())
+    assert single.lightings == ()
+    assert single.in_each_lighting == (single,)
+    assert "ighting" not in (single.folder / "layers" / "texturing.usda").read_text()
+    stage = open_edited(single)
+    camera = stage.GetPrimAtPath("/single/cameras/capture")
+    assert not camera.GetAttribute("usdBrdf:capture:lighting").HasAuthoredValue()
+    with pytest.raises(UsageError, match="the asset has but one lighting"):
+        single.in_lighting("day")

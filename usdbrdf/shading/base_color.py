@@ -1,0 +1,95 @@
+"""What a surface reflects: pi L_d / S (paper, section 3.3), in one lighting or in several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.texels import Texels
+from usdbrdf.texturing.inpaint import inpaint
+
+NEUTRAL = calibration.number("albedo.unseen")
+_DARK = calibration.number("albedo.dark")
+_OF_LIGHTING = calibration.number("albedo.error_of_lighting")
+_TINY = float(np.finfo(np.float32).tiny)
+
+
+def albedo_from_irradiance(
+    diffuse_radiance: Float, irradiance: Float, floor: float
+) -> tuple[Float, Bool]:
+    """Lambertian albedo of each texel, rho = pi L_d / S (paper, section 3.3).
+
+    diffuse_radiance (T, 3) float32, L_d, scene-linear; irradiance (T, 3) float32, S, W/m^2;
+    floor: S below it is unknown, not dark. Returns rho (T, 3) float32, not clipped and 0 where
+    unknown, and known (T,) bool.
+    """
+    known: Bool = np.all(irradiance > floor, axis=1)
+    rho = np.where(known[:, None], np.pi * diffuse_radiance / np.maximum(irradiance, floor), 0)
+    return rho.astype(np.float32), known
+
+
+def albedo_map(
+    texels: Texels, radiance: Float, irradiance: Float, known: Bool, emissive: Bool
+) -> tuple[Float, Bool]:
+    """(albedo (T, 3) in [0, 1], (T,) the known, non-emissive texels that would be over 1).
+
+    radiance, irradiance (T, 3); known (T,): the texel's radiance is not filled in, and its albedo
+    need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
+    is known are NEUTRAL.
+    """
+    albedo, tells = _albedo(radiance, irradiance, known & ~emissive)
+    over = (albedo > 1).any(axis=1) & tells
+    return _filled_in(texels, np.clip(albedo, 0, 1), tells, known, emissive), over
+
+
+class Reflection(NamedTuple):
+    """One lighting: of T texels radiance and irradiance (T, 3), as ``albedo_map`` has them and
+    ``known`` and ``emissive`` (T,) too; error (T,), standard deviation of radiance / irradiance
+    relative to it, as far as the samples and the rays tell, infinite where that is only bounded."""
+
+    radiance: Float
+    irradiance: Float
+    error: Float
+    known: Bool
+    emissive: Bool
+
+
+def base_color_of(texels: Texels, lightings: Sequence[Reflection]) -> Float:
+    """(T, 3) in [0, 1]: the albedo that all lightings tell, each weighted by the inverse of its
+    variance; what shines in one of them, others tell alone."""
+    if len(lightings) == 1:
+        (only,) = lightings
+        return albedo_map(texels, only.radiance, only.irradiance, only.known, only.emissive)[0]
+    total, weights = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), np.float32)
+    for one in lightings:
+        albedo, tells = _albedo(one.radiance, one.irradiance, one.known & ~one.emissive)
+        # A bound is better than nothing.
+        weight = np.maximum(1 / (one.error**2 + _OF_LIGHTING**2), 1e-6)
+        weight = np.where(tells, weight, 0).astype(np.float32)
+        total += weight[:, None] * np.clip(albedo, 0, 1)
+        weights += weight
+    known = np.any([one.known & ~one.emissive for one in lightings], axis=0)
+    emissive = np.all([one.emissive for one in lightings], axis=0)
+    mean = total / np.maximum(weights, _TINY)[:, None]
+    return _filled_in(texels, np.asarray(mean, np.float32), weights > 0, known, emissive)
+
+
+def _albedo(radiance: Float, irradiance: Float, reflects: Bool) -> tuple[Float, Bool]:
+    """Albedo (T, 3), not clipped, and which texels of those that reflect it is known of."""
+    floor = _DARK * float(np.median(irradiance.mean(axis=1)))
+    albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))
+    return albedo, reflects & lit_enough
+
+
+def _filled_in(texels: Texels, albedo: Float, tells: Bool, known: Bool, emissive: Bool) -> Float:
+    albedo = inpaint(texels, albedo, tells)
+    for i in range(len(texels.resolution)):
+        own = texels.of_object(i)
+        if not known[own].any():
+            albedo[own] = NEUTRAL
+    albedo[emissive] = 0
+    return albedo

@@ -1,0 +1,78 @@
+"""What the task fit does with the lobes that it found: maps that are free of their light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from usdbrdf.asset.layers.task_layers import write_refined_layer
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
+from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
+from usdbrdf.files.frames import FrameReader
+from usdbrdf.job.task import TaskRun
+from usdbrdf.material.refine import Lighting, Lobes, refined_light
+from usdbrdf.options import FitOptions
+from usdbrdf.tasks.task import Task
+from usdbrdf.transport.lit_scene import LitScene
+
+
+def refined_objects(
+    run: TaskRun,
+    task: Task,
+    each: Sequence[Asset],
+    maps: Sequence[AssetMaps],
+    lit: Sequence[LitScene],
+    reader: FrameReader,
+    objects: list[FittedObject],
+    options: FitOptions,
+) -> list[FittedObject]:
+    """The objects with maps of L_d, S and base colour that are free of their specular light; of
+    several lightings those of the base colour alone, the others in a layer of each."""
+    lobes = Lobes(
+        phi=np.array([item.phi for item in objects], np.float32),
+        psi=np.array([item.psi_of_channels for item in objects], np.float32),
+        conducts=np.array([item.is_metal for item in objects], np.bool_),
+    )
+    lightings = [
+        Lighting(one.lighting, scene, own, own.own_frames)
+        for one, scene, own in zip(each, lit, maps, strict=True)
+    ]
+    refined = refined_light(
+        run, lightings, reader, lobes, task.parameters["denoise"], options.memory, options.seed
+    )
+    scene, texels = maps[0].scene, maps[0].texels
+    base_color = refined[0].base_color
+    shared = {"base_color": TexelMap(base_color, 1.0, "1")}
+    own_maps = [
+        {
+            "diffuse": TexelMap(found.diffuse, 1.0, "W/(m^2 sr)"),
+            "refined_irradiance": TexelMap(found.irradiance, 1 / np.pi, "W/m^2"),
+        }
+        for found in refined
+    ]
+    if len(each) == 1:
+        shared = own_maps.pop() | shared
+    writer, with_maps = MapWriter(run, task.asset, scene, texels), []
+    for i, item in enumerate(objects):
+        mean = colour(texels.mean_of_object(i, base_color))
+        with_maps.append(replace(item, aovs=writer.write(i, shared), mean_color=mean))
+    for one, made in zip(each, own_maps, strict=False):
+        writer = MapWriter(run, one, scene, texels)
+        in_light = [
+            MeasuredObject(
+                prim_path=item.prim_path, identifier=item.identifier, aovs=writer.write(i, made)
+            )
+            for i, item in enumerate(objects)
+        ]
+        write_refined_layer(
+            run.output(f"layers/{one.layer('material').name}"),
+            replace(task.draft, asset=one),
+            in_light,
+            with_maps,
+        )
+    view = overview(scene, lit[0].rays, maps[0].all_frames)
+    view.write(run.output(task.asset.preview("base_color")), texels, base_color, exposure=1)
+    return with_maps
