@@ -406,7 +406,7 @@ class PluginPath(Command):
 
     def run(self) -> int:
         with loading():
-            from usdbrdf.asset.properties import plugin_path, validators_path
+            from usdbrdf.asset.schemas import plugin_path, validators_path
         folders = [plugin_path()] if self.schemas else [plugin_path(), validators_path()]
         show(os.pathsep.join(str(folder) for folder in folders))
         return 0

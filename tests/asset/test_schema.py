@@ -15,7 +15,7 @@ import pytest
 from pxr import Plug, Sdf, Usd
 
 from tests.synthetic_asset import sky_of
-from usdbrdf.asset import properties
+from usdbrdf.asset import schemas
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.author import author_record, over
 from usdbrdf.asset.properties import (
@@ -25,12 +25,10 @@ from usdbrdf.asset.properties import (
     Fact,
     FittedObject,
     facts_by_attribute,
-    plugin_path,
-    register,
-    verify,
 )
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.asset.readers.scene import read_record
+from usdbrdf.asset.schemas import plugin_path, register, verify
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.validation.record_rules import allowed_tokens, fit_range, undeclared_attribute
 from usdbrdf.validation.rule import AssetStage
@@ -179,7 +177,7 @@ def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
 
 def test_schemas_of_another_version_are_refused_before_the_first_write(monkeypatch):
     register()
-    monkeypatch.setattr(properties, "SCHEMA_VERSION", 99)
+    monkeypatch.setattr(schemas, "SCHEMA_VERSION", 99)
     with pytest.raises(UsdBrdfError, match=r"version 1.*99.*\[schema\.version\]"):
         verify()
 
@@ -250,7 +248,7 @@ def test_the_package_is_imported_without_usd_and_leaves_its_modules_as_they_are(
 def test_a_late_import_is_explained_at_the_first_write():
     code = (
         "from pxr import Usd; Usd.SchemaRegistry()\n"
-        "import usdbrdf.asset.properties as s\n"
+        "import usdbrdf.asset.schemas as s\n"
         "try: s.verify()\n"
         "except s.UsdBrdfError as error: print(error)"
     )
@@ -262,7 +260,7 @@ def test_a_late_import_is_explained_at_the_first_write():
 def test_a_late_import_is_fine_with_the_environment_variable():
     code = (
         "from pxr import Usd; Usd.SchemaRegistry()\n"
-        "import usdbrdf.asset.properties as s; s.verify(); print('known')"
+        "import usdbrdf.asset.schemas as s; s.verify(); print('known')"
     )
     assert run_python(code, PXR_PLUGINPATH_NAME=str(plugin_path())) == "known"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.validation.faults import FAULTS
-from usdbrdf.asset.properties import plugin_path
+from usdbrdf.asset.schemas import plugin_path
 from usdbrdf.validation.validate import RULES
 
 pytestmark = pytest.mark.skipif(

@@ -9,7 +9,7 @@ import pytest
 from pxr import Sdf, Usd, UsdValidation
 
 from tests.validation.faults import FAULTS
-from usdbrdf.asset.properties import validators_path
+from usdbrdf.asset.schemas import validators_path
 from usdbrdf.cli import main
 from usdbrdf.validation.usd_plugin import PLUGIN, plug_info
 from usdbrdf.validation.validate import RULES

@@ -1,5 +1,5 @@
 """Everything that reads or writes USD."""
 
-from usdbrdf.asset.properties import register
+from usdbrdf.asset.schemas import register
 
 register()

@@ -13,7 +13,8 @@ import numpy as np
 from pxr import Sdf, UsdGeom, Vt
 
 from usdbrdf.asset.layout import Asset, open_metadata
-from usdbrdf.asset.properties import SCHEMA_VERSION, verify
+from usdbrdf.asset.properties import SCHEMA_VERSION
+from usdbrdf.asset.schemas import verify
 from usdbrdf.model.capture import Scan
 
 TIME_CODES_PER_SECOND = 24.0

@@ -10,6 +10,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,13 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         ]
         write_json(staged / "objects.json", {"objects": objects})
         write_json(staged / "transforms.json", _document(scan, names))
+
+
+def as_copied(scan: Scan, asked: Scan) -> Scan:
+    """The scan, whose files are copied as they are, with the poses and objects that were found."""
+    refined, captured = asked.frames.world_from_camera, asked.frames.captured_pose
+    frames = replace(scan.frames, world_from_camera=refined, captured_pose=captured)
+    return replace(scan, frames=frames, mesh=asked.mesh, objects=asked.objects)
 
 
 def _frame_names(frames: Frames) -> list[str]:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from usdbrdf.asset.layout import Asset, relative_path
 from usdbrdf.capture.adapters import refuse_missing
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
+
+
+def parameters_of(options: IngestOptions) -> dict[str, Any]:
+    """What of the options the scan depends on, but for files, whose content counts."""
+    files = ("mesh", "objects", "frames", "allow_outside")
+    parameters = {k: v for k, v in asdict(options).items() if k not in files}
+    return parameters | ({"objects": AUTO} if options.objects == AUTO else {})
 
 
 def inputs_of_captures(

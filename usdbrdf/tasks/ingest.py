@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,11 @@ from usdbrdf.capture.lightings import (
     refuse_other_scenes,
     scan_of_lightings,
 )
-from usdbrdf.capture.native import refuse_taken, write_capture
+from usdbrdf.capture.native import as_copied, refuse_taken, write_capture
 from usdbrdf.errors import UsageError
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.model.capture import Scan
 from usdbrdf.options import AUTO, IngestOptions
-from usdbrdf.tasks.capture_inputs import inputs_of_captures
+from usdbrdf.tasks.capture_inputs import inputs_of_captures, parameters_of
 from usdbrdf.tasks.layers_to_come import write_layers_to_come
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
@@ -58,21 +57,14 @@ def ingest(
             )
         refuse_taken(copy_to, paths[0])
     check_lightings(asset, lightings)
-    parameters: dict[str, Any] = {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in asdict(options).items()
-        if key not in ("mesh", "objects", "frames", "allow_outside")
-    }
-    if options.objects == AUTO:
-        parameters["objects"] = AUTO
+    parameters = parameters_of(options)
     chosen = {
         name: choose_adapter(path, adapter, plugins=plugins) for name, path in captures.items()
     }
     beside = {name: (path, files_beside(chosen[name], path)) for name, path in captures.items()}
     inputs, places = inputs_of_captures(beside, options, asset)
     # Our own adapters change with the version of the code, which every stamp holds.
-    packages = sorted({one.package for one in chosen.values() if one.package})
-    if packages:
+    if packages := sorted({one.package for one in chosen.values() if one.package}):
         parameters["adapter_package"] = ", ".join(packages)
     task = Task(
         asset=asset,
@@ -97,8 +89,8 @@ def ingest(
             scan = replace(scan, frames=frames)
             images = [run.kept.get(file, Path(file)) for file in files]
             scans[name], told[name] = asked_of_its_pixels(scan, images, options)
-            if copy_to is not None:
-                write_capture(_as_asked(scan, scans[name]), images, copy_to)
+            if copy_to:
+                write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
@@ -124,12 +116,5 @@ def ingest(
         scan = replace(scan, frames=frames)
         again = options.refine_poses or options.objects == AUTO
         asked = asked_of_its_pixels(scan, frames.image_paths, options)[0] if again else scan
-        write_capture(_as_asked(scan, asked), frames.image_paths, copy_to)
+        write_capture(as_copied(scan, asked), frames.image_paths, copy_to)
     return result
-
-
-def _as_asked(scan: Scan, asked: Scan) -> Scan:
-    """The scan, whose files are copied as they are, with the poses and objects that were found."""
-    refined, captured = asked.frames.world_from_camera, asked.frames.captured_pose
-    frames = replace(scan.frames, world_from_camera=refined, captured_pose=captured)
-    return replace(scan, frames=frames, mesh=asked.mesh, objects=asked.objects)

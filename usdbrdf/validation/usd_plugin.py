@@ -8,7 +8,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdValidation
 
-from usdbrdf.asset.properties import validators_path
+from usdbrdf.asset.schemas import validators_path
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.validation.rule import AssetStage, Cure, Rule, Severity
 from usdbrdf.validation.validate import RULES
