@@ -88,6 +88,23 @@ def test_gains_masks_and_lenses_of_some_are_none_of_the_others(pair):
     assert frames.photographs == ()
 
 
+def test_the_lens_is_what_those_tell_that_tell_of_it(pair):
+    scans = _scans(*(made.folder for made in pair))
+    assert scan_of_lightings(scans, CREASE).frames.vignetting == (0, 0)
+    night = scans["by_night"]
+    frames = replace(night.frames, vignetting=(-0.3, -0.1))
+    scans["by_night"] = replace(night, frames=frames)
+    assert scan_of_lightings(scans, CREASE).frames.vignetting == pytest.approx((-0.3, -0.1))
+
+
+def test_refusals_quote_any_path(pair):
+    folder = pair[1].folder.rename(pair[1].folder.parent / "by {night}")
+    with edited(folder / "objects.json") as document:
+        document["objects"][0]["name"] = "other"
+    with pytest.raises(InputRefused, match=r"night\}.*: its objects are others"):
+        refuse_other_scenes(_scans(pair[0].folder, folder))
+
+
 def test_all_cameras_tell_which_side_of_a_face_is_the_surface(tmp_path):
     """A sheet wound away from the cameras of the night, who alone see it."""
     made = [make_capture(tmp_path / name, frames=12) for name in ("day", "night")]

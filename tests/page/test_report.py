@@ -14,6 +14,8 @@ from pxr import Usd
 import usdbrdf
 from tests.page.conftest import data_of
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
+from usdbrdf.page import views
 from usdbrdf.page.pictures import part_around
 from usdbrdf.page.report import page, report
 
@@ -76,6 +78,20 @@ def test_a_page_without_photographs_has_none_and_none_of_their_names(room, page_
     assert not any(name in text for name in names)
     assert not any("photograph" in row for row in (*data["objects"], *data["views"]))
     assert "photograph" in data_of(page_file.read_text("utf-8"))["views"][0]
+
+
+def test_without_photographs_pixels_of_nothing_are_black():
+    view = ScoredView(
+        row={"number": 0, "view": "a"},
+        reference=np.ones((4, 6, 3), np.float32),
+        shown=dict.fromkeys(MODELS, np.ones((4, 6, 3), np.float32)),
+        counted=np.arange(6) < np.full((4, 1), 3),
+        errors=dict.fromkeys(MODELS, np.zeros((4, 6), np.float32)),
+    )
+    for model in MODELS:
+        assert (views._shown(view, True).pictures[model] == 255).all()
+        private = views._shown(view, False).pictures[model]
+        np.testing.assert_array_equal(private[..., 0] == 255, view.counted)
 
 
 def test_what_an_asset_is_called_is_no_part_of_the_page(page_file):

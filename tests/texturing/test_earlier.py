@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import usdbrdf
 from tests.scenes import make_capture
+from usdbrdf.capture.adapters import read_scan
 from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.texturing import earlier
 
 NUM_FRAMES, FIRST = 12, 9
 
@@ -71,6 +74,13 @@ def test_a_frame_that_changed_or_went_means_all_from_the_start(made, tmp_path, c
     assert "goes on" not in said
     _textured(made, tmp_path / "anew", range(1, NUM_FRAMES), capsys)
     assert _maps(out) == _maps(tmp_path / "anew")
+
+
+def test_frames_through_another_lens_are_others(made):
+    frames = read_scan(made.folder, usdbrdf.IngestOptions()).frames
+    darker = replace(frames, vignetting=(-0.2, 0.0))
+    of_lens, of_none = (earlier._hashes_of_frames(some) for some in (darker, frames))
+    assert not set(of_lens) & set(of_none)
 
 
 def test_damaged_statistics_are_as_good_as_none(made, tmp_path, capsys):

@@ -68,10 +68,20 @@ class Asset:
 
     @property
     def lightings(self) -> tuple[str, ...]:
-        """The lightings of the scene, as ingest recorded them; () where there is but one."""
+        """The lightings of the scene, as ingest recorded them; () where there is but one, or
+        nobody can tell."""
+        return self.recorded_lightings or ()
+
+    @property
+    def recorded_lightings(self) -> tuple[str, ...] | None:
+        """The same; None where there is no scan, or none that can be read."""
         scan = self.layer("scan")
-        record = open_metadata(scan).customLayerData.get("usdbrdf", {}) if scan.is_file() else {}
-        return tuple(record.get("lightings", ()))
+        if not scan.is_file():
+            return None
+        with suppress(InputRefused):
+            record = open_metadata(scan).customLayerData.get("usdbrdf", {})
+            return tuple(record.get("lightings", ()))
+        return None
 
     @property
     def in_each_lighting(self) -> tuple[Asset, ...]:

@@ -94,31 +94,38 @@ def refuse_other_scenes(scans: Mapping[str, Scan]) -> None:
 
 
 def _refuse_another_scene(first: Scan, other: Scan) -> None:
-    refused = f"{other.source}: its {{}} than those of {first.source}. Lightings of one scene share"
+
+    def refused(what: str, cure: str) -> InputRefused:
+        return InputRefused(
+            f"{other.source}: its {what} than those of {first.source}. Lightings of one scene "
+            f"share their {cure}"
+        )
+
     points, theirs = (scan.mesh.points[: captured_points(scan)] for scan in (first, other))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     alike = points.shape == theirs.shape and np.abs(points - theirs).max() <= _ROUNDING * size
     one, another = captured_faces(first), captured_faces(other)
     if not alike or not np.array_equal(one[0], another[0]):
         counts = f"{len(another[0])} triangles are others"
-        raise InputRefused(
-            f"{refused.format(counts)} their mesh: bring both into one frame, and name one mesh "
-            "for both with --mesh. [lighting.mesh]"
+        raise refused(
+            counts,
+            "mesh: bring both into one frame, and name one mesh for both with --mesh. "
+            "[lighting.mesh]",
         )
     if first.objects != other.objects or not np.array_equal(one[1], another[1]):
-        raise InputRefused(
-            f"{refused.format('objects are others')} their objects: name one objects.json for both "
-            "with --objects. [lighting.objects]"
+        raise refused(
+            "objects are others",
+            "objects: name one objects.json for both with --objects. [lighting.objects]",
         )
     units = [
         (scan.meters_per_unit, scan.up_axis, scan.frames.encoding, scan.frames.radiometric)
         for scan in (first, other)
     ]
     if units[0] != units[1]:
-        raise InputRefused(
-            f"{refused.format('units or encoding are others')} length of a unit, up axis and "
-            "encoding of the images. State the same with the options, or convert one of the "
-            "captures. [lighting.units]"
+        raise refused(
+            "units or encoding are others",
+            "length of a unit, up axis and encoding of the images. State the same in options, "
+            "or convert one of the captures. [lighting.units]",
         )
 
 
@@ -142,8 +149,9 @@ def _joined(scans: Mapping[str, Scan]) -> Frames:
             f.world_from_camera if f.captured_pose is None else f.captured_pose for f in several
         ]
         columns["captured_pose"] = np.concatenate(poses)
-    # One lens took them all.
-    columns["vignetting"] = tuple(np.mean([f.vignetting for f in several], axis=0).tolist())
+    # One lens took them all, and not all tell clearly what it does.
+    told = [frames.vignetting for frames in several if any(frames.vignetting)]
+    columns["vignetting"] = tuple(np.mean(told or [(0.0, 0.0)], axis=0).tolist())
     return replace(
         several[0],
         image_paths=tuple(path for frames in several for path in frames.image_paths),

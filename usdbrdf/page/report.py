@@ -113,8 +113,9 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
     with TemporaryDirectory(prefix="usdbrdf-") as folder:
         views = _asked_views(place, atlas, options, Path(folder))
-        if options.evaluation is None:
-            shown, rows = rendered_views(seen, views)
+        # Pictures of ``evaluate`` are the photograph where the model has nothing to show.
+        if options.evaluation is None or not pictures:
+            shown, rows = rendered_views(seen, views, pictures)
         else:
             shown, rows = evaluated_views(options.evaluation, place)
     return {
@@ -131,7 +132,11 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             "texels": len(atlas.texels),
         },
         "findings": findings(found, words, bool(frames.radiometric)),
-        "warnings": warnings_of(found),
+        "warnings": [
+            sentence
+            for sentence in warnings_of(found)
+            if pictures or not any(path.name in sentence for path in frames.image_paths)
+        ],
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
         "map": room_map(atlas, seen.lit, atlas.map_where_present(colours, 3), up_axis),
         "objects": object_rows(

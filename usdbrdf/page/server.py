@@ -40,7 +40,13 @@ class PageServer:
             def do_GET(self) -> None:
                 if self._refused(at_page):
                     return
-                self._answer(200, document(at_review).encode("utf-8"), "text/html; charset=utf-8")
+                try:
+                    with writing:
+                        page = document(at_review)
+                except UsdBrdfError as error:
+                    self._answer(500, str(error).encode("utf-8"))
+                else:
+                    self._answer(200, page.encode("utf-8"), "text/html; charset=utf-8")
 
             def do_POST(self) -> None:
                 if self._refused(at_review):

@@ -63,8 +63,11 @@ def unnamed(row: Mapping[str, Any], photographs: bool) -> dict[str, Any]:
     return {k: v for k, v in row.items() if photographs or k not in ("name", "view")}
 
 
-def rendered_views(seen: ViewedAsset, views: Views) -> tuple[list[ShownView], list[figures.Row]]:
-    """The views that are shown, and rows of those that are plotted, which are smaller."""
+def rendered_views(
+    seen: ViewedAsset, views: Views, photographs: bool
+) -> tuple[list[ShownView], list[figures.Row]]:
+    """The views that are shown, and rows of those that are plotted, which are smaller. Without
+    ``photographs`` nothing of them stands where the model has nothing to show."""
     count = len(views.names)
     shown, plotted = spread_evenly(count, SHOWN), spread_evenly(count, _PLOTTED)
     taken = [*shown, *plotted]
@@ -77,13 +80,15 @@ def rendered_views(seen: ViewedAsset, views: Views) -> tuple[list[ShownView], li
             scored_views(seen, asked, exposure, _PICTURE, widths), taken, strict=True
         )
     ]
-    return [_shown(view) for view in scored[: len(shown)]], [v.row for v in scored[len(shown) :]]
+    pictures = [_shown(view, photographs) for view in scored[: len(shown)]]
+    return pictures, [view.row for view in scored[len(shown) :]]
 
 
-def _shown(view: ScoredView) -> ShownView:
+def _shown(view: ScoredView, photographs: bool) -> ShownView:
+    own = view.counted[..., None] | photographs
     pictures = {_PHOTOGRAPH: as_bytes(view.reference)}
     for model in MODELS:
-        pictures[model] = as_bytes(view.shown[model])
+        pictures[model] = as_bytes(np.where(own, view.shown[model], 0))
         pictures[f"flip_{model}"] = figures.magma(view.errors[model], view.counted)
     return ShownView(row=view.row, pictures=pictures)
 

@@ -57,7 +57,7 @@ def ingest(
             )
         refuse_taken(copy_to, paths[0])
     check_lightings(asset, lightings)
-    parameters = parameters_of(options)
+    parameters = parameters_of(options) | ({"lightings": [*lightings]} if lightings else {})
     chosen = {
         name: choose_adapter(path, adapter, plugins=plugins) for name, path in captures.items()
     }

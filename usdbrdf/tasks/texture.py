@@ -45,7 +45,9 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
             going_on = GoingOn.afresh(run, frames, charts_of_lightings(maps))
         else:
             new = partial(new_charts, maps, rays, options)
-            going_on = GoingOn.of(run, scene, frames, task.parameters, new)
+            # The input's own texture coordinates may be taken over.
+            made_for = {**task.parameters, "geometry": task.inputs.get("geometry", "")}
+            going_on = GoingOn.of(run, scene, frames, made_for, new)
         charts = going_on.charts
         scene = replace(scene, corner_uv=charts["corner_uv"])
         surface = TexturedScene(scene, texels_from_atlas(scene, charts["resolution"]), rays)

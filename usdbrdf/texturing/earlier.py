@@ -110,12 +110,15 @@ def _named(part: slice) -> str:
 
 def _hashes_of_frames(frames: Frames) -> list[str]:
     gain = np.ones(len(frames)) if frames.gain is None else frames.gain
+    lens = np.array(frames.vignetting, np.float64)
     rows = zip(
         frames.world_from_camera, frames.intrinsics, frames.resolution,
         frames.saturation_radiance, frames.noise_floor_radiance, gain, strict=True,
     )  # fmt: skip
     return [
-        _hash_of([frames.encoding, sha256_of(path), *(np.asarray(n).tobytes() for n in row)])
+        _hash_of(
+            [frames.encoding, sha256_of(path), *(np.asarray(n).tobytes() for n in (*row, lens))]
+        )
         for path, row in zip(frames.image_paths, rows, strict=True)
     ]
 

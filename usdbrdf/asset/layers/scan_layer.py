@@ -107,9 +107,9 @@ def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
 def check_lightings(asset: Asset, lightings: Sequence[str]) -> None:
     """Raise if the asset is there and shows other lightings than these, or none by a name: what
     was made of the others would stay in it. New ones may join."""
-    if not asset.layer("scan").is_file():
+    known = asset.recorded_lightings
+    if known is None:
         return
-    known = asset.lightings
     if bool(known) != bool(lightings) or set(known) - set(lightings):
         there = f"has the lightings {', '.join(known)}" if known else "has one lighting"
         new = ", ".join(lightings) if lightings else "one alone"

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import LIGHTING, Asset
 from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.capture.camera_checks import refuse_rays_that_miss
 from usdbrdf.capture.checks import (
@@ -101,6 +101,8 @@ def photographs_of_views(
     Photographs through lenses become pinhole frames below ``folder``, as those of a capture do.
     """
     captured = frames_from_stage(stage)
+    lighting = stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection()
+    captured = captured.at(captured.of_lighting(str(lighting)))
     findings = Findings()
     options = IngestOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
@@ -113,6 +115,7 @@ def photographs_of_views(
         records = [_as_the_captures_photographs(r, captured) for r in records]
     _refuse_none(len(records), findings, source)
     taken = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
+    taken = replace(taken, vignetting=captured.vignetting)
     taken.world_from_camera[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
     frames, views, photograph_of = frames_of_photographs(taken, records)
     mesh = ScanMesh(
