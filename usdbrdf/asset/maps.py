@@ -136,10 +136,14 @@ class AssetMaps:
         return frames_from_stage(self.stage)
 
     @property
+    def lighting(self) -> str:
+        """The lighting that the stage is in; "" where there is but one."""
+        return str(self.stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection())
+
+    @property
     def own_frames(self) -> range:
         """The numbers of ``frames`` among those of all lightings."""
-        lighting = self.stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection()
-        return self.all_frames.of_lighting(str(lighting))
+        return self.all_frames.of_lighting(self.lighting)
 
     @cached_property
     def scene(self) -> Scene:

@@ -41,22 +41,23 @@ def refuse_one_frame(options: FitOptions) -> None:
 def fit(asset: Asset, options: FitOptions) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps; of
     several lightings one material of all, and the maps of each."""
-    each = asset.in_each_lighting
-    if len(each) > 1:
+    maps = [AssetMaps(open_weaker(one, "material")) for one in asset.in_each_lighting]
+    if len(maps) > 1:
         refuse_one_frame(options)
-    maps = [AssetMaps(open_weaker(one, "material")) for one in each]
     # S is refined as it was filtered, if the filter is here too.
-    shading = [read_provenance(one.layer("shading")).get("parameters", {}) for one in each]
-    filtered = options.method == "views" and all(made.get("denoise") == OIDN for made in shading)
+    told = [read_provenance(one.layer("shading")) for one in asset.in_each_lighting]
+    filters = [provenance.get("parameters", {}).get("denoise") for provenance in told]
+    filtered = options.method == "views" and all(name == OIDN for name in filters)
     lightmap_filter = chosen_filter(AUTO) if filtered else NONE
     chosen = {k: v for k, v in asdict(options).items() if k != "memory"}
     chosen["environment"] = kind_of_light(options.environment)
     inputs: dict[str, str] = {}
-    for one, own in zip(each, maps, strict=True):
-        read = (*_READ, *_WEIGHED) if len(each) > 1 else _READ
+    read = (*_READ, *_WEIGHED) if len(maps) > 1 else _READ
+    for own in maps:
         inputs |= hashes_of_inputs(
-            one, "material", own, aovs=read, photographs=True, environment=options.environment
-        )
+            replace(asset, lighting=own.lighting), "material", own,
+            aovs=read, photographs=True, environment=options.environment,
+        )  # fmt: skip
     task = Task(
         asset=asset,
         name="fit",
@@ -72,7 +73,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
             Lighting(
                 scene,
                 survey_frames(
-                    run.part(one.lighting),
+                    run.part(own.lighting),
                     scene,
                     own.coverage.measured & ~own.emissive,
                     reader,
@@ -81,7 +82,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
                 ),
                 own.irradiance,
             )
-            for one, own, scene in zip(each, maps, lit, strict=True)
+            for own, scene in zip(maps, lit, strict=True)
         ]
         lobe, found = fitted_by_likelier_lobe(run, lightings, reader, options)
         microfacet = lobe != PAPER
@@ -105,7 +106,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         say(f"fit: {measured} of {len(objects)} objects measured")
         if options.method == "views":
             lit = [replace(scene, lobe=lobe) for scene in lit]
-            objects = refined_objects(run, task, each, maps, lit, reader, objects, options)
+            objects = refined_objects(run, task, maps, lit, reader, objects, options)
         layer = run.output(f"layers/{asset.layer('material').name}")
         networks = run.output(f"layers/{asset.materialx_layer.name}") if options.materialx else None
         write_material_layer(layer, task.draft, objects, materialx=networks)

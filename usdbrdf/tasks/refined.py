@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from usdbrdf.asset.layers.task_layers import write_refined_layer
-from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
 from usdbrdf.files.frames import FrameReader
@@ -22,7 +21,6 @@ from usdbrdf.transport.lit_scene import LitScene
 def refined_objects(
     run: TaskRun,
     task: Task,
-    each: Sequence[Asset],
     maps: Sequence[AssetMaps],
     lit: Sequence[LitScene],
     reader: FrameReader,
@@ -37,8 +35,8 @@ def refined_objects(
         conducts=np.array([item.is_metal for item in objects], np.bool_),
     )
     lightings = [
-        Lighting(one.lighting, scene, own, own.own_frames)
-        for one, scene, own in zip(each, lit, maps, strict=True)
+        Lighting(own.lighting, scene, own, own.own_frames)
+        for scene, own in zip(lit, maps, strict=True)
     ]
     refined = refined_light(
         run, lightings, reader, lobes, task.parameters["denoise"], options.memory, options.seed
@@ -53,13 +51,14 @@ def refined_objects(
         }
         for found in refined
     ]
-    if len(each) == 1:
+    if len(maps) == 1:
         shared = own_maps.pop() | shared
     writer, with_maps = MapWriter(run, task.asset, scene, texels), []
     for i, item in enumerate(objects):
         mean = colour(texels.mean_of_object(i, base_color))
         with_maps.append(replace(item, aovs=writer.write(i, shared), mean_color=mean))
-    for one, made in zip(each, own_maps, strict=False):
+    for own, made in zip(maps, own_maps, strict=False):
+        one = replace(task.asset, lighting=own.lighting)
         writer = MapWriter(run, one, scene, texels)
         in_light = [
             MeasuredObject(
