@@ -129,6 +129,8 @@ export async function start(canvas, room, colours, pick) {
     const frame = canvas.getBoundingClientRect();
     const point = new Vector2(
       (2 * (x - frame.left)) / frame.width - 1, 1 - (2 * (y - frame.top)) / frame.height);
+    // The camera may have turned since the last picture.
+    camera.updateMatrixWorld();
     caster.setFromCamera(point, camera);
     const hit = caster.intersectObjects(meshes, false)[0];
     pick(hit ? hit.object.userData.prim : null);
