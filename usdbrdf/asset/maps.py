@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Ar, Usd, UsdGeom
 
-from usdbrdf.asset.layout import LIGHTING, Asset
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov
 from usdbrdf.asset.readers.scene import (
     aov_path,
     frames_from_stage,
     light_from_outside,
+    lighting_of_stage,
     scene_from_stage,
 )
 from usdbrdf.errors import InputRefused
@@ -138,7 +139,7 @@ class AssetMaps:
     @property
     def lighting(self) -> str:
         """The lighting that the stage is in; "" where there is but one."""
-        return str(self.stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection())
+        return lighting_of_stage(self.stage)
 
     @property
     def own_frames(self) -> range:

@@ -157,9 +157,10 @@ def read_recorded(
     return recorded, unknown, int(ringing.sum())
 
 
-def read_frames(
-    read: Callable[[int], FramePixels], order: Sequence[int]
-) -> Iterator[tuple[int, FramePixels]]:
+Read = Callable[[int], FramePixels]
+
+
+def read_frames(read: Read, order: Sequence[int]) -> Iterator[tuple[int, FramePixels]]:
     """Number and pixels of the frames of ``order``, the next ones decoded while one is used."""
     with ThreadPoolExecutor(max_workers=_READERS) as readers:
         coming = deque((i, readers.submit(read, i)) for i in order[:_AHEAD])

@@ -41,19 +41,19 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
     except UsdBrdfError as error:
         say(f"report: without the room in 3D: {error}")
         return None
+    exposure = display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1))
     packed = gzip.compress(content, compresslevel=6, mtime=0)
     return {
         "glb": base64.b64encode(packed).decode("ascii"),
-        "lit": lit_pictures(atlas),
-        "exposure": display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1)),
+        "lit": lit_pictures(atlas, exposure),
+        "exposure": exposure,
         "irradiance": _typical_irradiance(atlas),
         "lamps": lamps(atlas, up_axis),
     }
 
 
-def lit_pictures(atlas: AssetMaps) -> dict[str, str]:
+def lit_pictures(atlas: AssetMaps, exposure: float) -> dict[str, str]:
     """By prim path its lit texture, one exposure for all."""
-    exposure = display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1))
     found, light = {}, atlas.light
     for i, obj in enumerate(atlas.scene.objects):
         image = atlas.texels.image(i, light)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.parts import objects_with_faces
-from usdbrdf.files.frames import FramePixels, read_frames
+from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.geometry.segment_colours import colours_of_faces, divided_by_colour
 from usdbrdf.geometry.segments import links_of_faces, segments_of_mesh
 from usdbrdf.job.progress import progress, say
@@ -26,7 +26,7 @@ _FRAMES, _MOST_NUMBERS = 32, 1 << 26
 
 
 def segmented(
-    mesh: ScanMesh, turned: Bool | None, frames: Frames, read: Callable[[int], FramePixels]
+    mesh: ScanMesh, turned: Bool | None, frames: Frames, read: Read
 ) -> tuple[ScanMesh, tuple[ObjectLabel, ...], dict[str, Any]]:
     """The mesh divided into objects, these, and how many of each kind, for the record.
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.files.frames import FramePixels, read_frames
+from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.capture import Scan
 from usdbrdf.texturing.agreement import points_of_surface
@@ -26,9 +25,7 @@ from usdbrdf.transport.rays import RayScene
 _ASKED, _LISTED = 32, 6
 
 
-def asked_of_its_optics(
-    scan: Scan, read: Callable[[int], FramePixels], *, estimate: bool
-) -> tuple[Scan, dict[str, Any]]:
+def asked_of_its_optics(scan: Scan, read: Read, *, estimate: bool) -> tuple[Scan, dict[str, Any]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; and what was found, of
     which the user is told where it is much: stops that corners are darker by, and that the balance
     of red or blue to green is off by in the worst frame."""

@@ -14,7 +14,7 @@ import numpy as np
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import read_frame, read_frames
+from usdbrdf.files.frames import Read, read_frame, read_frames
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
@@ -22,7 +22,7 @@ from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
-from usdbrdf.tasks.poses import Read, with_refined_poses
+from usdbrdf.tasks.poses import with_refined_poses
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from usdbrdf.files.frames import FramePixels, read_frames
+from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress, say
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
@@ -18,7 +17,6 @@ from usdbrdf.texturing.pose_samples import logarithms
 from usdbrdf.texturing.pose_steps import refined_poses
 from usdbrdf.transport.rays import RayScene
 
-Read = Callable[[int], FramePixels]
 # Pixels of a picture's width, and of all pictures, that poses are refined with, at most.
 _MOST_ACROSS, _MOST_PIXELS = 1024, 1 << 27
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
+from usdbrdf.asset.layout import LIGHTING
 from usdbrdf.asset.properties import (
     AOV,
     CAPTURE,
@@ -47,6 +48,11 @@ LENS = (
     "verticalApertureOffset",
 )
 _IMAGE = CAPTURE.attribute(CAPTURE.key)
+
+
+def lighting_of_stage(stage: Usd.Stage) -> str:
+    """The lighting that is selected; "" where there is but one."""
+    return str(stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection())
 
 
 def frames_from_stage(stage: Usd.Stage) -> Frames:

@@ -15,8 +15,8 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.layout import LIGHTING, Asset
-from usdbrdf.asset.readers.scene import frames_from_stage
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.scene import frames_from_stage, lighting_of_stage
 from usdbrdf.capture.camera_checks import refuse_rays_that_miss
 from usdbrdf.capture.checks import (
     Findings,
@@ -101,8 +101,7 @@ def photographs_of_views(
     Photographs through lenses become pinhole frames below ``folder``, as those of a capture do.
     """
     captured = frames_from_stage(stage)
-    lighting = stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection()
-    captured = captured.at(captured.of_lighting(str(lighting)))
+    captured = captured.at(captured.of_lighting(lighting_of_stage(stage)))
     findings = Findings()
     options = IngestOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
