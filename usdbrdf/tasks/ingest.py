@@ -89,6 +89,7 @@ def ingest(
             scan = replace(scan, frames=frames)
             images = [run.kept.get(file, Path(file)) for file in files]
             scans[name], told[name] = asked_of_its_pixels(scan, images, options)
+            warnings += told[name].pop("warnings")
             if copy_to:
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)

@@ -15,7 +15,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import segmented
-from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
+from usdbrdf.tasks.photometry import ASKED, agreement_of_frames, doubts_about_agreement
 
 
 def inspect(
@@ -32,6 +32,8 @@ def inspect(
             frames = developed_in(found.frames.at(asked), views, Path(folder))
             read = partial(read_frame, frames)
             agrees = agreement_of_frames(found.mesh, frames, read, capture)
+            doubts = tuple(doubts_about_agreement(agrees, capture))
+            found = replace(found, warnings=(*found.warnings, *doubts))
             if options.objects == AUTO:
                 every = developed_in(found.frames, found.views, Path(folder))
                 read = partial(read_frame, every)
