@@ -303,6 +303,14 @@ class EvaluateOptions(Options):
         return math.isqrt(self.samples_per_pixel)
 
 
+class CompareOptions(Options):
+    """What of two assets is compared."""
+
+    lighting: str | None = _lighting()
+    other_lighting: str | None = option("--other-lighting NAME", None, unset="the one it opens in")
+    "the same of OTHER"
+
+
 class Insert(Options):
     """A model and what to do with it, lengths in units of the asset's stage. UsageError where it is
     placed in two ways, or where a matrix comes with a scale or a rotation, which it holds itself.
@@ -413,6 +421,7 @@ class ReportOptions(Options):
     photographs: bool = option("--no-photographs", True)
     "leave all photographs out, and what they look like beside the model's pictures"
     environment: Surroundings = _environment()
+    lighting: str | None = _lighting()
     seed: int = _seed()
     allow_outside: tuple[Path, ...] = _allow_outside()
 

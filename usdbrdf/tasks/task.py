@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.progress import say, warn
-from usdbrdf.job.stamp import code_version
+from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 Options = TypeVar("Options")
@@ -59,7 +59,7 @@ class Task:
         """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
         return run_task(
             self.asset.folder,
-            f"{self.name}@{self.asset.lighting}" if self.asset.lighting else self.name,
+            name_in_lighting(self.name, self.asset.lighting),
             order=1 + ROLES.index(self.role),
             parameters=self.parameters,
             inputs=self.inputs,

@@ -38,6 +38,7 @@
     }
     if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
     const told = [
+      ...(facts.lighting ? [['Lighting', facts.lighting]] : []),
       ['Photographs', `${facts.frames}, ${facts.resolution.join(' \u00d7 ')} pixels, ${facts.encoding}`],
       ['Read as', facts.adapter || 'unknown'],
       ['Radiometric', facts.radiometric ? 'yes' : 'no: numbers are relative'],
