@@ -38,6 +38,7 @@ class FrameRecord:
                        that bends becomes one pinhole frame or several
     mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
                        not used; or None
+    captured_pose      world_from_camera before somebody refined it; None where it is as captured
     """
 
     name: str
@@ -50,12 +51,16 @@ class FrameRecord:
     noise_floor_radiance: float = 0.0
     lens: Lens = PINHOLE
     mask_path: Path | None = None
+    captured_pose: Double | None = None
 
 
 def frames_from_records(
     records: Sequence[FrameRecord], *, encoding: str, radiometric: bool
 ) -> Frames:
+    """The rows together. Poses count as refined where all are."""
+    captured = [r.captured_pose for r in records if r.captured_pose is not None]
     return Frames(
+        captured_pose=np.array(captured) if 0 < len(captured) == len(records) else None,
         image_paths=tuple(r.image_path for r in records),
         world_from_camera=np.array([r.world_from_camera for r in records]).reshape(-1, 4, 4),
         intrinsics=np.array([r.intrinsics for r in records], np.float64).reshape(-1, 4),
@@ -237,20 +242,33 @@ def rigid_records(
             said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
             findings.drop(record.name, said, "capture.camera")
         else:
-            axes = pose[:3, :3] / (pose_scale or 1.0)
-            worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
-            rigid = pose.copy()
-            if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
-                left, _, right = np.linalg.svd(axes)
-                axes = left @ right
-            rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
-            kept.append(replace(record, world_from_camera=rigid))
+            rigid, off = _made_rigid(pose, record.name, source, pose_scale)
+            worst = max(worst, off)
+            captured = record.captured_pose
+            if captured is not None:
+                captured = _made_rigid(captured, record.name, source, pose_scale)[0]
+            kept.append(replace(record, world_from_camera=rigid, captured_pose=captured))
     if worst > _ROUNDING:
         findings.warn(
             f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
             "made rigid. [capture.pose]"
         )
     return kept
+
+
+def _made_rigid(
+    pose: Double, name: str, source: Path, pose_scale: float | None
+) -> tuple[Double, float]:
+    """An almost rigid pose made exactly so, and how far its axes were off; InputRefused for
+    others."""
+    axes = pose[:3, :3] / (pose_scale or 1.0)
+    off = _refuse_not_rigid(axes, name, source, pose_scale)
+    if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
+        left, _, right = np.linalg.svd(axes)
+        axes = left @ right
+    rigid = pose.copy()
+    rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
+    return rigid, off
 
 
 def is_camera_matrix(pose: Double) -> bool:

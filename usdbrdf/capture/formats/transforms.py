@@ -274,6 +274,7 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         name=name,
         image_path=path,
         world_from_camera=_undo_applied_transform(capture, pose),
+        captured_pose=_captured_pose(capture, frame, name),
         intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
         lens=lens,
@@ -300,6 +301,19 @@ def _pose(matrix: object) -> Double | None:
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
     return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def _captured_pose(capture: _Capture, frame: Mapping[str, Any], name: str) -> Double | None:
+    """The pose before it was refined, which says that it was."""
+    stated = frame.get("captured_transform_matrix")
+    pose = _pose(stated)
+    if stated is not None and (pose is None or not is_camera_matrix(pose)):
+        raise capture.refuse(
+            f"the captured_transform_matrix of the frame {name!r} is not a matrix of 4 x 4 finite "
+            "and sensible numbers. Correct or remove it.",
+            "capture.pose",
+        )
+    return None if pose is None else _undo_applied_transform(capture, pose)
 
 
 def _intrinsics(
