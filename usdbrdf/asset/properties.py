@@ -179,6 +179,10 @@ class Photographs:
         photograph: its curve and its numbers that are not 0, in pixels fx, fy, cx and cy; k, d, p
         and s are radial, dividing, tangential and prism terms as OpenCV has them.""",
         samples="changes", when=lambda taken: any(taken.lens))]
+    photograph_encoding: Annotated[str, Fact(CAPTURE, "photographEncoding", "token", "", """Colour
+        space of the photographs that images were resampled from, in OpenColorIO's names; empty
+        where the images are the photographs themselves.""",
+        when=lambda taken: bool(taken.photograph_encoding))]
     lighting: Annotated[Sequence[str], Fact(CAPTURE, "lighting", "string", "", """Which lighting of
         the scene the photograph shows, a variant of the set lighting; empty where there is but
         one.""", samples="changes", when=lambda taken: any(taken.lighting))]

@@ -117,7 +117,7 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
     """The frames with images below ``folder``; those that are ``views`` of photographs (see
     ``Scan``) are handed to ``place``, one after the other.
 
-    Images keep the encoding of the photographs, but for 8-bit ones, which become linear.
+    Images keep the encoding of the photographs where that is linear; others become linear.
     """
     if not any(views):
         return frames
@@ -131,6 +131,7 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
         frames,
         image_paths=tuple(folder / path for path in frames.image_paths),
         encoding=frames.encoding if stays else "lin_rec709_scene",
+        photograph_encoding=frames.encoding,
     )
 
 

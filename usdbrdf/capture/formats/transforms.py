@@ -145,17 +145,10 @@ def frame_records(
     """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
 
     Those without pose or file are in ``findings``; poses are not yet known to be rigid. Without
-    ``images`` no file is asked for where the document itself states width and height, and lenses
-    that bend light are refused: nothing is rendered through them.
+    ``images`` no file is asked for where the document itself states width and height.
     """
     source = source.resolve()
     _, records = _captured(source, options, findings, images=images)
-    bent = next((record for record in records if record.lens.bends), None)
-    if bent is not None and not images:
-        raise InputRefused(
-            f"{source}: the view {bent.name!r} has a lens that bends light. Undistort the images "
-            "to a pinhole camera first. [capture.camera]"
-        )
     return at_image_size(records, findings, source) if images else records
 
 
