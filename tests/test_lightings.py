@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
 import usdbrdf
 from tests.scenes import make_capture, poses_down_and_up
+from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_edited, open_measured
@@ -222,6 +223,27 @@ def test_lightings_of_one_asset_are_compared(asset, tmp_path):
     # One base colour for both, but S and L_d of each.
     assert found["diffuse"]["albedo"]["nrmse"] == 0
     assert found["lit"]["relit_a"] != found["lit"]["relit_b"]
+
+
+def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
+    folder = tmp_path / "room"
+    shutil.copytree(asset.folder, folder)
+    copy, name = Asset.made(folder), "/room/geo/floor.usdBrdf:shading:raysPerTexel"
+    edited = copy.in_lighting("night").layer("shading")
+    layer = Sdf.Layer.OpenAsAnonymous(str(edited))
+    layer.GetAttributeAtPath(name).default = 7777.0
+    layer.Export(str(edited))
+    (adopted,) = adopt(copy, [edited])
+    shutil.copyfile(asset.in_lighting("night").layer("shading"), edited)
+    edits = Sdf.Layer.OpenAsAnonymous(str(copy.edits_layer))
+    edits.subLayerPaths.append(f"./{adopted.name}")
+    edits.Export(str(copy.edits_layer))
+    seen = [
+        open_edited(copy.in_lighting(lighting)).GetAttributeAtPath(name).Get()
+        for lighting in LIGHTINGS
+    ]
+    own = open_edited(asset.in_lighting("day")).GetAttributeAtPath(name).Get()
+    assert seen == [own, 7777.0]
 
 
 def test_other_lightings_need_another_folder(base, asset, captures):
