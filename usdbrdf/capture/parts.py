@@ -44,7 +44,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
-from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.options import AUTO, CaptureOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
@@ -173,7 +173,7 @@ def objects_with_faces(
 
 def geometry_from_usd(
     path: Path,
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     capture_root: Path,
@@ -223,7 +223,7 @@ def geometry_from_usd(
 def geometry_from_file(
     mesh_path: Path,
     objects: Path | Literal["auto"] | Callable[[FileMesh], LabelTable] | None,
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     capture_root: Path,
@@ -307,7 +307,7 @@ def _recalling(read: Callable[P, Scan]) -> Callable[P, Scan]:
 def scan_from_parts(
     records: Sequence[FrameRecord],
     read_geometry: Callable[[], ScanGeometry],
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     name: str,
@@ -451,7 +451,7 @@ def _exposure_of_file(path: Path) -> float | None:
 
 
 def radiance_encoding(
-    options: IngestOptions, *, photographs: bool, stated: str | None = None
+    options: CaptureOptions, *, photographs: bool, stated: str | None = None
 ) -> str:
     """Colour space of the images: the options', that which the capture states, or the usual one;
     UsageError where the options contradict the images."""

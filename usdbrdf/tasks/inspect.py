@@ -14,7 +14,7 @@ from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.options import AUTO, InspectOptions
-from usdbrdf.tasks.objects import segmented
+from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames, doubts_about_agreement
 
 
@@ -35,9 +35,11 @@ def inspect(
             doubts = tuple(doubts_about_agreement(agrees, capture))
             found = replace(found, warnings=(*found.warnings, *doubts))
             if options.objects == AUTO:
-                every = developed_in(found.frames, found.views, Path(folder))
-                read = partial(read_frame, every)
-                mesh, objects, _ = segmented(found.mesh, None, every, read)
+                asked = frames_that_tell_colours(found.mesh, len(found.frames))
+                views = [found.views[i] for i in asked] if found.views else []
+                frames = developed_in(found.frames.at(asked), views, Path(folder))
+                read = partial(read_frame, frames)
+                mesh, objects, _ = segmented(found.mesh, found.own_faces, frames, read)
                 found = replace(found, mesh=mesh, objects=objects)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))

@@ -13,6 +13,7 @@ import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
+from usdbrdf.capture.native import own_faces
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frame, read_frames
 from usdbrdf.job.progress import progress
@@ -60,7 +61,7 @@ def asked_of_its_pixels(
         warnings += warned(doubts_about_exposures(off, scan))
         read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.objects == AUTO:
-        mesh, objects, found = segmented(scan.mesh, scan.turned_faces, scan.frames, read)
+        mesh, objects, found = segmented(scan.mesh, own_faces(scan), scan.frames, read)
         scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
     return scan, told
 

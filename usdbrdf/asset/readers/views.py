@@ -38,7 +38,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 # A reference may leave much of a picture unknown; a view that holds next to nothing is dropped.
 _MAX_UNKNOWN = 0.999
@@ -59,7 +59,7 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
     need not exist where the document states width and height. InputRefused where a view cannot be
     used, or two have images of one name."""
     findings = Findings()
-    records = _rigid_records(source, asset, IngestOptions(), findings, images=False)
+    records = _rigid_records(source, asset, CaptureOptions(), findings, images=False)
     if findings.dropped:
         first = findings.dropped[0]
         raise InputRefused(
@@ -109,7 +109,7 @@ def photographs_of_views(
     captured = frames_from_stage(stage)
     captured = captured.at(captured.of_lighting(lighting_of_stage(stage)))
     findings = Findings()
-    options = IngestOptions(allow_outside=allow_outside)
+    options = CaptureOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
     records = with_masks(records, findings)
     total = len(records) + len(findings.dropped)
@@ -148,7 +148,7 @@ def photographs_of_views(
 
 
 def _rigid_records(
-    source: Path, asset: Asset, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, asset: Asset, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> list[FrameRecord]:
     """The usable frames of a document, in the capture's unit; the others are in ``findings``."""
     records = frame_records(source, options, findings, images=images)

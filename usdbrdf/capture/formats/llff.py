@@ -25,7 +25,7 @@ from usdbrdf.capture.formats.named_pictures import (
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import read_array
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "llff"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -37,7 +37,7 @@ def matches(path: Path) -> bool:
     return (path / "poses_bounds.npy").is_file()
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     source = folder / "poses_bounds.npy"
     if not source.is_file():

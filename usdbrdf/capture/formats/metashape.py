@@ -33,7 +33,7 @@ from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, r
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "metashape"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -55,7 +55,7 @@ def _documents(path: Path) -> list[Path]:
     return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     documents = _documents(path.resolve())
     if len(documents) != 1:
         said = f"{len(documents)} exports of cameras" if documents else "no export of cameras"

@@ -27,7 +27,7 @@ from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES
@@ -108,7 +108,7 @@ def _nearness(path: Path) -> int:
     return SUFFIXES.index(path.suffix.lower())
 
 
-def pictures_of(folder: Path, options: IngestOptions, *usual: str) -> Pictures:
+def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
     """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders (or of
     those that most programs use) that holds any."""
     if options.frames is not None:
@@ -159,7 +159,7 @@ def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
         )
 
 
-def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> Path:
+def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:
     """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
     of the folder; InputRefused, which says ``how`` to get one, where there is none."""
     if options.mesh is not None:
@@ -178,7 +178,7 @@ def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> 
 def scan_of(
     records: Sequence[FrameRecord],
     geometry: Path | Callable[[], ScanGeometry],
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     adapter: str,

@@ -27,7 +27,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_model, model_files
 from usdbrdf.untrusted.mesh_files import FileMesh
 
@@ -41,7 +41,7 @@ def matches(path: Path) -> bool:
     return (path / "scans").is_dir() and bool(model_files(path / "dslr" / "colmap"))
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     source = folder / "dslr" / "colmap"
     if not model_files(source):

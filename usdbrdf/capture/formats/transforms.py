@@ -36,10 +36,10 @@ from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Curve, Lens, whole_sphere
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 
-def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
+def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path:
     """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
     for folder in options.allow_outside if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
@@ -78,7 +78,7 @@ def matches(path: Path) -> bool:
     return (path / "transforms.json").is_file() or (path.suffix == ".json" and path.is_file())
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     source = path / "transforms.json" if path.is_dir() else path
     findings = Findings()
@@ -140,7 +140,7 @@ def _upright(records: Sequence[FrameRecord]) -> str:
 
 
 def frame_records(
-    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> list[FrameRecord]:
     """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
 
@@ -163,7 +163,7 @@ class _Capture:
 
     source: Path
     document: Mapping[str, Any]
-    options: IngestOptions
+    options: CaptureOptions
     images: bool = True
     is_legacy: bool = False
     first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
@@ -201,7 +201,7 @@ class _Capture:
 
 
 def _captured(
-    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> tuple[_Capture, list[FrameRecord]]:
     """The document and its frames, but for those without pose or file."""
     # A camera that could not be placed costs its frame, not the capture.
