@@ -60,6 +60,7 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         write_ply(staged / "mesh.ply", points, *captured_faces(scan))
         objects = [
             {"id": i, "name": label.label, "class_name": label.class_name}
+            | ({"directive": label.directive} if label.directive else {})
             for i, label in enumerate(scan.objects)
         ]
         write_json(staged / "objects.json", {"objects": objects})

@@ -28,7 +28,7 @@ from usdbrdf.capture.native import as_copied, refuse_taken, write_capture
 from usdbrdf.errors import UsageError
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import AUTO, IngestOptions
-from usdbrdf.tasks.capture_inputs import inputs_of_captures, parameters_of
+from usdbrdf.tasks.capture_inputs import DIRECTIVES_OF_OBJECTS, inputs_of_captures, parameters_of
 from usdbrdf.tasks.layers_to_come import write_layers_to_come
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
@@ -93,7 +93,10 @@ def ingest(
             if copy_to:
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
-        draft = Draft(asset=asset, header=header, provenance=task.provenance)
+        # A layer does not tell of directives, which others may follow without it.
+        told_of = {k: v for k, v in inputs.items() if not k.startswith(DIRECTIVES_OF_OBJECTS)}
+        provenance = replace(task.provenance, inputs=told_of)
+        draft = Draft(asset=asset, header=header, provenance=provenance)
         write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
@@ -103,6 +106,7 @@ def ingest(
             "frames": len(scan.frames),
             "objects": len(scan.objects),
             "objects_from": scan.label_source,
+            "directives": {one.identifier: one.directive for one in scan.objects if one.directive},
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,

@@ -18,7 +18,7 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import ObjectLabel, ScanMesh, doubled_areas
+from usdbrdf.model.mesh import ObjectLabel, ObjectName, ScanMesh, doubled_areas
 from usdbrdf.transport.rays import RayScene
 
 # Frames that tell the colours, and numbers that each of them keeps.
@@ -53,7 +53,7 @@ def segmented(
     )
     labels, number = _labels(found.face, divided, found.planes, found.parts)
     face_object, objects = objects_with_faces(
-        _with_second_skins(mesh, number[divided]), tuple((label, "") for label in labels)
+        _with_second_skins(mesh, number[divided]), tuple(map(ObjectName, labels))
     )
     told = {
         "planes": found.planes,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from usdbrdf.asset.directives import directives_of
 from usdbrdf.asset.layers.task_layers import (
     Lamp,
     world_from_root,
@@ -16,7 +17,7 @@ from usdbrdf.asset.layers.task_layers import (
 )
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import ShadedObject, colour
+from usdbrdf.asset.properties import LAMP, OF_SHADE, ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
@@ -32,6 +33,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
     maps = AssetMaps(open_weaker(asset, "shading"))
+    asked = directives_of(asset, maps.stage, OF_SHADE)
     task = Task(
         asset=asset,
         name="shade",
@@ -40,6 +42,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
             **asdict(options.sampling),
             "denoise": lightmap_filter,
             "environment": kind_of_light(options.environment),
+            **({"directives": asked} if asked else {}),
         },
         inputs=hashes_of_inputs(
             asset,
@@ -53,12 +56,21 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
+        said = {
+            i: asked[obj.identifier] == LAMP
+            for i, obj in enumerate(maps.scene.objects)
+            if obj.identifier in asked
+        }
         shaded = shade_surface(
-            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
-        )
+            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter,
+            said,
+        )  # fmt: skip
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
-        objects = _write_maps(writer, shaded)
+        objects = [
+            replace(item, directive=asked.get(item.identifier, ""))
+            for item in _write_maps(writer, shaded)
+        ]
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
         lamps = [
