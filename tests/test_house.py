@@ -62,6 +62,7 @@ ARROWS: dict[str, set[str]] = {
     "cli": {"commands", "command_parser"},
     "commands": {"command_parser"},
     "command_parser": {"pipeline", *READERS},
+    "_COARSER": "precision against time",
     "__main__": {"cli"},
     # The public face, which nothing inside may import.
     "": {"pipeline", *READERS},
