@@ -62,7 +62,6 @@ ARROWS: dict[str, set[str]] = {
     "cli": {"commands", "command_parser"},
     "commands": {"command_parser"},
     "command_parser": {"pipeline", *READERS},
-    "_COARSER": "precision against time",
     "__main__": {"cli"},
     # The public face, which nothing inside may import.
     "": {"pipeline", *READERS},
@@ -135,6 +134,7 @@ ENGINEERING: dict[str, str] = {
     "ASKED": "time",
     "BRIGHT_CODE": "codes of 8-bit images",
     "CLIPPED": "codes of what a texel shows in a frame",
+    "DARK": "codes of what a texel shows in a frame",
     "DARK_CODE": "codes of 8-bit images",
     "GRID": "discretisation of the search",
     "HEIGHT": "pixels of a picture",
@@ -163,6 +163,7 @@ ENGINEERING: dict[str, str] = {
     "_CANDIDATES": "time",
     "_CLEAR": "codes of 8-bit images",
     "_CLEARLY": "which of two readings of a format",
+    "_COARSER": "precision against time",
     "_COARSEST": "steps of a search",
     "_COLUMNS": "convention of a format",
     "_COUNTED_PIXELS": "time",
