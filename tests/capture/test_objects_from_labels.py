@@ -43,7 +43,7 @@ def test_what_is_too_small_for_an_object_does_not_depend_on_the_unit(unit):
 @pytest.mark.fault("G9")
 def test_one_large_part_is_one_object():
     split = segmentation(_squares([2, 0.05]), None, table_path=None, min_area=0.01)
-    assert split.labels == (("scan", ""),)
+    assert split.labels == (ObjectName("scan"),)
     assert split.face_object.tolist() == [0] * 4
 
 

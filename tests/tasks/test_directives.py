@@ -7,7 +7,9 @@ from pxr import UsdShade
 
 import usdbrdf
 from tests.scenes import edited, make_capture, poses_down_and_up
+from usdbrdf.asset.directives import directives_of
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.properties import OF_FIT
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_stage, time_code
 from usdbrdf.asset.readers.scene import read_fit, read_shading
@@ -82,4 +84,4 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
 def test_a_word_that_is_none_stops_the_step_that_reads_it(built):
     _say(built.asset, Stuhl_No_1="gold")
     with pytest.raises(InputRefused, match=r"'gold' is none of .*\[review.layer\]$"):
-        usdbrdf.fit(built.asset, usdbrdf.FitOptions())
+        directives_of(built.asset, open_measured(built.asset), OF_FIT)

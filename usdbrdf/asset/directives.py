@@ -10,7 +10,7 @@ refit     it is fitted with other random numbers
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pxr import Usd
 
@@ -19,6 +19,7 @@ from usdbrdf.asset.readers.scene import authored
 from usdbrdf.asset.review import read_review, review_file
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.stamp import read_stamp, stamp_path
+from usdbrdf.model.scene import SceneObject
 
 
 def directives_of(asset: Asset, stage: Usd.Stage, words: Sequence[str]) -> dict[str, str]:
@@ -39,3 +40,9 @@ def directives_of(asset: Asset, stage: Usd.Stage, words: Sequence[str]) -> dict[
         if said.directive and identifier:
             asked[str(identifier)] = said.directive
     return {name: word for name, word in sorted(asked.items()) if word in words}
+
+
+def by_number(asked: Mapping[str, str], objects: Sequence[SceneObject]) -> dict[int, str]:
+    """What is asked of objects, by their numbers in the scene."""
+    known = ((i, asked.get(obj.identifier, "")) for i, obj in enumerate(objects))
+    return {i: word for i, word in known if word}

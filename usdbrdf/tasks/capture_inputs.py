@@ -16,10 +16,8 @@ from usdbrdf.files.documents import json_text, read_json
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.tasks.task import HANDED_ON
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
-
-# The input that later steps follow and ingest only hands on.
-DIRECTIVES_OF_OBJECTS = "directives"
 
 
 def parameters_of(options: IngestOptions) -> dict[str, Any]:
@@ -91,6 +89,6 @@ def _inputs_of_objects(file: Path) -> dict[str, str]:
         asked = [str(row.pop("directive", "")) for row in rows]
         texts = {"objects": json_text(document)}
         if any(asked):
-            texts[DIRECTIVES_OF_OBJECTS] = json_text(asked)
+            texts[HANDED_ON] = json_text(asked)
         return {k: hashlib.sha256(text.encode()).hexdigest() for k, text in texts.items()}
     return whole

@@ -17,7 +17,8 @@ from usdbrdf.files.frames import read_frame
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
-from usdbrdf.tasks.photometry import ASKED, agreement_of_frames, doubts_about_agreement
+from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
+from usdbrdf.texturing.agreement import doubts_about_agreement
 
 
 def inspect(

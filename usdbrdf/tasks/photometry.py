@@ -3,7 +3,7 @@ same points of the mesh, and how bright is each beside the others?"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,12 +28,13 @@ from usdbrdf.tasks.task import warned
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,
+    doubts_about_agreement,
     is_doubtful,
     logarithms_in_frame,
     other_convention,
     points_of_surface,
 )
-from usdbrdf.texturing.exposures import with_estimated_exposures
+from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
 
 # Frames that are asked whether they agree.
@@ -58,7 +59,7 @@ def asked_of_its_pixels(
     if options.exposure == "estimate":
         scan, off = estimated_exposures(scan, read)
         told["estimated_exposures"] = off
-        warnings += warned(doubts_about_exposures(off, scan))
+        warnings += warned(doubts_about_exposures(off, len(scan.frames), scan.source))
         read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.objects == AUTO:
         mesh, objects, found = segmented(scan.mesh, own_faces(scan), scan.frames, read)
@@ -104,16 +105,6 @@ def agreement_of_frames(
     return given
 
 
-def doubts_about_agreement(found: Agreement | None, source: Path) -> Iterator[str]:
-    """A sentence where the frames hardly agree, under whatever reading of the poses."""
-    if found is not None and is_doubtful(found):
-        yield (
-            f"{source.name}: frames that show the same points of the mesh differ by "
-            f"{found.ratio:.0%} of what any two pixels do, under every usual reading of the poses. "
-            "Check that poses, mesh and images belong together. [capture.agreement]"
-        )
-
-
 def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]:
     """The scan with its frames exposed as their pixels say; image and gain of those that
     contradicted the others by much."""
@@ -124,13 +115,3 @@ def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]
     columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]
     frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1))
     return replace(scan, frames=frames), off
-
-
-def doubts_about_exposures(off: Mapping[str, float], scan: Scan) -> Iterator[str]:
-    """A sentence where frames of a scan contradicted the others, by image their gains."""
-    if off:
-        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in off.items())
-        yield (
-            f"{scan.source.name}: {len(off)} of {len(scan.frames)} frames contradicted the others, "
-            f"{named}; what all are off by was divided out. [capture.exposure]"
-        )

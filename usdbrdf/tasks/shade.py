@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from usdbrdf.asset.directives import directives_of
+from usdbrdf.asset.directives import by_number, directives_of
 from usdbrdf.asset.layers.task_layers import (
     Lamp,
     world_from_root,
@@ -34,6 +34,10 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     lightmap_filter = chosen_filter(options.denoise)
     maps = AssetMaps(open_weaker(asset, "shading"))
     asked = directives_of(asset, maps.stage, OF_SHADE)
+    inputs = hashes_of_inputs(
+        asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
+        photographs=options.environment == ESTIMATE,
+    )  # fmt: skip
     task = Task(
         asset=asset,
         name="shade",
@@ -44,33 +48,17 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
             "environment": kind_of_light(options.environment),
             **({"directives": asked} if asked else {}),
         },
-        inputs=hashes_of_inputs(
-            asset,
-            "shading",
-            maps,
-            aovs=("lit", "coverage"),
-            environment=options.environment,
-            photographs=options.environment == ESTIMATE,
-        ),
+        inputs=inputs,
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
-        said = {
-            i: asked[obj.identifier] == LAMP
-            for i, obj in enumerate(maps.scene.objects)
-            if obj.identifier in asked
-        }
-        shaded = shade_surface(
-            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter,
-            said,
-        )  # fmt: skip
+        said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
+        given = maps.surface, maps.lit, maps.coverage, outside
+        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
-        objects = [
-            replace(item, directive=asked.get(item.identifier, ""))
-            for item in _write_maps(writer, shaded)
-        ]
+        objects = _write_maps(writer, shaded, asked)
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
         lamps = [
@@ -95,7 +83,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     return task.run(work)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
+def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> list[ShadedObject]:
     """Every object's pictures, and the record that names them."""
     traced = shaded.traced
     maps = {
@@ -126,6 +114,7 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
                 rays_per_texel=float(traced.rays[own].mean()),
                 standard_error=float(np.median(shaded.relative_error[own])),
                 escaped_fraction=float(mean(traced.escaped)),
+                directive=asked.get(obj.identifier, ""),
             )
         )
     return objects

@@ -13,6 +13,9 @@ from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 Options = TypeVar("Options")
+# The input that later steps follow and a task only hands on: a layer that told of it would change
+# with it, and all steps after that.
+HANDED_ON = "directives"
 
 
 def in_each_lighting(
@@ -68,8 +71,9 @@ class Task:
 
     @property
     def provenance(self) -> Provenance:
+        told = {k: v for k, v in self.inputs.items() if k.split(".")[0] != HANDED_ON}
         return Provenance(
-            role=self.role, version=code_version(), parameters=self.parameters, inputs=self.inputs
+            role=self.role, version=code_version(), parameters=self.parameters, inputs=told
         )
 
     @property
