@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -71,6 +71,18 @@ def frames_from_records(
         encoding=encoding,
         radiometric=radiometric,
     )
+
+
+# How many times as far as along another axis cameras must point up along y.
+_CLEARLY = 2.0
+
+
+def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
+    """The up axis where a format does not say: z, unless people held their cameras clearly upright
+    along y."""
+    axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
+    up = np.nan_to_num(axes.sum(axis=0))
+    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
 
 
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
 from usdbrdf.capture.formats.named_pictures import (
     mask_beside,
     mesh_beside,
@@ -20,7 +20,6 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
-    up_axis_of,
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import read_array

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
@@ -25,7 +25,6 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
-    up_axis_of,
     warn_of_unused,
 )
 from usdbrdf.errors import InputRefused

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 
@@ -44,13 +43,6 @@ def rigid_pose(rotation: Double, centre: Double) -> Double:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, centre
     return pose
-
-
-def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
-    """The axis along which the cameras' own point up on the whole, where the format does not say:
-    people hold cameras upright."""
-    up = sum((r.world_from_camera[:3, 1] for r in records), np.zeros(3))
-    return "Y" if abs(up[1]) > abs(up[2]) else "Z"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from usdbrdf.capture.checks import (
     clause_of,
     is_camera_matrix,
     refuse_photographs,
+    up_axis_of,
 )
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.parts import (
@@ -52,8 +53,6 @@ def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
-# How many times as far as along another axis cameras must point up along y.
-_CLEARLY = 2.0
 _CURVES: dict[str, Curve] = {
     "PINHOLE": "perspective", "SIMPLE_PINHOLE": "perspective", "OPENCV": "perspective",
     "PERSPECTIVE": "perspective", "SIMPLE_RADIAL": "perspective", "RADIAL": "perspective",
@@ -104,7 +103,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "clipped pixels pass for radiance. [capture.saturation]"
         )
     up_axis = _stated(capture, "up_axis", ("Y", "Z"))
-    if up_axis is None and options.up_axis is None and (up_axis := _upright(records)) == "Y":
+    if up_axis is None and options.up_axis is None and (up_axis := up_axis_of(records)) == "Y":
         findings.warn(
             f"{source.name}: states no up_axis, and its cameras are upright along y, not "
             "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
@@ -130,13 +129,6 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         up_axis=up_axis or "Z",
     )
-
-
-def _upright(records: Sequence[FrameRecord]) -> str:
-    """The up axis: z, as nerfstudio has it, unless people held their cameras upright along y."""
-    axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
-    up = np.nan_to_num(axes.sum(axis=0))
-    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
 
 
 def frame_records(
