@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.page import report
 from usdbrdf.page.report import page_data
 
 COARSE = ["-q", "--texel-size", "0.3", "--standard-error", "0.1", "--rays", "64"]
@@ -209,11 +211,15 @@ def _page_of_the_night(asset, by_day, by_night):
     lamps = {row["id"]: row["radiance"] for row in data["objects"] if row["status"] == "lamp"}
     assert list(lamps) == ["box"]
     assert lamps["box"]["mean"][0] == pytest.approx(6, rel=0.01)
-    targets = {row["id"]: row["target"] for row in data["objects"]}
-    stored = {name: read_fit(open_measured(asset), f"/room/geo/{name}") for name in targets}
-    assert any(fit.target_frame >= 12 for fit in stored.values())
-    for name, fit in stored.items():
-        assert targets[name] == max(fit.target_frame - 12, -1)
+
+
+def test_target_frames_are_counted_in_the_lighting_that_is_shown(asset, monkeypatch):
+    maps = AssetMaps(open_measured(asset.in_lighting("night")))
+    fit = read_fit(maps.stage, "/room/geo/floor")
+    for stored, shown in ((15, 3), (3, -1), (-1, -1)):
+        changed = replace(fit, target_frame=stored)
+        monkeypatch.setattr(report, "read_fit", lambda *_, changed=changed: changed)
+        assert report._in_own_frames(maps, "/room/geo/floor").target_frame == shown
 
 
 def test_lightings_of_one_asset_are_compared(asset, tmp_path):
@@ -238,12 +244,10 @@ def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
     edits = Sdf.Layer.OpenAsAnonymous(str(copy.edits_layer))
     edits.subLayerPaths.append(f"./{adopted.name}")
     edits.Export(str(copy.edits_layer))
-    seen = [
-        open_edited(copy.in_lighting(lighting)).GetAttributeAtPath(name).Get()
-        for lighting in LIGHTINGS
-    ]
-    own = open_edited(asset.in_lighting("day")).GetAttributeAtPath(name).Get()
-    assert seen == [own, 7777.0]
+    stages = [open_edited(copy.in_lighting(lighting)) for lighting in LIGHTINGS]
+    stages.append(open_edited(asset.in_lighting("day")))
+    day, night, before = (stage.GetAttributeAtPath(name).Get() for stage in stages)
+    assert (day, night) == (before, 7777.0)
 
 
 def test_other_lightings_need_another_folder(base, asset, captures):
