@@ -8,8 +8,15 @@ import pytest
 from tests.scenes import make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import IngestOptions
-from usdbrdf.shading.surroundings import HEIGHT, WIDTH, share_outside, surroundings_from_frames
+from usdbrdf.shading.surroundings import (
+    HEIGHT,
+    WIDTH,
+    Surroundings,
+    share_outside,
+    surroundings_from_frames,
+)
 from usdbrdf.transport.environment import directions_of_pixels
 from usdbrdf.transport.rays import RayScene
 
@@ -63,3 +70,50 @@ def test_a_closed_room_shows_no_surroundings(tmp_path):
     frames = read_scan(tmp_path / "capture", IngestOptions()).frames
     assert not share_outside(rays, frames).any()
     assert not surroundings_from_frames(rays, frames, z_up=True).coverage.observed.any()
+
+
+def _seen_through_a_window(sky):
+    """Up to 28 degrees above the horizon and 45 to either side."""
+    directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
+    above = (directions[:, 2] > 0) & (directions[:, 2] < np.sin(np.radians(28)))
+    seen = above & (directions[:, 0] > np.cos(np.pi / 4) * np.hypot(*directions[:, :2].T))
+    radiance = np.where(seen[:, None], sky, 0).astype(np.float32)
+    none = np.zeros_like(seen)
+    return Surroundings(radiance=radiance, coverage=CoverageMap.of(seen, none))
+
+
+def test_a_clear_sky_goes_on_beyond_the_window():
+    """The CIE's standard clear sky of low turbidity (S 011, type 12), the sun outside of what is
+    seen."""
+    directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
+    sun = np.array([-0.8, 0.0, 0.6])
+    zenith = np.maximum(directions[:, 2], 0.02)
+    away = np.arccos(np.clip(directions @ sun, -1, 1))
+    gradation = 1 - np.exp(-0.32 / zenith)
+    indicatrix = 1 + 10 * (np.exp(-3 * away) - np.exp(-3 * np.pi / 2)) + 0.45 * np.cos(away) ** 2
+    sky = (gradation * indicatrix)[:, None] * np.ones(3)
+    seen = _seen_through_a_window(sky)
+    # Away from the sun, where no frame looked.
+    asked = (directions[:, 2] > 0.6) & (directions[:, 0] > 0)
+    error = np.abs(np.log(seen.trend(True)[asked] / sky[asked]))
+    flat = np.abs(np.log(seen.median() / sky[asked]))
+    assert np.median(flat) > 0.5
+    assert np.median(error) < 0.7 * np.median(flat)
+
+
+def test_what_has_no_trend_goes_on_about_as_bright():
+    """Buildings, say."""
+    random = np.random.default_rng(0)
+    blocks = random.lognormal(0, 0.7, (HEIGHT // 16, WIDTH // 16, 1))
+    sky = np.repeat(np.repeat(blocks, 16, axis=0), 16, axis=1).reshape(-1, 1) * np.ones(3)
+    seen = _seen_through_a_window(sky)
+    assert np.abs(np.log(seen.trend(True) / seen.median())).max() < 1.5
+
+
+def test_of_next_to_nothing_seen_no_trend_is_told():
+    none = Surroundings.unseen()
+    np.testing.assert_array_equal(none.trend(True), 0)
+    one = np.zeros((HEIGHT * WIDTH, 3), np.float32)
+    one[1000:1040] = np.linspace(1, 3, 40)[:, None]
+    seen = Surroundings(radiance=one, coverage=CoverageMap.of(one[:, 0] > 0, one[:, 0] < 0))
+    np.testing.assert_allclose(seen.trend(True), 2, rtol=1e-6)
