@@ -82,12 +82,15 @@ def _seen_through_a_window(sky):
     return Surroundings(radiance=radiance, coverage=CoverageMap.of(seen, none))
 
 
-# Gradation a, b and indicatrix c, d, e of the CIE's standard skies (S 011): overcast, and clear with
-# low turbidity.
-@pytest.mark.parametrize("a, b, c, d, e", [(4, -0.7, 0, -1, 0), (-1, -0.32, 10, -3, 0.45)])
-def test_a_sky_goes_on_beyond_the_window(a, b, c, d, e):
+# Gradation a, b and indicatrix c, d, e of two of the CIE's standard skies (S 011).
+_OVERCAST, _CLEAR = (4, -0.7, 0, -1, 0), (-1, -0.32, 10, -3, 0.45)
+
+
+@pytest.mark.parametrize("kind", [_OVERCAST, _CLEAR])
+def test_a_sky_goes_on_beyond_the_window(kind):
     """Nearer to what it is than as bright as at the horizon, on the average over where the sun may
     stand."""
+    a, b, c, d, e = kind
     directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
     zenith = np.maximum(directions[:, 2], 0.02)
     errors = []
