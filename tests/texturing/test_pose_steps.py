@@ -117,8 +117,8 @@ def test_disturbed_poses_come_back_and_the_captured_ones_are_kept(made, tmp_path
     assert "refined already" in err
     steps = json.loads(printed)["steps"]["ingest"]["refined_poses"]
     assert [one["moved_m"] for one in steps] == pytest.approx(moved.tolist(), abs=1e-5)
-    stage = Usd.Stage.Open(str(Asset.at(tmp_path / "again").layer("scan")))
-    camera = next(UsdGeom.Xformable(p) for p in stage.Traverse() if p.IsA(UsdGeom.Camera))
+    again = Usd.Stage.Open(str(Asset.at(tmp_path / "again").layer("scan")))
+    camera = next(UsdGeom.Xformable(p) for p in again.Traverse() if p.IsA(UsdGeom.Camera))
     for one, other in zip((first, second), camera.GetOrderedXformOps(), strict=True):
         assert one.GetOpName() == other.GetOpName()
         for time in range(1, 17):
