@@ -251,7 +251,7 @@ FAULTS = {
     "LightsSelection": lights_that_are_not_there,
     "LampTwice": lamp_that_glows_beside_its_lights,
     "ReviewRecord": verdict_of_another_word,
-    "ReviewRejected": chair_that_was_rejected,
     "ReviewDirectives": chair_that_is_to_be_a_metal,
+    "ReviewRejected": chair_that_was_rejected,
     "ReviewOutdated": chair_that_was_judged_with_other_numbers,
 }

@@ -280,8 +280,8 @@ class ShadedObject(MeasuredObject):
         estimated emitters only.""", low=0,
         when=lambda shaded: shaded.radiance_status == "estimated")]
     directive: Annotated[str, Fact(SHADING, "directive", "token", "", """Whether the object shines
-        was said by a person, in review.usda or in the capture's objects: it is a lamp, or it is
-        none; empty where its radiance told.""", tokens=OF_SHADE,
+        was said by a person, in review.usda or in the capture's objects. lamp: it does;
+        not-lamp: it does not; empty where its radiance told.""", tokens=OF_SHADE,
         when=lambda shaded: bool(shaded.directive))] = ""
     area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
         object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
