@@ -88,7 +88,7 @@ IMPORTERS: dict[str, set[str]] = {
         "transport/",
     },
     "omni": {"validation/omniverse.py"},
-    "OpenImageIO": {"files/images.py"},
+    "OpenImageIO": {"files/images.py", "files/published_images.py"},
     "pickle": {"kernel.py"},
     "PIL": {"delivery/"},
     "psutil": {"job/memory.py"},

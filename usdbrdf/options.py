@@ -401,6 +401,23 @@ class PackageOptions(Options):
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
 
 
+class PublishOptions(Options):
+    """What a published version of an asset is."""
+
+    version: str | None = option("--version vNNN", None, unset="the one after the latest")
+    "its name"
+    uri: str | None = option("--uri TEMPLATE", None, unset="./NAME.usd")
+    """identifier in assetInfo, for a studio's resolver: a URI with {name} and {version}, such as
+    'ayon+entity://show/assets?product={name}&version={version}'"""
+    photographs: bool = option("--no-photographs", True)
+    "leave the photographs out; else they are copied without EXIF, GPS and the like"
+    texture_space: Literal["rec709", "acescg"] = option("--texture-space", "rec709")
+    """linear space of the textures and of all other colours: rec709, or acescg for programs that
+    render in it and convert nothing"""
+    encoding: Literal["text", "binary"] = option("--encoding", "text")
+    "of the root layer, NAME.usd"
+
+
 class ReportOptions(Options):
     """What the page of an asset shows."""
 

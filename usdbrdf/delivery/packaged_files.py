@@ -29,8 +29,8 @@ IMAGES = EIGHT_BIT | {".exr"}
 # What becomes EXR or PNG.
 CONVERTED = frozenset({".hdr", ".tif", ".tiff"})
 # The start of what no path of a file is, such as https://.
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-_COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
+ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +72,15 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
         shader = UsdShade.Shader(prim)
         if not shader or shader.GetShaderId() != "UsdUVTexture":
             continue
-        value = _produced(shader, "file")
+        value = produced(shader, "file")
         if isinstance(value, Sdf.AssetPath) and value.path:
-            fed = _fed(prim)
+            fed = fed_inputs(prim)
             uses.append(
                 TextureUse(
                     prim_path=str(prim.GetPath()),
                     file=file_in_asset(value.path, asset),
-                    space=str(_produced(shader, "sourceColorSpace") or "auto"),
-                    colour=any(name in _COLOURS for name, _ in fed),
+                    space=str(produced(shader, "sourceColorSpace") or "auto"),
+                    colour=any(name in COLOURS for name, _ in fed),
                     reads_alpha=any(output == "a" for _, output in fed),
                 )
             )
@@ -186,8 +186,8 @@ def _free(path: str, taken: Collection[str], folder: Path) -> str:
 def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
     """Make a node read the new file and give the same values."""
     shader = UsdShade.Shader(flat.GetPrimAtPath(use.prim_path))
-    old_scale = Gf.Vec4f(_produced(shader, "scale") or Gf.Vec4f(1))
-    old_bias = Gf.Vec4f(_produced(shader, "bias") or Gf.Vec4f(0))
+    old_scale = Gf.Vec4f(produced(shader, "scale") or Gf.Vec4f(1))
+    old_bias = Gf.Vec4f(produced(shader, "bias") or Gf.Vec4f(0))
     _set(shader, "file", Types.Asset, Sdf.AssetPath(f"./{new.path}"))
     _set(shader, "sourceColorSpace", Types.Token, new.space)
     if new.scale != 1 or new.bias != 0:
@@ -196,7 +196,7 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
         _set(shader, "scale", Types.Float4, Gf.Vec4f(*scale, old_scale[3]))
         if any(bias) or any(old_bias):
             _set(shader, "bias", Types.Float4, Gf.Vec4f(*bias, old_bias[3]))
-        fallback = _produced(shader, "fallback")
+        fallback = produced(shader, "fallback")
         if fallback is not None:
             stored = [(fallback[i] - new.bias) / new.scale for i in range(3)]
             _set(shader, "fallback", Types.Float4, Gf.Vec4f(*stored, fallback[3]))
@@ -204,7 +204,7 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
 
 def file_in_asset(path: str, asset: Asset) -> Path:
     """The file at an absolute path, links followed; InputRefused unless it is in the asset."""
-    if _ADDRESS.match(path):
+    if ADDRESS.match(path):
         raise InputRefused(
             f"{path}: files from the network are not packaged. Save it in the asset's folder and "
             "name that copy in edits.usda. [package.outside]"
@@ -225,7 +225,7 @@ def file_in_asset(path: str, asset: Asset) -> Path:
     return place
 
 
-def _produced(shader: UsdShade.Shader, name: str) -> Any:
+def produced(shader: UsdShade.Shader, name: str) -> Any:
     """The value of an input, wherever a chain of connections takes it from."""
     wanted = shader.GetInput(name)
     producers = wanted.GetValueProducingAttributes() if wanted else []
@@ -238,7 +238,7 @@ def _set(shader: UsdShade.Shader, name: str, type_name: Sdf.ValueTypeName, value
     own.Set(value)
 
 
-def _fed(texture: Usd.Prim) -> list[tuple[str, str]]:
+def fed_inputs(texture: Usd.Prim) -> list[tuple[str, str]]:
     """Inputs in the same material that the texture feeds, each with which of its outputs."""
     material = texture.GetParent()
     while material.GetParent() and not material.IsA(UsdShade.Material):
