@@ -69,6 +69,15 @@ def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
     return option("--allow-outside DIR", (), unset="none", help=text)
 
 
+TextureSpace = Literal["rec709", "acescg"]
+
+
+def _texture_space() -> TextureSpace:
+    who = "acescg for programs that render in it and convert nothing"
+    text = f"linear space of textures and other colours: rec709, or {who}"
+    return option("--texture-space", "rec709", help=text)
+
+
 class TalkOptions(Options):
     """What is said while a command runs and at its end."""
 
@@ -399,6 +408,10 @@ class PackageOptions(Options):
     lighting: str | None = _lighting()
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
+    texture_space: TextureSpace = _texture_space()
+    whole: bool = option("--whole", False)
+    """.usdz of the layers as they are, all looks and lightings as variants, in the place of one
+    look made flat"""
 
 
 class PublishOptions(Options):
@@ -411,9 +424,7 @@ class PublishOptions(Options):
     'ayon+entity://show/assets?product={name}&version={version}'"""
     photographs: bool = option("--no-photographs", True)
     "leave the photographs out; else they are copied without EXIF, GPS and the like"
-    texture_space: Literal["rec709", "acescg"] = option("--texture-space", "rec709")
-    """linear space of the textures and of all other colours: rec709, or acescg for programs that
-    render in it and convert nothing"""
+    texture_space: TextureSpace = _texture_space()
     encoding: Literal["text", "binary"] = option("--encoding", "text")
     "of the root layer, NAME.usd"
 

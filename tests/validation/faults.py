@@ -13,7 +13,7 @@ from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 Types = Sdf.ValueTypeNames
 CHAIR, WALL, LAMP = (f"/room/geo/{name}" for name in ("Stuhl_No_1", "wall", "lamp"))
 CAMERA = "/room/cameras/capture"
-ALBEDO_TEXTURE = "/room/mtl/Stuhl_No_1/AlbedoTexture"
+COLOUR_TEXTURE = "/room/mtl/Stuhl_No_1/BaseColorTexture"
 SURFACE = "/room/mtl/Stuhl_No_1/PreviewSurface"
 
 
@@ -65,12 +65,12 @@ def layer_edited_by_hand(built):
 
 def texture_by_absolute_path(built):
     file = built.asset.folder / "textures" / "Stuhl_No_1.albedo.exr"
-    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(str(file)))
+    opinion(built, COLOUR_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(str(file)))
 
 
 def texture_outside_the_asset(built):
     write_exr(built.asset.folder.parent / "wood.exr", np.zeros((2, 2, 3), np.float32))
-    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath("../wood.exr"))
+    opinion(built, COLOUR_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath("../wood.exr"))
 
 
 def texture_deleted(built):
@@ -138,7 +138,7 @@ def albedo_above_one(built):
 
 
 def texture_read_as_srgb(built):
-    opinion(built, ALBEDO_TEXTURE, "inputs:sourceColorSpace", Types.Token, "auto")
+    opinion(built, COLOUR_TEXTURE, "inputs:sourceColorSpace", Types.Token, "auto")
 
 
 def specular_color_beside_ior(built):

@@ -99,20 +99,21 @@ def write_collection(
 
     edit       changes a layer, told whether it is the root layer; returns whether it did
     write      writes a file that is no layer to a place
-    encodings  "usda" or "usdc" for layers of which their names do not say it, by place
+    encodings  layers that are always written anew, by place: "usda" or "usdc" where their names
+               do not say it, else ""
     """
     for file in found.named_by:
         place = folder / found.places[file]
         place.parent.mkdir(parents=True, exist_ok=True)
         write(file, place)
     for i, (file, layer) in enumerate(found.layers.items()):
-        place = found.places[file]
-        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        name = found.places[file]
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         moved, edited = _lead_to_copies(found, file, layer), edit(layer, i == 0)
-        if moved or edited or file in found.changed or place in encodings:
-            _export(layer, folder / place, encodings.get(place, ""))
+        if moved or edited or file in found.changed or name in encodings:
+            _export(layer, folder / name, encodings.get(name, ""))
         else:
-            shutil.copyfile(file, folder / place)
+            shutil.copyfile(file, folder / name)
 
 
 def forget_photographs(layer: Sdf.Layer) -> bool:
@@ -127,19 +128,19 @@ def forget_photographs(layer: Sdf.Layer) -> bool:
         elif isinstance(spec, Sdf.PrimSpec) and spec.HasInfo("apiSchemas"):
             schemas = spec.GetInfo("apiSchemas")
             if any(name.startswith(_SCHEMAS_OF_PHOTOGRAPHS) for name in schemas.GetAppliedItems()):
-                schemas.prependedItems = _without(schemas.prependedItems)
-                schemas.appendedItems = _without(schemas.appendedItems)
-                schemas.explicitItems = _without(schemas.explicitItems)
-                spec.SetInfo("apiSchemas", schemas)
+                kept = [
+                    name
+                    for name in schemas.GetAppliedItems()
+                    if not name.startswith(_SCHEMAS_OF_PHOTOGRAPHS)
+                ]
+                make = Sdf.TokenListOp
+                own = make.CreateExplicit(kept) if schemas.isExplicit else make.Create(kept)
+                spec.SetInfo("apiSchemas", own)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     for spec in gone:
         spec.owner.RemoveProperty(spec)
     return bool(gone)
-
-
-def _without(names: Sequence[str]) -> list[str]:
-    return [name for name in names if not name.startswith(_SCHEMAS_OF_PHOTOGRAPHS)]
 
 
 def _reached(start: Sequence[Path], stop: set[Path]) -> dict[Path, Sdf.Layer]:

@@ -102,7 +102,11 @@ def _is_convertible(file: Path, prim: Usd.Prim) -> bool:
 
 def converted_texture(file: Path, space: str) -> Float:
     """(H, W, C) float32: an image with its red, green and blue in another space."""
-    pixels = read_exr(file)
+    return in_space(read_exr(file), space)
+
+
+def in_space(pixels: Float, space: str) -> Float:
+    """The same of pixels of linear Rec.709 and what they have beside."""
     rgb = from_working_space(np.ascontiguousarray(pixels[..., :3]), space)
     return np.concatenate([rgb, pixels[..., 3:]], axis=2)
 

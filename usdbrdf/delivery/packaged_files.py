@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from pxr import Gf, Sdf, Usd, UsdShade
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.surfaces import is_srgb, read_texture
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.colour import WORKING_SPACE, to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
+from usdbrdf.files.published_images import copy_without_metadata, write_texture
 from usdbrdf.model.arrays import Byte, Float
 
 Types = Sdf.ValueTypeNames
@@ -88,22 +88,34 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
 
 
 def add_texture(
-    use: TextureUse, folder: Path, taken: Collection[str], format: str, max_size: int | None
+    use: TextureUse,
+    folder: Path,
+    taken: Collection[str],
+    format: str,
+    max_size: int | None,
+    convert: Callable[[Float], Float] | None = None,
+    encoding: str = WORKING_SPACE,
 ) -> NewTexture:
     """Write the texture of a node below ``folder``; returns where, and how to read it.
 
     taken     paths that the package has already
-    format    "exr" keeps files as they are, "png" makes 8 bits of floats
+    format    "exr" keeps pixels as they are, tiled and with smaller copies; "png" makes 8 bits of
+              floats
     max_size  of the longer side in pixels, None for any
+    convert   what to do to the pixels of an EXR, which ``encoding`` is the colour space of then
     """
-    width, height, channels = _checked_size(use.file)
+    width, height, channels = checked_size(use.file)
     source = use.file.suffix.lower()
     smaller = size_within(width, height, max_size)
     fits = smaller == (width, height)
     as_it_is = source in EIGHT_BIT or (format == EXR and source not in CONVERTED)
     if as_it_is and (fits or use.reads_alpha):
         path = _free(f"textures/{use.file.stem}{source}", taken, folder)
-        shutil.copyfile(use.file, folder / path)
+        if source in EIGHT_BIT:
+            copy_without_metadata(use.file, folder / path)
+        else:
+            converted = convert(read_exr(use.file)) if convert else None
+            write_texture(folder / path, use.file, converted=converted, encoding=encoding)
         return NewTexture(path=path, space="sRGB" if is_srgb(use.file, use.space) else "raw")
     if use.reads_alpha and format != EXR:
         raise InputRefused(
@@ -119,7 +131,8 @@ def add_texture(
         pixels = resized(pixels, *smaller)
     path = _free(f"textures/{use.file.stem}.{format}", taken, folder)
     if format == EXR:
-        write_exr(folder / path, pixels)
+        write_exr(folder / path, convert(pixels) if convert else pixels, encoding=encoding)
+        write_texture(folder / path, folder / path)
         return NewTexture(path=path, space="raw")
     stored, scale, bias = encoded_colour(pixels) if use.colour else encoded_data(pixels)
     write_preview_png(folder / path, stored)
@@ -129,14 +142,14 @@ def add_texture(
 def add_file(file: Path, below: Path, folder: Path, taken: Collection[str]) -> str:
     """Add a picture that is no texture of a material, such as a dome light's; returns its path in
     the package, which is the one that it has below ``below`` if that is free."""
-    _checked_size(file)
+    checked_size(file)
     convert = file.suffix.lower() in CONVERTED
     place = file.relative_to(below)
     path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken, folder)
     if convert:
         write_exr(folder / path, read_texture(file, "auto"))
     else:
-        shutil.copyfile(file, folder / path)
+        copy_without_metadata(file, folder / path)
     return path
 
 
@@ -161,7 +174,7 @@ def size_within(width: int, height: int, max_size: int | None) -> tuple[int, int
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def _checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
+def checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
     if file.suffix.lower() not in IMAGES | CONVERTED:
         known = ", ".join(sorted(IMAGES | CONVERTED))
         raise InputRefused(

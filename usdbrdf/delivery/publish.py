@@ -1,9 +1,5 @@
 """Asset folder in, a new version beside the earlier ones out: complete in itself, with a manifest,
-never changed again.
-
-The work folder keeps ``edits.usda``; a version has what it said then. Renderers read what is
-published, so it is here that textures get their smaller copies: the maps of the work folder, which
-later steps read, stay as they are, and converting takes no longer."""
+never changed again. The work folder keeps ``edits.usda``; a version has what it said then."""
 
 from __future__ import annotations
 
@@ -21,9 +17,7 @@ from pxr import Sdf
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
-from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.delivery.collection import collected, refuse_incomplete, write_collection
-from usdbrdf.delivery.colours import ColourTextures, convert_layer, converted_texture
+from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import (
@@ -33,19 +27,13 @@ from usdbrdf.files.atomic import (
     sha256_of,
     temporary_folder,
 )
-from usdbrdf.files.colour import ACESCG, WORKING_SPACE
-from usdbrdf.files.images import needs_float, write_exr
-from usdbrdf.files.published_images import copy_without_metadata, write_texture
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.options import PublishOptions
 
 _LOCKED = ".usdbrdf-publish"  # holds the lock of a folder of versions
 _VERSION = re.compile(r"v(\d{3,9})")
-_SPACES = {"rec709": WORKING_SPACE, "acescg": ACESCG}
 _ENCODINGS = {"text": "usda", "binary": "usdc"}
-# Attributes that name textures which renderers look up on surfaces, from near and from afar.
-_TEXTURES = re.compile(r"(inputs|usdBrdf:aov):(?!texture:).+")
 
 
 def publish(
@@ -148,42 +136,23 @@ def _content_of(version: Path) -> str:
 
 
 def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) -> Manifest:
-    root, space = f"{asset.name}.usd", _SPACES[options.texture_space]
+    root, space = f"{asset.name}.usd", SPACES[options.texture_space]
     identifier = _identifier(options.uri, asset.name, version) or f"./{root}"
-    textures = ColourTextures()
-    for one in asset.in_each_lighting:
-        stage = open_edited(one)
-        if space != WORKING_SPACE:
-            textures.look_at(stage)
-    found = collected(asset, root, photographs=options.photographs)
     said = hashlib.sha256(f"{options.encoding}\0{options.uri}\0{space}\0".encode())
 
-    def edit(layer: Sdf.Layer, is_root: bool) -> bool:
-        changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
-        record = dict(layer.customLayerData.get("usdbrdf", {}))
-        if record.get("role") == "edits":
-            layer.documentation = "What the artist's layer said when this version was published."
-            changed = True
-        if is_root:
-            said.update(layer.ExportToString().encode())
-            _describe(layer, asset.name, version, identifier)
-        return changed or is_root
+    def describe(layer: Sdf.Layer) -> None:
+        said.update(layer.ExportToString().encode())
+        _describe(layer, asset.name, version, identifier)
 
-    def write(file: Path, place: Path) -> None:
-        named = found.named_by[file]
-        converted = converted_texture(file, space) if file in textures.files else None
-        if file.suffix.lower() == ".exr" and any(_TEXTURES.fullmatch(name) for name in named):
-            write_texture(
-                place, file, converted=converted, encoding=space if converted is not None else ""
-            )
-        elif converted is not None:
-            write_exr(place, converted, half=not needs_float(converted), encoding=space)
-        else:
-            copy_without_metadata(file, place)
-
-    encodings = {root: _ENCODINGS[options.encoding]}
-    write_collection(found, folder, edit=edit, write=write, encodings=encodings)
-    refuse_incomplete(folder / root)
+    found = write_copy(
+        asset,
+        folder,
+        root=root,
+        encoding=_ENCODINGS[options.encoding],
+        space=space,
+        photographs=options.photographs,
+        describe=describe,
+    )
     files = {
         file.relative_to(folder).as_posix(): sha256_of(file)
         for file in sorted(folder.rglob("*"))

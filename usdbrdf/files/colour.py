@@ -17,6 +17,7 @@ from usdbrdf.model.arrays import Float
 WORKING_SPACE = "lin_rec709_scene"
 DISPLAY_SPACE = "srgb_rec709_scene"
 ACESCG = "lin_ap1_scene"
+DATA = "data"  # numbers that are no colours
 _CONFIG = "studio-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
 _KIND_OF_CONFIG = "studio-config-v"
 # How OpenColorIO calls what a space's values are.

@@ -402,7 +402,7 @@ def _author_diffuse(
 ) -> str:
     """A metal's reflectance, or the diffuse colour; returns its texture as ``_author_colour``."""
     if item.is_metal:
-        return _author_metal(layer, material, item)
+        return _author_metal(layer, material, item, shading)
     return _author_colour(layer, material, item, scale, shading)
 
 
@@ -417,6 +417,7 @@ def _author_colour(
                 layer, material, "diffuseColor", "BaseColorTexture", aov.file,
                 scale=scale, fallback=item.mean_color,
             )  # fmt: skip
+            _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
             return path_in_layer(aov.file)
     albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
     if albedo is None:
@@ -426,10 +427,17 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _author_metal(layer: Sdf.Layer, material: str, item: FittedObject) -> str:
+def _leave_out(layer: Sdf.Layer, node: str, shading: Sdf.Layer) -> None:
+    """Deactivate a node of a weaker layer that nothing in the network reads any more."""
+    if shading.GetPrimAtPath(node):
+        over(layer, node).active = False
+
+
+def _author_metal(layer: Sdf.Layer, material: str, item: FittedObject, shading: Sdf.Layer) -> str:
     """One reflectance in the place of a texture; returns that there is none."""
     colour = shown_metal(item.phi, item.f0, item.mapping)
     shader = over(layer, f"{material}/{SURFACE}")
+    _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
     author_inputs(shader, Types.Color3f, diffuseColor=Gf.Vec3f(*colour))
     # An empty list that is explicit takes off the connection of the layer beneath.
     spec = layer.GetAttributeAtPath(f"{shader.path}.inputs:diffuseColor")
