@@ -40,7 +40,7 @@ def test_exactly_the_rule_about_a_fault_finds_it(built, name):
         assert line.startswith(f"{finding.severity.value}: ")
         assert line.endswith(f" [usdbrdf.{name}]")
         assert "\n" not in line
-        assert re.match(r"\w+: </[^>]*> @/.+\.usd[ac]@: ", line)
+        assert re.match(r"\w+: </[^>]*> @/.+\.usd[ac]?@: ", line)
 
 
 def test_a_finding_names_the_layer_that_has_the_opinion(built):

@@ -112,6 +112,7 @@ def _plain_spec(spec: Any, encoding: str) -> Any:
     plain.attribute("DateTime", _PINNED_DATE)
     plain.tile_width = plain.tile_height = plain.tile_depth = 0
     if encoding:
+        plain.erase_attribute("colorInteropID")  # which comes before the name
         plain.set_colorspace(encoding)
         plain.attribute("chromaticities", "float[8]", chromaticities_of(encoding))
     if str(spec.getattribute("compression") or "").startswith(("dwa", "b44", "pxr24")):
