@@ -18,13 +18,14 @@ from usdbrdf.asset.readers.surfaces import is_srgb
 from usdbrdf.delivery.collection import canonical
 from usdbrdf.delivery.packaged_files import COLOURS, fed_inputs, produced
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import WORKING_SPACE, from_working_space
+from usdbrdf.files.colour import ACESCG, WORKING_SPACE, from_working_space
 from usdbrdf.files.images import read_exr, stored_space
 from usdbrdf.model.arrays import Float
 
 _MEASURED = "usdBrdf:"
 _SPACE_OF_PRIM, _SPACE_OF_RENDER = "colorSpace:name", "renderingColorSpace"
 _DATA = frozenset({"data", "raw"})
+_IN_MATERIALX = {ACESCG: "acescg"}  # which has names of its own
 _MATERIALX_COLOURS = ("ND_image_color3", "ND_tiledimage_color3")
 
 
@@ -33,22 +34,24 @@ class ColourTextures:
     """Which textures of a stage are colours in the working space.
 
     files      of the textures
-    readers    paths of the shaders that read them
+    readers    paths of the shaders and lights that read them -> how these call the new space
     fallbacks  paths of the shaders whose fallbacks are colours, which has those of 8 bits too
     """
 
     files: set[Path] = field(default_factory=set)
-    readers: set[str] = field(default_factory=set)
+    readers: dict[str, str] = field(default_factory=dict)
     fallbacks: set[str] = field(default_factory=set)
 
-    def look_at(self, stage: Usd.Stage) -> None:
-        """Add those of a stage. InputRefused where a node multiplies red, green and blue by
-        different numbers: that means another thing in another space."""
+    def look_at(self, stage: Usd.Stage, space: str) -> None:
+        """Add those of a stage that are to be in ``space``. InputRefused where a node multiplies
+        red, green and blue by different numbers: that means another thing in another space."""
         for prim in stage.TraverseAll():
             file = _colour_file(prim)
             if file is not None and _is_convertible(file, prim):
                 self.files.add(canonical(file))
-                self.readers.add(str(prim.GetPath()))
+                materialx = str(prim.GetAttribute("info:id").Get() or "").startswith("ND_")
+                called = _IN_MATERIALX.get(space, space) if materialx else space
+                self.readers[str(prim.GetPath())] = called
             shader = UsdShade.Shader(prim)
             if not shader or shader.GetShaderId() != "UsdUVTexture" or not _feeds_colour(prim):
                 continue
@@ -142,7 +145,7 @@ def _convert(
         return True
     prim = str(spec.path.GetPrimPath().StripAllVariantSelections())
     if spec.name in ("inputs:file", "inputs:texture:file") and prim in textures.readers:
-        spec.SetInfo("colorSpace", space)
+        spec.SetInfo("colorSpace", textures.readers[prim])
         return True
     is_fallback = spec.name == "inputs:fallback" and prim in textures.fallbacks
     if spec.roleName != "Color" and not is_fallback:

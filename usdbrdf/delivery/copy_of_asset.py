@@ -51,7 +51,7 @@ def write_copy(
     for one in asset.in_each_lighting:
         stage = open_edited(one)
         if space != WORKING_SPACE:
-            textures.look_at(stage)
+            textures.look_at(stage, space)
     found = collected(asset, root, photographs=photographs)
     for file in found.named_by:
         accept(file)

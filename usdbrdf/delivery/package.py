@@ -301,7 +301,7 @@ def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOpt
         fit_for_arkit(flat, warn)
     space, colours = SPACES[options.texture_space], ColourTextures()
     if space != WORKING_SPACE:
-        colours.look_at(flat)
+        colours.look_at(flat, space)
         convert_layer(flat.GetRootLayer(), colours, space)
     with TemporaryDirectory(prefix="usdbrdf-package-") as name:
         folder = Path(name)

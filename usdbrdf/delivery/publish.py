@@ -4,6 +4,7 @@ never changed again. The work folder keeps ``edits.usda``; a version has what it
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shutil
 import string
@@ -59,10 +60,12 @@ def publish(
     asset = Asset.made(folder)
     asset.refuse_output(destination, "publish.destination")
     state, lock = asset.folder / STATE_FOLDER, destination / _LOCKED
+    # Where nobody can write, nobody works.
+    state = state if os.access(state, os.W_OK) else lock
     locked = partial(folder_lock, wait_s=wait_s, without_lock=without_lock)
     with environment_failures(str(destination)), _made(destination):
         lock.mkdir(exist_ok=True)
-        with locked(lock), locked(state if state.is_dir() else lock):
+        with locked(lock), locked(state):
             return _published(asset, destination, options)
 
 
