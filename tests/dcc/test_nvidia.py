@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 _ENGINE = """
 import sys
 from usd_validation_nvidia import ValidationEngine
-found = [str(issue) for issue in ValidationEngine().validate(sys.argv[1]).issues()]
+found = [str(issue) for issue in ValidationEngine(variants=len(sys.argv) < 3).validate(sys.argv[1]).issues()]
 sys.exit("\\n".join(found) or 0)
 """
 
@@ -75,7 +75,7 @@ def test_it_finds_nothing_in_any_variant_of_a_sound_asset(run, built):
 
 def test_its_engine_finds_a_fault(run, built):
     FAULTS["BindingBesideLooks"](built)
-    done = run(built.asset.root_layer, program=("-c", _ENGINE))
+    done = run(built.asset.root_layer, "as selected", program=("-c", _ENGINE))
     assert done.returncode == 1
     assert "UsdBrdfBindingBesideLooks" in done.stderr
 
