@@ -26,7 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 _ENGINE = """
 import sys
 from usd_validation_nvidia import ValidationEngine
-found = [str(issue) for issue in ValidationEngine(variants=len(sys.argv) < 3).validate(sys.argv[1]).issues()]
+engine = ValidationEngine(variants=len(sys.argv) < 3)
+found = [str(issue) for issue in engine.validate(sys.argv[1]).issues()]
 sys.exit("\\n".join(found) or 0)
 """
 
