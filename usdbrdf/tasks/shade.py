@@ -88,13 +88,14 @@ def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> lis
     traced = shaded.traced
     maps = {
         "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
-        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2"),
+        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2", colour=False),
         "albedo": TexelMap(shaded.albedo, 1.0, "1"),
     }
     if shaded.irradiance is not traced.mean:
         maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
     if shaded.unexplained.any():
-        maps["unexplained"] = TexelMap(shaded.unexplained.astype(np.float32), 1.0, "1")
+        unexplained = shaded.unexplained.astype(np.float32)
+        maps["unexplained"] = TexelMap(unexplained, 1.0, "1", colour=False)
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
     emitters, objects = shaded.emitters, []
     for i, obj in enumerate(writer.scene.objects):
