@@ -38,18 +38,13 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
         photographs=options.environment == ESTIMATE,
     )  # fmt: skip
-    task = Task(
-        asset=asset,
-        name="shade",
-        role="shading",
-        parameters={
-            **asdict(options.sampling),
-            "denoise": lightmap_filter,
-            "environment": kind_of_light(options.environment),
-            **({"directives": asked} if asked else {}),
-        },
-        inputs=inputs,
-    )
+    parameters = {
+        **asdict(options.sampling),
+        "denoise": lightmap_filter,
+        "environment": kind_of_light(options.environment),
+        **({"directives": asked} if asked else {}),
+    }
+    task = Task(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
