@@ -68,6 +68,7 @@ SWEEPS = (
 
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
+    "job/test_first_run.py::test_what_a_run_needs_was_compiled",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",
     "material/test_view_model.py::test_the_samples_tell_how_large_their_errors_are",

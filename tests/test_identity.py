@@ -141,6 +141,8 @@ def test_processes_that_compile_at_once_agree(copy):
     together = [_start(copy, _RUN) for _ in range(4)]
     found = [_output(process) for process in together]
     assert {words[2] for words, _ in found} == {_run(copy)[2]}
+    # Three waited for the one that had begun.
+    assert sorted(words[0] for words, _ in found) == ["compiled", *["loaded"] * 3]
     assert [err for _, err in found] == [""] * 4
     kernels = copy / "home/.cache/usdbrdf/kernels"
     assert {file.suffix for file in kernels.rglob("*") if file.is_file()} == {".nbc"}

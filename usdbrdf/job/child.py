@@ -77,6 +77,7 @@ def _sweep(parent: str) -> None:
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
+_LONG_SECONDS = 600  # for a child beside us that is ended with us
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _ERROR_CLASSES = {
@@ -109,15 +110,7 @@ def run_child(
     with scratch_folder() as folder:
         with environment_failures(label):
             save_arrays(folder / "arrays.npz", arrays)
-            task = {
-                "function": function,
-                "parameters": dict(parameters),
-                "label": label,
-                "parent": os.getpid(),
-                "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
-                "memory_limit_bytes": memory_limit_bytes,
-            }
-            (folder / "task.json").write_text(json_text(task), "utf-8")
+            _write_task(folder, function, parameters, timeout_s, label, memory_limit_bytes)
         status = _run(folder, timeout_s, label)
         if status == _ERROR_TOLD:
             told = json.loads((folder / "error.json").read_text("utf-8"))
@@ -131,12 +124,62 @@ def run_child(
         return load_arrays(folder / "result.npz")
 
 
+@contextmanager
+def beside(function: str, parameters: Mapping[str, Any], label: str) -> Iterator[None]:
+    """The same without arrays, in a child that works beside this block and is ended with it: what
+    it leaves in files is all that counts, and nothing is said of its failure."""
+    with scratch_folder() as folder:
+        process = None
+        with suppress(OSError):
+            save_arrays(folder / "arrays.npz", {})
+            _write_task(folder, function, parameters, _LONG_SECONDS, label, None)
+            process = _start(folder)
+        try:
+            yield
+        finally:
+            if process is not None:
+                _end(process)
+
+
+def _write_task(
+    folder: Path,
+    function: str,
+    parameters: Mapping[str, Any],
+    timeout_s: float,
+    label: str,
+    memory_limit_bytes: int | None,
+) -> None:
+    task = {
+        "function": function,
+        "parameters": dict(parameters),
+        "label": label,
+        "parent": os.getpid(),
+        "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
+        "memory_limit_bytes": memory_limit_bytes,
+    }
+    (folder / "task.json").write_text(json_text(task), "utf-8")
+
+
 def _run(folder: Path, timeout_s: float, label: str) -> int:
+    with environment_failures(label):
+        process = _start(folder)
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise LateChild(
+            f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
+            "again when the machine is less busy, or simplify the input. [child.timeout]"
+        ) from error
+    finally:  # also on Ctrl-C
+        _end(process)
+
+
+def _start(folder: Path) -> subprocess.Popen[bytes]:
     # The child imports what we can import. It runs in the scratch folder, so that "-c" does not
     # put the caller's working folder, and whatever lies there, first on its path.
     search = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
-    with environment_failures(label), (folder / "said").open("wb") as said:
-        process = subprocess.Popen(
+    with (folder / "said").open("wb") as said:
+        return subprocess.Popen(
             [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": search},
@@ -145,17 +188,13 @@ def _run(folder: Path, timeout_s: float, label: str) -> int:
             stderr=said,
             start_new_session=True,
         )
-    try:
-        return process.wait(timeout_s)
-    except subprocess.TimeoutExpired as error:
-        raise LateChild(
-            f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
-            "again when the machine is less busy, or simplify the input. [child.timeout]"
-        ) from error
-    finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Nothing of a child may outlive us, nor what it started itself."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
