@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from usdbrdf import options
 from usdbrdf.command_parser import Command
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show, tell
 from usdbrdf.option import REQUIRED, option
 from usdbrdf.options import EditOptions, TalkOptions
+from usdbrdf.run_table import table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,7 +63,8 @@ class _Run(_Talking):
             name: {"reran": result.reran, "reason": result.reason, **result.summary}
             for name, result in results.items()
         }
-        lines = [f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}"]
+        done = "written" if any(r.reran for r in results.values()) else "up to date"
+        lines = [*table(steps, root), f"{root}: {done}"]
         if steps.get("ingest", {}).get("radiometric") is False:
             doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
             lines = [f"warning: {doubt}", *lines]
@@ -397,6 +400,24 @@ class Adapters(Command):
         return 0
 
 
+class Doctor(Command):
+    """Say what of the machine and the extras is there, and whether what every run needs works."""
+
+    json: bool = option("--json", False)
+    "print the findings as JSON to stdout, nothing else"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf import doctor
+        findings = doctor.examine()
+        if self.json:
+            told = {"works": not doctor.is_broken(findings), "findings": [*map(asdict, findings)]}
+            show(json.dumps(told, indent=2), whole=True)
+        else:
+            show("\n".join(map(printable, doctor.lines(findings))))
+        return EnvironmentFailure.exit_code if doctor.is_broken(findings) else 0
+
+
 class PluginPath(Command):
     """Print what to put into PXR_PLUGINPATH_NAME."""
 
@@ -425,6 +446,7 @@ _OTHERS = (
     Validate,
     Rules,
     Adapters,
+    Doctor,
     PluginPath,
 )
 COMMANDS = {
