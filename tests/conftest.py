@@ -76,6 +76,7 @@ NIGHTLY = (
     "physics/test_recovery.py::"
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
+    "test_docs.py::test_the_commands_of_tutorials_run",
 )
 
 
