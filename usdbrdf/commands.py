@@ -10,10 +10,10 @@ import os
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from usdbrdf import options
-from usdbrdf.command_parser import Command
+from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show, tell
@@ -418,6 +418,17 @@ class Doctor(Command):
         return EnvironmentFailure.exit_code if doctor.is_broken(findings) else 0
 
 
+class Completion(Command):
+    """Print what lets a shell complete command lines."""
+
+    shell: Literal["bash", "zsh", "fish"] = option("SHELL", REQUIRED)
+    "bash, zsh or fish; for bash: source <(usdbrdf completion bash)"
+
+    def run(self) -> int:
+        show(completion(self.shell, COMMANDS))
+        return 0
+
+
 class PluginPath(Command):
     """Print what to put into PXR_PLUGINPATH_NAME."""
 
@@ -447,6 +458,7 @@ _OTHERS = (
     Rules,
     Adapters,
     Doctor,
+    Completion,
     PluginPath,
 )
 COMMANDS = {
