@@ -18,7 +18,7 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.job import child as module
-from usdbrdf.job.child import beside, run_child
+from usdbrdf.job.child import run_child
 
 CHILDREN = """
 import os, signal, sys, time
@@ -143,7 +143,7 @@ def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):
 
 def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
     note = tmp_path / "note"
-    with beside("toy_children:note", {"note": str(note)}, "beside"):
+    with module.child("toy_children:note", {}, {"note": str(note)}, 600, "beside"):
         deadline = time.monotonic() + 30
         while not (note.exists() and note.read_text()):
             assert time.monotonic() < deadline
@@ -155,7 +155,7 @@ def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
 
 
 def test_what_a_child_beside_cannot_do_is_nobodys_concern(child, capfd):
-    with beside("toy_children:broken", {}, "beside"):
+    with module.child("toy_children:broken", {}, {}, 600, "beside"):
         time.sleep(0.1)
     assert capfd.readouterr() == ("", "")
 

@@ -34,11 +34,11 @@ def test_nothing_is_started_where_all_was_compiled(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(first_run, "mark_of_compiled", lambda _: mark)
     monkeypatch.setattr(first_run.os, "cpu_count", lambda: 2)
 
-    def beside(function, parameters, label):
+    def child(function, arrays, parameters, timeout_s, label):
         started.append((function, parameters))
         return open(os.devnull)
 
-    monkeypatch.setattr(first_run, "beside", beside)
+    monkeypatch.setattr(first_run, "child", child)
     with compiling_beside():
         assert started == [("usdbrdf.warm_up:compile_all", {"done": str(mark)})]
     assert "compiling for this machine" in capsys.readouterr().err

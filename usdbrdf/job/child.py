@@ -21,9 +21,9 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,6 @@ def _sweep(parent: str) -> None:
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
-_LONG_SECONDS = 600  # for a child beside us that is ended with us
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _ERROR_CLASSES = {
@@ -96,90 +95,58 @@ def run_child(
     *,
     memory_limit_bytes: int | None = None,
 ) -> dict[str, Array]:
-    """The arrays that ``function`` ("package.module:name") returns, called as f(arrays, parameters)
-    in a child process; parameters must be JSON.
+    """What a ``child`` returns that works alone."""
+    with child(
+        function, arrays, parameters, timeout_s, label, memory_limit_bytes=memory_limit_bytes
+    ) as result:
+        return result()
 
-    timeout_s            wall time after which it is killed
+
+@contextmanager
+def child(
+    function: str,
+    arrays: Mapping[str, Array],
+    parameters: Mapping[str, Any],
+    timeout_s: float,
+    label: str,
+    *,
+    memory_limit_bytes: int | None = None,
+) -> Iterator[Callable[[], dict[str, Array]]]:
+    """A child process at work on ``function`` ("package.module:name"), called as f(arrays,
+    parameters); parameters must be JSON. What the block is given waits for it to end and gives the
+    arrays that it returns; at the end of the block it is killed.
+
+    timeout_s            wall time that is waited for it
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
 
-    A UsdBrdfError raised there is raised here with its class. Death by a signal is a CrashedChild,
-    an InputRefused; running out of time a LateChild, an EnvironmentFailure as running out of
-    memory, SIGKILL and what cannot be imported there are.
+    A UsdBrdfError raised there is raised by the waiting, with its class. Death by a signal is a
+    CrashedChild, an InputRefused; running out of time a LateChild, an EnvironmentFailure as running
+    out of memory, SIGKILL and what cannot be imported there are.
     """
     with scratch_folder() as folder:
         with environment_failures(label):
             save_arrays(folder / "arrays.npz", arrays)
-            _write_task(folder, function, parameters, timeout_s, label, memory_limit_bytes)
-        status = _run(folder, timeout_s, label)
-        if status == _ERROR_TOLD:
-            told = json.loads((folder / "error.json").read_text("utf-8"))
-            if told["class"] in _ERROR_CLASSES:
-                raise _ERROR_CLASSES[told["class"]](told["message"])
-            raise UsdBrdfError(
-                f"{label} failed: {told['class']}: {told['message']}. [child.failed]"
-            ) from RuntimeError(told["traceback"])
-        if status != 0:
-            raise _crash(status, folder, label)
-        return load_arrays(folder / "result.npz")
+            task = {
+                "function": function,
+                "parameters": dict(parameters),
+                "label": label,
+                "parent": os.getpid(),
+                "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
+                "memory_limit_bytes": memory_limit_bytes,
+            }
+            (folder / "task.json").write_text(json_text(task), "utf-8")
+        with _started(folder, label) as process:
+            yield partial(_result, process, folder, timeout_s, label)
 
 
 @contextmanager
-def beside(function: str, parameters: Mapping[str, Any], label: str) -> Iterator[None]:
-    """The same without arrays, in a child that works beside this block and is ended with it: what
-    it leaves in files is all that counts, and nothing is said of its failure."""
-    with scratch_folder() as folder:
-        process = None
-        with suppress(OSError):
-            save_arrays(folder / "arrays.npz", {})
-            _write_task(folder, function, parameters, _LONG_SECONDS, label, None)
-            process = _start(folder)
-        try:
-            yield
-        finally:
-            if process is not None:
-                _end(process)
-
-
-def _write_task(
-    folder: Path,
-    function: str,
-    parameters: Mapping[str, Any],
-    timeout_s: float,
-    label: str,
-    memory_limit_bytes: int | None,
-) -> None:
-    task = {
-        "function": function,
-        "parameters": dict(parameters),
-        "label": label,
-        "parent": os.getpid(),
-        "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
-        "memory_limit_bytes": memory_limit_bytes,
-    }
-    (folder / "task.json").write_text(json_text(task), "utf-8")
-
-
-def _run(folder: Path, timeout_s: float, label: str) -> int:
-    with environment_failures(label):
-        process = _start(folder)
-    try:
-        return process.wait(timeout_s)
-    except subprocess.TimeoutExpired as error:
-        raise LateChild(
-            f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
-            "again when the machine is less busy, or simplify the input. [child.timeout]"
-        ) from error
-    finally:  # also on Ctrl-C
-        _end(process)
-
-
-def _start(folder: Path) -> subprocess.Popen[bytes]:
+def _started(folder: Path, label: str) -> Iterator[subprocess.Popen[bytes]]:
     # The child imports what we can import. It runs in the scratch folder, so that "-c" does not
     # put the caller's working folder, and whatever lies there, first on its path.
     search = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
-    with (folder / "said").open("wb") as said:
-        return subprocess.Popen(
+    with environment_failures(label), (folder / "said").open("wb") as said:
+        process = subprocess.Popen(
             [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": search},
@@ -188,13 +155,34 @@ def _start(folder: Path) -> subprocess.Popen[bytes]:
             stderr=said,
             start_new_session=True,
         )
+    try:
+        yield process
+    finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Nothing of a child may outlive us, nor what it started itself."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+def _result(
+    process: subprocess.Popen[bytes], folder: Path, timeout_s: float, label: str
+) -> dict[str, Array]:
+    try:
+        status = process.wait(timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise LateChild(
+            f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
+            "again when the machine is less busy, or simplify the input. [child.timeout]"
+        ) from error
+    if status == _ERROR_TOLD:
+        told = json.loads((folder / "error.json").read_text("utf-8"))
+        if told["class"] in _ERROR_CLASSES:
+            raise _ERROR_CLASSES[told["class"]](told["message"])
+        raise UsdBrdfError(
+            f"{label} failed: {told['class']}: {told['message']}. [child.failed]"
+        ) from RuntimeError(told["traceback"])
+    if status != 0:
+        raise _crash(status, folder, label)
+    return load_arrays(folder / "result.npz")
 
 
 def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
