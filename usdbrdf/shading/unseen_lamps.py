@@ -169,6 +169,7 @@ def _strengths(
         deviation=np.full(count, _DEVIATION),
         bound=np.zeros(count, np.bool_),
         pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
     )
     found = solved(asked, sources)
     error = jackknife(asked, sources, found).max(axis=1)
