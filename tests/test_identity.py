@@ -31,6 +31,15 @@ found = probe(np.arange(3))
 kept = "compiled" if probe.stats.cache_misses else "loaded"
 print(kept, probe.stats.cache_path, found.sum())
 """
+_TOLD = """
+import numpy as np
+from usdbrdf.kernel import when_compiling
+from usdbrdf.transport.probe import probe
+told = []
+with when_compiling(lambda: told.append(1)):
+    probe(np.arange(3))
+print(len(told) > 0)
+"""
 _TASK = """
 import pathlib
 from usdbrdf.job.stamp import stamp_of, stamp_path, why_rerun, write_stamp
@@ -115,6 +124,11 @@ def test_an_edit_of_any_source_runs_the_tasks_again(copy, source):
         file.write("\n")
     assert _run(copy, _TASK) == ["code", "changed"]
     assert _run(copy, _TASK) == ["done"]
+
+
+def test_what_has_to_be_compiled_is_told(copy):
+    assert _run(copy, _TOLD) == ["True"]
+    assert _run(copy, _TOLD) == ["False"]
 
 
 def test_damaged_kernels_are_compiled_again(copy):

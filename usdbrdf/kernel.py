@@ -22,7 +22,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -71,6 +71,8 @@ class KernelCache(Cache):  # type: ignore[misc]
         found = _unsealed(file) if file else None
         if file and found is None:
             self._end_turn()
+            if _told is not None:
+                _told()
             self._turn = _turn_to_compile(file)
             found = _unsealed(file)  # another process may have compiled it meanwhile
         if found is None or found[0] != key:
@@ -143,6 +145,20 @@ def _turn_to_compile(file: Path) -> BinaryIO | None:
         Path(lock.name).unlink()
     lock.close()
     return None
+
+
+_told: Callable[[], object] | None = None
+
+
+@contextlib.contextmanager
+def when_compiling(told: Callable[[], object]) -> Iterator[None]:
+    """In here ``told`` is called whenever a kernel has to be compiled that could have been kept."""
+    global _told
+    before, _told = _told, told
+    try:
+        yield
+    finally:
+        _told = before
 
 
 def mark_of_compiled(identity: str) -> Path | None:

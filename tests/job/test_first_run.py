@@ -6,7 +6,12 @@ import json
 import os
 import subprocess
 import sys
+import time
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.job import first_run
@@ -29,27 +34,57 @@ print(json.dumps(compiled))
 """
 
 
-def test_nothing_is_started_where_all_was_compiled(tmp_path, monkeypatch, capsys):
-    mark, started = tmp_path / "done", []
-    monkeypatch.setattr(first_run, "mark_of_compiled", lambda _: mark)
-    monkeypatch.setattr(first_run.os, "cpu_count", lambda: 2)
+@pytest.fixture
+def started(tmp_path, monkeypatch):
+    """What was started, and of what the first compiled kernel tells."""
+    found, ended, told = [], [], []
 
+    @contextmanager
     def child(function, arrays, parameters, timeout_s, label):
-        started.append((function, parameters))
-        return open(os.devnull)
+        found.append((function, parameters))
+        try:
+            yield
+        finally:
+            ended.append(function)
 
+    @contextmanager
+    def when_compiling(tell):
+        told.append(tell)
+        yield
+
+    monkeypatch.setattr(first_run, "mark_of_compiled", lambda _: tmp_path / "done")
+    monkeypatch.setattr(first_run.os, "cpu_count", lambda: 2)
     monkeypatch.setattr(first_run, "child", child)
+    monkeypatch.setattr(first_run, "when_compiling", when_compiling)
+    return SimpleNamespace(found=found, ended=ended, told=told, mark=tmp_path / "done")
+
+
+def test_it_begins_with_the_first_kernel_that_is_compiled(started, capsys):
     with compiling_beside():
-        assert started == [("usdbrdf.warm_up:compile_all", {"done": str(mark)})]
-    assert "compiling for this machine" in capsys.readouterr().err
-    mark.touch()
+        assert started.found == []
+        started.told[0]()
+        deadline = time.monotonic() + 30
+        while not started.found:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        started.told[0]()
+    assert started.found == [("usdbrdf.warm_up:compile_all", {"done": str(started.mark)})]
+    assert len(started.ended) == 1
+    assert capsys.readouterr().err.count("compiling for this machine") == 1
+
+
+def test_nothing_is_started_where_nothing_is_compiled(started, monkeypatch, capsys):
     with compiling_beside():
-        assert len(started) == 1
-    assert capsys.readouterr().err == ""
-    mark.unlink()
+        pass
+    started.mark.touch()
+    with compiling_beside():
+        assert len(started.told) == 1
+    started.mark.unlink()
     monkeypatch.setattr(first_run.os, "cpu_count", lambda: 1)
     with compiling_beside():
-        assert len(started) == 1
+        assert len(started.told) == 1
+    assert started.found == []
+    assert capsys.readouterr().err == ""
 
 
 def test_the_room_is_a_capture(tmp_path):
