@@ -41,6 +41,7 @@ SLOW = (
     "shading/test_denoise.py",
     "shading/test_denoise_default.py",
     "shading/test_outside.py",
+    "tasks/test_directives.py",
     "tasks/test_texture.py",
     "test_cli.py",
     "test_convert.py",

@@ -240,6 +240,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_FRAMES": "memory",
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
+    "_OTHER_SEED": "a seed",
     "_PARTS": "blocks of a jackknife",
     "_PER_CODE": "time",
     "_PER_PIXEL": "bytes",

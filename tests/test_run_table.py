@@ -43,6 +43,13 @@ def test_objects_by_status_and_what_needs_a_look():
     assert lines[-1].split() == ["stage", str(ROOT)]
 
 
+def test_what_a_person_left_out_needs_no_look():
+    objects = {"pane": {**_fit("prior"), "directive": "glass"}, "a": _fit("measured", phi=0.1)}
+    lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)
+    assert lines[0].endswith("2: 1 measured, 1 not fitted, as a person asked")
+    assert "pane" not in "\n".join(lines)
+
+
 def test_a_long_list_is_cut():
     objects = {f"thing_{i:02d}": _fit("prior", phi=0.5, psi=0.5) for i in range(40)}
     lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from usdbrdf.delivery.package import package as package
     from usdbrdf.evaluation.compare_assets import compare as compare
     from usdbrdf.evaluation.evaluate_views import evaluate as evaluate
+    from usdbrdf.options import CompareOptions as CompareOptions
     from usdbrdf.options import ConvertOptions as ConvertOptions
     from usdbrdf.options import EvaluateOptions as EvaluateOptions
     from usdbrdf.options import FitOptions as FitOptions
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "usdbrdf.options": (
-        *("ConvertOptions", "EvaluateOptions", "FitOptions", "IngestOptions", "Insert"),
+        *("CompareOptions", "ConvertOptions", "EvaluateOptions", "FitOptions"),
+        *("IngestOptions", "Insert"),
         *("PackageOptions", "RelightOptions", "ReportOptions", "Sampling"),
         *("ShadeOptions", "TextureOptions"),
     ),

@@ -270,11 +270,12 @@ class Compare(_Talking):
     "another of the same scene; it is not changed"
     output: Path = option("-o --output FOLDER", Path("comparison"))
     "folder for figures and pictures, made if it is not there"
+    options: options.CompareOptions
 
     def run(self) -> int:
         with loading():
             from usdbrdf.evaluation import compare_assets as made
-        found = made.compare(self.first, self.second, self.output)
+        found = made.compare(self.first, self.second, self.output, self.options)
         written = f"{self.output / made.DOCUMENT}: written"
         summary = {"output": str(self.output), **made.figures(found)}
         return self.told(summary, made.comparison_line(found), written)

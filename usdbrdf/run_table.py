@@ -12,10 +12,12 @@ _MOST_ROWS = 12
 _WORDS = {
     "measured": ("measured", ""),
     "lamp": ("lamps", ""),
+    "unfitted": ("not fitted, as a person asked", ""),
     "prior": ("not determined", "frames that see highlights on them would tell"),
     "unseen": ("unseen", "no frame shows them: all about them is a guess"),
     "failed": ("failed", "the target frame does not determine them"),
 }
+_NOT_FITTED = ("ignore", "glass")
 
 
 def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
@@ -43,10 +45,14 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
 
 
 def _statuses(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Of each object; a lamp's is that it shines."""
+    """Of each object; a lamp's is that it shines, a pane's that a person said so."""
     lamps = {name for part in _parts(steps["shade"]) for name in part.get("emitters", ())}
     return {
-        name: "lamp" if name in lamps else str(found["status"])
+        name: "lamp"
+        if name in lamps
+        else "unfitted"
+        if found.get("directive") in _NOT_FITTED
+        else str(found["status"])
         for name, found in steps["fit"]["objects"].items()
     }
 

@@ -207,6 +207,10 @@ def chair_that_was_judged_with_other_numbers(built):
     said_in_a_review(built, verdict="accept", **{**seen_of_chair(built), "phi": 0.99})
 
 
+def chair_that_is_to_be_a_metal(built):
+    said_in_a_review(built, directive="metal", **seen_of_chair(built))
+
+
 def seen_of_chair(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     prim = stage.GetPrimAtPath(CHAIR)
@@ -247,6 +251,7 @@ FAULTS = {
     "LightsSelection": lights_that_are_not_there,
     "LampTwice": lamp_that_glows_beside_its_lights,
     "ReviewRecord": verdict_of_another_word,
+    "ReviewDirectives": chair_that_is_to_be_a_metal,
     "ReviewRejected": chair_that_was_rejected,
     "ReviewOutdated": chair_that_was_judged_with_other_numbers,
 }

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.asset.directives import by_number, directives_of
 from usdbrdf.asset.layers.task_layers import (
     Lamp,
     world_from_root,
@@ -16,7 +17,7 @@ from usdbrdf.asset.layers.task_layers import (
 )
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import ShadedObject, colour
+from usdbrdf.asset.properties import LAMP, OF_SHADE, ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
@@ -32,6 +33,11 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
     maps = AssetMaps(open_weaker(asset, "shading"))
+    asked = directives_of(asset, maps.stage, OF_SHADE)
+    inputs = hashes_of_inputs(
+        asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
+        photographs=options.environment == ESTIMATE,
+    )  # fmt: skip
     task = Task(
         asset=asset,
         name="shade",
@@ -40,25 +46,19 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
             **asdict(options.sampling),
             "denoise": lightmap_filter,
             "environment": kind_of_light(options.environment),
+            **({"directives": asked} if asked else {}),
         },
-        inputs=hashes_of_inputs(
-            asset,
-            "shading",
-            maps,
-            aovs=("lit", "coverage"),
-            environment=options.environment,
-            photographs=options.environment == ESTIMATE,
-        ),
+        inputs=inputs,
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
-        shaded = shade_surface(
-            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
-        )
+        said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
+        given = maps.surface, maps.lit, maps.coverage, outside
+        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
-        objects = _write_maps(writer, shaded)
+        objects = _write_maps(writer, shaded, asked)
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
         lamps = [
@@ -83,7 +83,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     return task.run(work)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
+def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> list[ShadedObject]:
     """Every object's pictures, and the record that names them."""
     traced = shaded.traced
     maps = {
@@ -114,6 +114,7 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
                 rays_per_texel=float(traced.rays[own].mean()),
                 standard_error=float(np.median(shaded.relative_error[own])),
                 escaped_fraction=float(mean(traced.escaped)),
+                directive=asked.get(obj.identifier, ""),
             )
         )
     return objects
