@@ -105,7 +105,7 @@ def supply(session: nox.Session) -> None:
 def docs(session: nox.Session) -> None:
     """The documentation as a site, in out/site."""
     install(session, "docs")
-    session.run("mkdocs", "build", "--strict", "-q", "-d", "out/site")
+    session.run("mkdocs", "build", "--strict", "-d", "out/site")
 
 
 @nox.session

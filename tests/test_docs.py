@@ -80,7 +80,7 @@ def test_the_commands_of_tutorials_run(tmp_path):
 def test_the_site_is_whole(tmp_path):
     pytest.importorskip("mkdocstrings", reason="needs the extra docs")
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path / "site")],
         cwd=ROOT, env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
         capture_output=True, text=True,
     )  # fmt: skip
