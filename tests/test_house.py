@@ -91,8 +91,7 @@ IMPORTERS: dict[str, set[str]] = {
         "texturing/",
         "transport/",
     },
-    "omni": {"validation/omniverse.py"},
-    "OpenImageIO": {"files/images.py"},
+    "OpenImageIO": {"files/images.py", "files/published_images.py"},
     "pickle": {"kernel.py"},
     "PIL": {"delivery/"},
     "psutil": {"job/memory.py"},
@@ -107,6 +106,7 @@ IMPORTERS: dict[str, set[str]] = {
     "threadpoolctl": {"material/fit_objects.py"},
     "tqdm": {"job/progress.py"},
     "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
+    "usd_validation_nvidia": {"validation/nvidia.py"},
     "xatlas": {"geometry/unwrap.py"},
 }
 

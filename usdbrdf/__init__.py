@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from usdbrdf.delivery.package import package as package
+    from usdbrdf.delivery.publish import publish as publish
     from usdbrdf.evaluation.compare_assets import compare as compare
     from usdbrdf.evaluation.evaluate_views import evaluate as evaluate
     from usdbrdf.options import CompareOptions as CompareOptions
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from usdbrdf.options import IngestOptions as IngestOptions
     from usdbrdf.options import Insert as Insert
     from usdbrdf.options import PackageOptions as PackageOptions
+    from usdbrdf.options import PublishOptions as PublishOptions
     from usdbrdf.options import RelightOptions as RelightOptions
     from usdbrdf.options import ReportOptions as ReportOptions
     from usdbrdf.options import Sampling as Sampling
@@ -43,11 +45,12 @@ _HOMES = {
     "usdbrdf.options": (
         *("CompareOptions", "ConvertOptions", "EvaluateOptions", "FitOptions"),
         *("IngestOptions", "Insert"),
-        *("PackageOptions", "RelightOptions", "ReportOptions", "Sampling"),
-        *("ShadeOptions", "TextureOptions"),
+        *("PackageOptions", "PublishOptions", "RelightOptions", "ReportOptions"),
+        *("Sampling", "ShadeOptions", "TextureOptions"),
     ),
     "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
     "usdbrdf.delivery.package": ("package",),
+    "usdbrdf.delivery.publish": ("publish",),
     "usdbrdf.evaluation.compare_assets": ("compare",),
     "usdbrdf.evaluation.evaluate_views": ("evaluate",),
     "usdbrdf.page.report": ("report",),

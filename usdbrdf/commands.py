@@ -39,11 +39,14 @@ class _Talking(TalkOptions, Command):
         return 0
 
 
-class _Run(_Talking):
+class _Locking(Command):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
     without_lock: bool = option("--without-lock", False)
     """go on where the file system has no locks: see that nothing else writes into the asset"""
+
+
+class _Run(_Locking, _Talking):
     strict: bool = option("--strict", False)
     "exit with 7 if a step of this asset warned, now or when it was done"
 
@@ -309,6 +312,28 @@ class Package(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
+class Publish(_Locking, _WithAsset):
+    """Write the asset as a version that never changes, for others to take in."""
+
+    destination: Path = option("DEST", REQUIRED)
+    "folder of all its versions, made if it is not there"
+    options: options.PublishOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.delivery.publish import publish
+        summary = publish(
+            self.asset,
+            self.destination,
+            self.options,
+            wait_s=self.wait_s,
+            without_lock=self.without_lock,
+        )
+        done = f"written, {summary['files']} files, {summary['bytes']:,} bytes"
+        told = done if summary["new"] else "holds this already, nothing was written"
+        return self.told(summary, f"{summary['publish']}: {told}")
+
+
 class Report(_WithAsset):
     """Write one HTML page on which people see whether to believe the asset."""
 
@@ -453,6 +478,7 @@ _OTHERS = (
     Compare,
     Relight,
     Package,
+    Publish,
     Report,
     View,
     Validate,

@@ -69,6 +69,15 @@ def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
     return option("--allow-outside DIR", (), unset="none", help=text)
 
 
+TextureSpace = Literal["rec709", "acescg"]
+
+
+def _texture_space() -> TextureSpace:
+    who = "acescg for programs that render in it and convert nothing"
+    text = f"linear space of textures and other colours: rec709, or {who}"
+    return option("--texture-space", "rec709", help=text)
+
+
 class TalkOptions(Options):
     """What is said while a command runs and at its end."""
 
@@ -412,6 +421,25 @@ class PackageOptions(Options):
     lighting: str | None = _lighting()
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
+    texture_space: TextureSpace = _texture_space()
+    whole: bool = option("--whole", False)
+    """.usdz of the layers as they are, all looks and lightings as variants, in the place of one
+    look made flat"""
+
+
+class PublishOptions(Options):
+    """What a published version of an asset is."""
+
+    version: str | None = option("--version vNNN", None, unset="the one after the latest")
+    "its name"
+    uri: str | None = option("--uri TEMPLATE", None, unset="./NAME.usd")
+    """identifier in assetInfo, for a studio's resolver: a URI with {{name}} and {{version}}, such
+    as 'ayon+entity://show/assets?product={{name}}&version={{version}}'"""
+    photographs: bool = option("--no-photographs", True)
+    "leave the photographs out; else they are copied without EXIF, GPS and the like"
+    texture_space: TextureSpace = _texture_space()
+    encoding: Literal["text", "binary"] = option("--encoding", "text")
+    "of the root layer, NAME.usd"
 
 
 class ReportOptions(Options):

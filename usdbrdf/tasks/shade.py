@@ -38,18 +38,13 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
         photographs=options.environment == ESTIMATE,
     )  # fmt: skip
-    task = Task(
-        asset=asset,
-        name="shade",
-        role="shading",
-        parameters={
-            **asdict(options.sampling),
-            "denoise": lightmap_filter,
-            "environment": kind_of_light(options.environment),
-            **({"directives": asked} if asked else {}),
-        },
-        inputs=inputs,
-    )
+    parameters = {
+        **asdict(options.sampling),
+        "denoise": lightmap_filter,
+        "environment": kind_of_light(options.environment),
+        **({"directives": asked} if asked else {}),
+    }
+    task = Task(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
@@ -88,13 +83,14 @@ def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> lis
     traced = shaded.traced
     maps = {
         "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
-        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2"),
+        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2", colour=False),
         "albedo": TexelMap(shaded.albedo, 1.0, "1"),
     }
     if shaded.irradiance is not traced.mean:
         maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
     if shaded.unexplained.any():
-        maps["unexplained"] = TexelMap(shaded.unexplained.astype(np.float32), 1.0, "1")
+        unexplained = shaded.unexplained.astype(np.float32)
+        maps["unexplained"] = TexelMap(unexplained, 1.0, "1", colour=False)
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
     emitters, objects = shaded.emitters, []
     for i, obj in enumerate(writer.scene.objects):

@@ -412,9 +412,10 @@ def _author_diffuse(
     """A metal's reflectance, the diffuse colour, or of glass none; returns its texture as
     ``_author_colour``."""
     if item.is_metal:
-        return _author_plain(layer, material, shown_metal(item.phi, item.f0, item.mapping))
+        metal = shown_metal(item.phi, item.f0, item.mapping)
+        return _author_plain(layer, material, metal, shading)
     if item.is_glass:
-        return _author_plain(layer, material, (0.0, 0.0, 0.0))
+        return _author_plain(layer, material, (0.0, 0.0, 0.0), shading)
     return _author_colour(layer, material, item, scale, shading)
 
 
@@ -429,6 +430,7 @@ def _author_colour(
                 layer, material, "diffuseColor", "BaseColorTexture", aov.file,
                 scale=scale, fallback=item.mean_color,
             )  # fmt: skip
+            _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
             return path_in_layer(aov.file)
     albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
     if albedo is None:
@@ -438,9 +440,16 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _author_plain(layer: Sdf.Layer, material: str, colour: Colour) -> str:
+def _leave_out(layer: Sdf.Layer, node: str, shading: Sdf.Layer) -> None:
+    """Deactivate a node of a weaker layer that nothing in the network reads any more."""
+    if shading.GetPrimAtPath(node):
+        over(layer, node).active = False
+
+
+def _author_plain(layer: Sdf.Layer, material: str, colour: Colour, shading: Sdf.Layer) -> str:
     """One reflectance in the place of a texture; returns that there is none."""
     shader = over(layer, f"{material}/{SURFACE}")
+    _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
     author_inputs(shader, Types.Color3f, diffuseColor=Gf.Vec3f(*colour))
     # An empty list that is explicit takes off the connection of the layer beneath.
     spec = layer.GetAttributeAtPath(f"{shader.path}.inputs:diffuseColor")
