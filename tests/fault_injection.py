@@ -70,7 +70,7 @@ class Fault:
         self._note_tasks(patch)
         self._around_renames(patch)
         self._around_stamps(patch)
-        around(usdbrdf.files.images, "_write", before="image:before_write")
+        around(usdbrdf.files.images, "write_image", before="image:before_write")
         around(task.TaskRun, "_place", after="{task}:before_write")
         around(task.TaskRun, "save", after="{task}:checkpoint")
         around(task, "move", after="{task}:mid_publish")

@@ -193,7 +193,7 @@ def test_a_file_that_does_not_read_back_is_not_published(tmp_path, monkeypatch, 
         pixels[-1, -1, -1] += 1
         write(path, staged, spec, pixels)
 
-    monkeypatch.setattr(images, "_write", losing)
+    monkeypatch.setattr(images, "write_image", losing)
     with pytest.raises(EnvironmentFailure, match=r"does not read back.+\[image\.write\]$"):
         write_exr(path, radiance + 1)
     assert path.read_bytes() == before
@@ -492,7 +492,7 @@ def test_whatever_the_decoder_raises_is_a_refusal(tmp_path, monkeypatch, radianc
         def read_image(self, *_):
             raise error(*(("utf-8", b"", 0, 1, "x") if error is UnicodeDecodeError else ("boom",)))
 
-    monkeypatch.setattr(images, "_open", lambda path, max_side: Stumbling())
+    monkeypatch.setattr(images, "open_image", lambda path, max_side: Stumbling())
     with pytest.raises(ImageRefused, match=r"truncated or damaged.*\[image\.truncated\]$"):
         read_radiance(tmp_path / "a.exr")
 
