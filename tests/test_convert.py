@@ -103,7 +103,7 @@ def copy(base, asset, request):
 
 
 def prim_of(stage: Usd.Stage, name: str) -> Usd.Prim:
-    return stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{name}")
+    return stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{name}/{name}")
 
 
 def surface_of(prim: Usd.Prim) -> UsdShade.Shader:

@@ -66,7 +66,7 @@ def asset(base, captures) -> Asset:
 
 def _colour(stage: Usd.Stage, name: str) -> list[str]:
     """The prims that the diffuse and the emissive colour of an object's material come from."""
-    prim = stage.GetPrimAtPath(f"/room/geo/{name}")
+    prim = stage.GetPrimAtPath(f"/room/geo/{name}/{name}")
     surface = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
     inputs = [surface.GetInput(f"{kind}Color") for kind in ("diffuse", "emissive")]
     return [str(own.GetValueProducingAttributes()[0].GetPrim().GetName()) for own in inputs]
@@ -81,7 +81,7 @@ def test_each_lighting_has_layers_and_maps_of_its_own(asset):
     assert layers == each | shared
     for name, wall in zip(LIGHTINGS, (0.25, 0.25), strict=True):
         stage = open_edited(asset.in_lighting(name))
-        file = aov_path(stage, "/room/geo/floor", "lit")
+        file = aov_path(stage, "/room/geo/floor/floor", "lit")
         assert file == asset.folder / "textures" / name / "floor.lit.exr"
         shown = read_exr(file)[..., 0]
         assert np.median(shown) == pytest.approx(wall, rel=0.02)
@@ -93,18 +93,18 @@ def test_the_root_layer_opens_in_the_first_and_others_can_be_chosen(asset):
     choice = stage.GetDefaultPrim().GetVariantSet("lighting")
     assert choice.GetVariantNames() == [*LIGHTINGS]
     assert choice.GetVariantSelection() == "day"
-    assert read_shading(stage, "/room/geo/lamp").radiance[0] == pytest.approx(8, rel=0.01)
+    assert read_shading(stage, "/room/geo/lamp/lamp").radiance[0] == pytest.approx(8, rel=0.01)
     choice.SetVariantSelection("night")
-    assert read_shading(stage, "/room/geo/box").radiance[0] == pytest.approx(6, rel=0.01)
-    assert not read_shading(stage, "/room/geo/lamp").emitter
+    assert read_shading(stage, "/room/geo/box/box").radiance[0] == pytest.approx(6, rel=0.01)
+    assert not read_shading(stage, "/room/geo/lamp/lamp").emitter
 
 
 def test_all_lightings_show_one_base_colour_and_one_lobe(asset):
     found = []
     for name in LIGHTINGS:
         stage = open_edited(asset.in_lighting(name))
-        files = [aov_path(stage, f"/room/geo/{o}", "base_color") for o in ("floor", "lamp")]
-        lobes = [stage.GetAttributeAtPath(f"/room/geo/floor.usdBrdf:fit:{n}").Get()
+        files = [aov_path(stage, f"/room/geo/{o}/{o}", "base_color") for o in ("floor", "lamp")]
+        lobes = [stage.GetAttributeAtPath(f"/room/geo/floor/floor.usdBrdf:fit:{n}").Get()
                  for n in ("phi", "psi")]  # fmt: skip
         found.append((files, lobes))
         assert _colour(stage, "floor") == ["BaseColorTexture", "PreviewSurface"]
