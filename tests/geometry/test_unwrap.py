@@ -153,21 +153,21 @@ def test_an_object_that_the_unwrapper_cannot_take_is_packed_triangle_by_triangle
     """Alone: the others keep their charts. The child that ends is a real one."""
     scene = _two_squares()
     first = scene.objects[0].num_faces
-    run = module.run_child
+    child = module.child
 
     def ending(function, arrays, parameters, seconds, label):
         # The second object lies at z = 1.
         if not (arrays["points"][arrays["triangles"]][..., 2] == 1).any():
-            return run(function, arrays, parameters, seconds, label)
-        return run(f"{__name__}:{end}", arrays, parameters, 60 if end == "crash" else 1, label)
+            return child(function, arrays, parameters, seconds, label)
+        return child(f"{__name__}:{end}", arrays, parameters, 60 if end == "crash" else 1, label)
 
-    monkeypatch.setattr(module, "run_child", ending)
+    monkeypatch.setattr(module, "child", ending)
     uv, resolution = unwrap(scene, TexelSizes.even(scene, 0.1))
     _whole(scene, uv, resolution)
     expected, size = pack_triangles_singly(scene.points[scene.triangles[first:]], 0.1)
     np.testing.assert_array_equal(uv[first:], expected)
     assert tuple(resolution[1]) == size
-    monkeypatch.setattr(module, "run_child", run)
+    monkeypatch.setattr(module, "child", child)
     alone = unwrap(scene, TexelSizes.even(scene, 0.1))
     np.testing.assert_array_equal(uv[:first], alone[0][:first])
     said = capsys.readouterr().err
@@ -191,7 +191,7 @@ def test_an_atlas_too_large_after_that_is_refused(monkeypatch, capsys):
     def crashing(*_):
         raise CrashedChild("unwrapping crashed (SIGSEGV). Repair the input. [child.crashed]")
 
-    monkeypatch.setattr(module, "run_child", crashing)
+    monkeypatch.setattr(module, "child", crashing)
     with pytest.raises(InputRefused, match=r"\[texturing\.size\]$"):
         unwrap(scene, TexelSizes.even(scene, 0.05))
 

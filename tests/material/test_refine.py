@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,7 @@ from usdbrdf.material import refine
 from usdbrdf.material.refine import Lighting, Lobes, Refined, refined_irradiance, refined_light
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading import shaded
+from usdbrdf.texturing.robust_mean import RobustMean
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
@@ -281,6 +283,27 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     assert np.median(np.abs(share / change - 1)) < 0.05
     lit_there = atlas.map("lit")[unseen]
     assert np.median(np.abs(given[0][unseen] / lit_there - 1)) > 0.1
+
+
+def test_what_is_too_dark_for_a_sample_stays_dark(room: Room):
+    """Texels of the floor that no frame measured to more than that; not those around them."""
+    atlas = room.clean
+    lit = np.array(atlas.lit)
+    own = np.flatnonzero(atlas.coverage.measured & (atlas.texels.object_index() == 0))
+    dark = own[np.arange(len(own)) % 7 < 3]
+    lit[dark] = 1e-5
+    before = SimpleNamespace(
+        lit=lit, emission=atlas.emission, emissive=atlas.emissive, coverage=atlas.coverage
+    )
+    lobes, lighting = _lobes(atlas), Lighting("", atlas.lit_scene(black_environment()), before, ())
+    level = refine._level(lit)[:, None]
+    mean = np.where(atlas.coverage.measured[:, None], lit / level, np.nan).astype(np.float32)
+    mean[dark] = np.nan
+    flat = np.zeros(len(lit), np.float32)
+    found = RobustMean(mean, flat, np.zeros((len(lit), 3), np.float32))
+    diffuse, error = refine._diffuse_of_means(lighting, found, lobes)
+    np.testing.assert_allclose(diffuse[dark], 1e-5, rtol=1e-3)
+    assert np.isinf(error[dark]).all()
 
 
 def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):

@@ -120,7 +120,7 @@ def _samples(parts: list[Part], pose: np.ndarray, image: np.ndarray) -> list[np.
     camera = camera_at(pose, (60.0, 60.0, 40.0, 30.0), 80, 60)
     surfaces = first_surfaces(world.rays, world.scene.face_object, camera)
     everywhere = np.ones(image.shape[:2], np.bool_)
-    picture = Picture(image, everywhere, ~everywhere)
+    picture = Picture(image, everywhere, ~everywhere, ~everywhere)
     kind, radiance = samples_from_frame(
         world.texels, world.texels.object_index(), surfaces, picture, camera
     )

@@ -8,8 +8,15 @@ import pytest
 from tests.scenes import make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import IngestOptions
-from usdbrdf.shading.surroundings import HEIGHT, WIDTH, share_outside, surroundings_from_frames
+from usdbrdf.shading.surroundings import (
+    HEIGHT,
+    WIDTH,
+    Surroundings,
+    share_outside,
+    surroundings_from_frames,
+)
 from usdbrdf.transport.environment import directions_of_pixels
 from usdbrdf.transport.rays import RayScene
 
@@ -63,3 +70,57 @@ def test_a_closed_room_shows_no_surroundings(tmp_path):
     frames = read_scan(tmp_path / "capture", IngestOptions()).frames
     assert not share_outside(rays, frames).any()
     assert not surroundings_from_frames(rays, frames, z_up=True).coverage.observed.any()
+
+
+def _seen_through_a_window(sky):
+    """Up to 28 degrees above the horizon and 45 to either side."""
+    directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
+    above = (directions[:, 2] > 0) & (directions[:, 2] < np.sin(np.radians(28)))
+    seen = above & (directions[:, 0] > np.cos(np.pi / 4) * np.hypot(*directions[:, :2].T))
+    radiance = np.where(seen[:, None], sky, 0).astype(np.float32)
+    none = np.zeros_like(seen)
+    return Surroundings(radiance=radiance, coverage=CoverageMap.of(seen, none))
+
+
+# Gradation a, b and indicatrix c, d, e of two of the CIE's standard skies (S 011).
+_OVERCAST, _CLEAR = (4, -0.7, 0, -1, 0), (-1, -0.32, 10, -3, 0.45)
+
+
+@pytest.mark.parametrize("kind", [_OVERCAST, _CLEAR])
+def test_a_sky_goes_on_beyond_the_window(kind):
+    """Nearer to what it is than as bright as at the horizon, on the average over where the sun may
+    stand."""
+    a, b, c, d, e = kind
+    directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
+    zenith = np.maximum(directions[:, 2], 0.02)
+    errors = []
+    for azimuth in np.radians([0, 90, 180]):
+        sun = np.array([0.8 * np.cos(azimuth), 0.8 * np.sin(azimuth), 0.6])
+        away = np.arccos(np.clip(directions @ sun, -1, 1))
+        indicatrix = 1 + c * (np.exp(d * away) - np.exp(d * np.pi / 2)) + e * np.cos(away) ** 2
+        sky = ((1 + a * np.exp(b / zenith)) * indicatrix)[:, None] * np.ones(3)
+        seen = _seen_through_a_window(sky)
+        asked = (directions[:, 2] > 0.5) & (away > 0.4)
+        found = seen.trend(True), seen.median()
+        errors.append([np.abs(np.log(one / sky)[asked]).mean() for one in found])
+    trend, flat = np.mean(errors, axis=0)
+    assert flat > 0.5
+    assert trend < 0.8 * flat
+
+
+def test_what_has_no_trend_goes_on_about_as_bright():
+    """Buildings, say."""
+    random = np.random.default_rng(0)
+    blocks = random.lognormal(0, 0.7, (HEIGHT // 16, WIDTH // 16, 1))
+    sky = np.repeat(np.repeat(blocks, 16, axis=0), 16, axis=1).reshape(-1, 1) * np.ones(3)
+    seen = _seen_through_a_window(sky)
+    assert np.abs(np.log(seen.trend(True) / seen.median())).max() < 1.5
+
+
+def test_of_next_to_nothing_seen_no_trend_is_told():
+    none = Surroundings.unseen()
+    np.testing.assert_array_equal(none.trend(True), 0)
+    one = np.zeros((HEIGHT * WIDTH, 3), np.float32)
+    one[1000:1040] = np.linspace(1, 3, 40)[:, None]
+    seen = Surroundings(radiance=one, coverage=CoverageMap.of(one[:, 0] > 0, one[:, 0] < 0))
+    np.testing.assert_allclose(seen.trend(True), 2, rtol=1e-6)

@@ -120,3 +120,18 @@ def _merged(parts: list[Part]) -> World:
     width, height = parts[0].size
     resolution = np.array([[width * len(parts), height]], np.int32)
     return World(scene=one, texels=texels_from_atlas(one, resolution))
+
+
+def test_far_from_what_was_seen_no_single_texel_decides():
+    """A square seen in its left third, of whose texels every fifth column shows something else."""
+    one = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size=(64, 64))])
+    position = one.texels.position
+    column = np.floor(position[:, 0] * 64)
+    known = column < 21
+    odd = known & (column % 5 == 0)
+    values = np.where(odd, 10.0, 0.1)[:, None].astype(np.float32) * np.ones(3, np.float32)
+    filled = inpaint(one.texels, np.where(known[:, None], values, np.nan), known)
+    # Column 20 shows something else, and is the nearest for all of them.
+    far = ~known & (position[:, 0] > 0.6)
+    assert np.median(filled[far]) == pytest.approx(0.1 * 100**0.24, rel=0.3)
+    assert filled[~known & (column == 21)].min() > 0.5

@@ -14,7 +14,7 @@ import pytest
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf.files.frames import read_frame, read_frames
-from usdbrdf.files.images import write_exr
+from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.exposures import Probes
@@ -114,6 +114,37 @@ def test_every_object_gets_the_radiance_it_was_drawn_with(room: Room):
     np.testing.assert_array_equal(
         observed.lower_bound, np.where(observed.clipped > 0, np.float32(SATURATION), 0)
     )
+
+
+def test_what_is_black_is_known_to_be_dark(room: Room, tmp_path: Path):
+    """Not as bright as what lies around it, nor as its noise in the frames exposed shortest."""
+    owner = room.world.scene.face_object
+    box = room.names.index("box")
+    floors = np.where(np.arange(12) % 2, 0.01, 0.2)
+    noise = np.random.default_rng(0)
+    for i in range(12):
+        camera = room.frames.camera(i)
+        hits = room.world.rays.closest(*camera.rays(camera.pixels()))
+        image = read_exr(room.frames.image_paths[i])
+        black = (owner[hits.face] == box).reshape(HEIGHT, WIDTH)
+        image[black] = floors[i] * noise.uniform(0, 0.6, (int(black.sum()), 3))
+        write_exr(tmp_path / f"{i}.exr", image)
+    paths = tuple(tmp_path / f"{i}.exr" for i in range(12))
+    frames = replace(room.frames, image_paths=paths, noise_floor_radiance=floors)
+    observed = _empty(room.world)
+    _observe(room.world, frames, observed)
+    assert (observed.dark > 0).sum() > 300
+    found = observed.measured(0.5)
+    own = room.world.texels.object_index() == box
+    told = own & (found["count"] > 0)
+    np.testing.assert_array_equal(told, own & (observed.dark > 0))
+    assert (found["median"][told] < 0.2).all()
+    well = told & (observed.weight > 3 * 0.01**-2)
+    assert well.sum() > 100
+    np.testing.assert_allclose(found["mean"][well].mean(), 0.003, rtol=0.15)
+    # Measured by the frames exposed longest, whatever others were too dark for.
+    wall = (observed.quantiles.samples > 0) & (observed.dark > 0)
+    np.testing.assert_array_equal(found["median"][wall], quantile(observed.quantiles, 0.5)[wall])
 
 
 def test_going_on_from_a_saved_state_changes_no_bit(room: Room):

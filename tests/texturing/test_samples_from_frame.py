@@ -12,6 +12,7 @@ from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
 from usdbrdf.texturing.samples import (
     CLIPPED,
+    DARK,
     NOTHING,
     SAMPLE,
     Picture,
@@ -41,6 +42,7 @@ def _shoot(
     pose: np.ndarray,
     valid: np.ndarray | None = None,
     clipped: np.ndarray | None = None,
+    dark: np.ndarray | None = None,
 ) -> Shot:
     camera = camera_at(pose, LENS, WIDTH, HEIGHT)
     surfaces = first_surfaces(world.rays, world.scene.face_object, camera)
@@ -49,6 +51,7 @@ def _shoot(
         image.astype(np.float32),
         ~nowhere if valid is None else valid,
         nowhere if clipped is None else clipped,
+        nowhere if dark is None else dark,
     )
     owner = world.texels.object_index()
     return Shot(*samples_from_frame(world.texels, owner, surfaces, picture, camera))
@@ -188,7 +191,7 @@ def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
     upper = surfaces.point[..., 2] > 0.1
     image = np.where(upper[..., None], 9.0, 1.0) * np.ones(3)
     everywhere = np.ones((HEIGHT, WIDTH), bool)
-    picture = Picture(image.astype(np.float32), everywhere, ~everywhere)
+    picture = Picture(image.astype(np.float32), everywhere, ~everywhere, ~everywhere)
     owner = np.zeros(len(one.texels), np.int32)
     kind, radiance = samples_from_frame(one.texels, owner, surfaces, picture, camera)
     seen = kind == SAMPLE
@@ -197,6 +200,26 @@ def test_the_same_object_in_front_of_itself_is_a_depth_edge_too():
     assert 400 < seen[~high].sum() < 800
     np.testing.assert_allclose(radiance[seen & high], 9)
     np.testing.assert_allclose(radiance[seen & ~high], 1)
+
+
+def test_pixels_below_the_noise_floor_make_dark_texels(plane: World):
+    pose = _camera()
+    column = _pixel_of(pose, plane.texels.position)[0]
+    image = np.ones((HEIGHT, WIDTH, 3))
+    dark, clipped = np.zeros((2, HEIGHT, WIDTH), bool)
+    dark[:, 30:38], clipped[:, 38:44] = True, True
+    image[dark] = 1e-4
+    image[clipped] = 50
+    shot = _shoot(plane, image, pose, ~(dark | clipped), clipped, dark)
+    free = _shoot(plane, np.ones((HEIGHT, WIDTH, 3)), pose).kind == SAMPLE
+    well_inside = free & (column > 32) & (column < 36)
+    assert well_inside.sum() > 50
+    # Beside what glares as well.
+    assert (shot.kind[well_inside] == DARK).all()
+    np.testing.assert_allclose(shot.radiance[well_inside], 1e-4, rtol=1e-5)
+    # Towards brighter pixels it is told from darkness on one side, and not known on the other.
+    assert (shot.kind[free & (np.abs(column - 38) < 0.4)] == NOTHING).all()
+    assert (shot.kind[free & (column < 28)] == SAMPLE).all()
 
 
 def test_saturated_pixels_make_clipped_texels(plane: World):

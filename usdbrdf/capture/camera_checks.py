@@ -14,7 +14,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
+from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
 
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
@@ -67,7 +67,7 @@ def drop_cameras_inside(
     """Indices of the frames that show surfaces from the side from which others show them; those
     that look at their backs from inside are noted in ``findings`` by their ``names``."""
     scene = RayScene(mesh.points, mesh.triangles)
-    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
+    normals = mesh.face_normals
     # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
     alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]
     usable: list[int] = []

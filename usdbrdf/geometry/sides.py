@@ -68,7 +68,7 @@ class Sides:
 def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
     """The side of every face of a mesh that cameras, in its own frame and unit, looked at."""
     rays = RayScene(mesh.points, mesh.triangles)
-    normals = face_normals_and_angles(mesh.points, mesh.triangles)[0]
+    normals = mesh.face_normals
     seen = sightings(rays, normals, cameras)
     votes = seen.votes
     decided = np.abs(votes) >= _PIXELS

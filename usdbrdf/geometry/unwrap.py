@@ -4,7 +4,9 @@ what is measured, or new ones by xatlas in a child process."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from usdbrdf.errors import CrashedChild, InputRefused, LateChild
-from usdbrdf.job.child import run_child
+from usdbrdf.job.child import child
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Double, Float, Int
@@ -26,6 +28,8 @@ _GAP, PADDING = 2, 4
 MAX_SIDE = 16384
 # What charts may take: at least, and for each triangle.
 _SECONDS, _SECONDS_OF_FACE = 120.0, 2e-3
+# Children at work: xatlas takes one core, and each holds all the geometry.
+_AT_ONCE = min(4, os.cpu_count() or 1)
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -175,27 +179,50 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
         side = math.ceil(math.sqrt(texels[obj.faces].sum()))
         if side > MAX_SIDE:
             raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
+    try:
+        corner_uv, resolution = _side_by_side(scene, sizes)
+    except (CrashedChild, LateChild):
+        corner_uv, resolution = _one_by_one(scene, sizes)
+    for obj, (width, height) in zip(scene.objects, resolution, strict=True):
+        if max(width, height) > MAX_SIDE:
+            raise too_large(obj, f"texture would be {width} x {height}")
+    return corner_uv, resolution
+
+
+def _side_by_side(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
+    """As ``unwrap``, the objects dealt out, the largest first, to a few children at once."""
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     given = {"points": scene.points, "triangles": scene.triangles, **sizes._asdict()}
-    try:
-        result = _in_child({**given, "first": first, "count": count}, "unwrapping the objects")
-    except (CrashedChild, LateChild):
-        result = _one_by_one(scene, sizes)
-    for obj, (width, height) in zip(scene.objects, result["resolution"], strict=True):
-        if max(width, height) > MAX_SIDE:
-            raise too_large(obj, f"texture would be {width} x {height}")
-    return result["corner_uv"], result["resolution"]
+    shares: list[list[int]] = [[] for _ in range(min(_AT_ONCE, len(count)))]
+    for i in np.argsort(-count, kind="stable"):
+        min(shares, key=lambda share: int(count[share].sum())).append(int(i))
+    corner_uv = np.zeros((len(scene.triangles), 3, 2), np.float32)
+    resolution = np.zeros((len(count), 2), np.int32)
+    with ExitStack() as children:
+        coming = []
+        for share in shares:
+            own = {**given, "first": first[share], "count": count[share]}
+            coming.append(children.enter_context(_child(own, "unwrapping the objects")))
+        for share, result in zip(shares, coming, strict=True):
+            found = result()
+            resolution[share] = found["resolution"]
+            for i in share:
+                faces = scene.objects[i].faces
+                corner_uv[faces] = found["corner_uv"][faces]
+    return corner_uv, resolution
 
 
-def _in_child(arrays: Mapping[str, Array], label: str) -> dict[str, Array]:
+def _child(
+    arrays: Mapping[str, Array], label: str
+) -> AbstractContextManager[Callable[[], dict[str, Array]]]:
     """``unwrap_objects``, where it may crash or hang as xatlas does on some meshes."""
     faces = int(arrays["count"].sum())
     seconds = _SECONDS + _SECONDS_OF_FACE * faces
-    return run_child(f"{__name__}:unwrap_objects", arrays, {}, seconds, label)
+    return child(f"{__name__}:unwrap_objects", arrays, {}, seconds, label)
 
 
-def _one_by_one(scene: Scene, sizes: TexelSizes) -> dict[str, Array]:
+def _one_by_one(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """The same with a child for each object; one that still crashes or hangs has each of its
     triangles packed by itself, and the user hears of it."""
     corner_uv = np.zeros((len(scene.triangles), 3, 2), np.float32)
@@ -206,7 +233,8 @@ def _one_by_one(scene: Scene, sizes: TexelSizes) -> dict[str, Array]:
         arrays = {"points": points, "triangles": triangles, **own._asdict()}
         arrays |= {"first": np.zeros(1, np.int64), "count": np.array([obj.num_faces])}
         try:
-            found = _in_child(arrays, f"unwrapping <{obj.prim_path}>")
+            with _child(arrays, f"unwrapping <{obj.prim_path}>") as result:
+                found = result()
             corner_uv[obj.faces], resolution[i] = found["corner_uv"], found["resolution"][0]
         except (CrashedChild, LateChild) as error:
             warn(
@@ -217,7 +245,7 @@ def _one_by_one(scene: Scene, sizes: TexelSizes) -> dict[str, Array]:
             corner_uv[obj.faces], resolution[i] = pack_triangles_singly(
                 scene.points[scene.triangles[obj.faces]], float(own.side.min())
             )
-    return {"corner_uv": corner_uv, "resolution": resolution}
+    return corner_uv, resolution
 
 
 def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:

@@ -21,9 +21,9 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -95,16 +95,34 @@ def run_child(
     *,
     memory_limit_bytes: int | None = None,
 ) -> dict[str, Array]:
-    """The arrays that ``function`` ("package.module:name") returns, called as f(arrays, parameters)
-    in a child process; parameters must be JSON.
+    """What a ``child`` returns that works alone."""
+    with child(
+        function, arrays, parameters, timeout_s, label, memory_limit_bytes=memory_limit_bytes
+    ) as result:
+        return result()
 
-    timeout_s            wall time after which it is killed
+
+@contextmanager
+def child(
+    function: str,
+    arrays: Mapping[str, Array],
+    parameters: Mapping[str, Any],
+    timeout_s: float,
+    label: str,
+    *,
+    memory_limit_bytes: int | None = None,
+) -> Iterator[Callable[[], dict[str, Array]]]:
+    """A child process at work on ``function`` ("package.module:name"), called as f(arrays,
+    parameters); parameters must be JSON. What the block is given waits for it to end and gives the
+    arrays that it returns; at the end of the block it is killed.
+
+    timeout_s            wall time that is waited for it
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
 
-    A UsdBrdfError raised there is raised here with its class. Death by a signal is a CrashedChild,
-    an InputRefused; running out of time a LateChild, an EnvironmentFailure as running out of
-    memory, SIGKILL and what cannot be imported there are.
+    A UsdBrdfError raised there is raised by the waiting, with its class. Death by a signal is a
+    CrashedChild, an InputRefused; running out of time a LateChild, an EnvironmentFailure as running
+    out of memory, SIGKILL and what cannot be imported there are.
     """
     with scratch_folder() as folder:
         with environment_failures(label):
@@ -118,20 +136,12 @@ def run_child(
                 "memory_limit_bytes": memory_limit_bytes,
             }
             (folder / "task.json").write_text(json_text(task), "utf-8")
-        status = _run(folder, timeout_s, label)
-        if status == _ERROR_TOLD:
-            told = json.loads((folder / "error.json").read_text("utf-8"))
-            if told["class"] in _ERROR_CLASSES:
-                raise _ERROR_CLASSES[told["class"]](told["message"])
-            raise UsdBrdfError(
-                f"{label} failed: {told['class']}: {told['message']}. [child.failed]"
-            ) from RuntimeError(told["traceback"])
-        if status != 0:
-            raise _crash(status, folder, label)
-        return load_arrays(folder / "result.npz")
+        with _started(folder, label) as process:
+            yield partial(_result, process, folder, timeout_s, label)
 
 
-def _run(folder: Path, timeout_s: float, label: str) -> int:
+@contextmanager
+def _started(folder: Path, label: str) -> Iterator[subprocess.Popen[bytes]]:
     # The child imports what we can import. It runs in the scratch folder, so that "-c" does not
     # put the caller's working folder, and whatever lies there, first on its path.
     search = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
@@ -146,16 +156,33 @@ def _run(folder: Path, timeout_s: float, label: str) -> int:
             start_new_session=True,
         )
     try:
-        return process.wait(timeout_s)
+        yield process
+    finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _result(
+    process: subprocess.Popen[bytes], folder: Path, timeout_s: float, label: str
+) -> dict[str, Array]:
+    try:
+        status = process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:
         raise LateChild(
             f"{label} did not end within {timeout_s:g} s and was stopped. Run the same command "
             "again when the machine is less busy, or simplify the input. [child.timeout]"
         ) from error
-    finally:  # also on Ctrl-C: nothing of it may outlive us, nor what it started itself
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    if status == _ERROR_TOLD:
+        told = json.loads((folder / "error.json").read_text("utf-8"))
+        if told["class"] in _ERROR_CLASSES:
+            raise _ERROR_CLASSES[told["class"]](told["message"])
+        raise UsdBrdfError(
+            f"{label} failed: {told['class']}: {told['message']}. [child.failed]"
+        ) from RuntimeError(told["traceback"])
+    if status != 0:
+        raise _crash(status, folder, label)
+    return load_arrays(folder / "result.npz")
 
 
 def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:

@@ -204,10 +204,10 @@ class Follower:
         if row is None or not len(self._index):
             return
         surfaces = first_surfaces(self._lit.rays, self._lit.scene.face_object, view.camera)
+        picture = Picture(view.radiance, view.valid, clipped, np.zeros_like(clipped))
         kind, radiance = samples_from_frame(
-            self._texels, self._owner, surfaces, Picture(view.radiance, view.valid, clipped),
-            view.camera, beside_glare=True,
-        )  # fmt: skip
+            self._texels, self._owner, surfaces, picture, view.camera, beside_glare=True
+        )
         seen = np.flatnonzero(kind == SAMPLE)
         self._seen[row, seen] = True
         self._radiance[row, seen] = radiance[seen]

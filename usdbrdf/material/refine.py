@@ -241,15 +241,18 @@ def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tu
     texels, before = lighting.lit.texels, lighting.before
     emissive, level = before.emissive, _level(before.lit)
     known = np.isfinite(found.mean[:, 0]) & ~emissive
-    filled_in = inpaint(texels, np.maximum(found.mean * level[:, None], 0), known)
+    # Too dark for a sample in any frame: there is nothing to take off.
+    dark = before.coverage.measured & ~known & ~emissive
+    shown = np.where(dark[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
+    filled_in = inpaint(texels, shown, known | dark)
     diffuse = restored(texels, filled_in, known, found.variance * level**2, found.footprint)
     diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
     # What clips in every frame is at least as bright as that.
     clipped = before.coverage.clipped[:, None]
     diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
     diffuse[lobes.conducts[texels.object_index()] & ~emissive] = 0
-    shown = np.maximum(found.mean.mean(axis=1), 1e-3)
-    error = np.where(known, np.sqrt(found.variance) / shown, np.inf)
+    relative = np.maximum(found.mean.mean(axis=1), 1e-3)
+    error = np.where(known, np.sqrt(found.variance) / relative, np.inf)
     return diffuse, error.astype(np.float32)
 
 

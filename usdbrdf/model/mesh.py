@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,11 @@ class ScanMesh:
     triangles: Int
     corner_normals: Float
     face_object: Int
+
+    @cached_property
+    def face_normals(self) -> Double:
+        """(F, 3) of unit length, as the faces are wound; zeros without area."""
+        return face_normals_and_angles(self.points, self.triangles)[0]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from usdbrdf.model.arrays import Bool, Float, Int, Long
 class Coverage(IntEnum):
     """FILLED: no frame shows the texel, its radiance is taken from around it; CLIPPED: frames show
     it, every one of them saturated, so that its radiance is a lower bound; MEASURED: at least one
-    frame gives its radiance."""
+    frame gives its radiance, or that it is too dark to be told from darkness."""
 
     FILLED = 0
     CLIPPED = 1

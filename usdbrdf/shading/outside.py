@@ -175,7 +175,7 @@ def light_from_outside(
     else:
         sun, found = NO_SUN, solved(asked, sky)
         found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
-    radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]))
+    radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]), z_up)
     weight = share[used].mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
     sky_error = float(np.average(of_sky, weights=weight)) if len(used) else math.nan
@@ -285,12 +285,12 @@ def _sky(
     asked: Asked, seen: Surroundings, patches: Int, share: Double, used: Long, z_up: bool
 ) -> Sources:
     """The patches that light what is asked."""
-    known, usual = seen.coverage.measured, _usual_sky(seen)
+    known, usual = seen.coverage.measured, seen.trend(z_up)
     if not usual.any():
-        usual = np.median(asked.reflected, axis=0) / np.pi
+        usual = np.tile(np.median(asked.reflected, axis=0) / np.pi, (len(usual), 1))
     bound = used >= _PATCHES
-    darkest = max(_DARKEST * float(usual.max()), 1e-30)
-    mean = np.tile(np.log(np.maximum(usual, darkest)), (len(used), 1))
+    darkest = max(_DARKEST * float(np.median(usual.max(axis=1))), 1e-30)
+    mean = np.zeros((len(used), 3))
     directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
     centre = np.zeros((len(used), 3))
     for k, patch in enumerate(used):
@@ -300,17 +300,13 @@ def _sky(
             mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _ABOVE_LIMIT[0]
         elif near.any():
             mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), darkest))
+        else:
+            mean[k] = np.log(np.maximum(usual[patches == patch], darkest)).mean(axis=0)
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
     near = np.argwhere(np.triu(centre @ centre.T > np.cos(_BESIDE), 1))
     near = near[~bound[near].any(axis=1)]
     deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
     return Sources(share[used], mean, deviation, bound, near)
-
-
-def _usual_sky(seen: Surroundings) -> Double:
-    """(3,) the median radiance of what frames show of the surroundings, 0 without any."""
-    known = seen.radiance[seen.coverage.measured].astype(np.float64)
-    return np.median(known, axis=0) if len(known) else np.zeros(3)
 
 
 def _with_sun(
@@ -334,9 +330,9 @@ def _with_sun(
     return chosen._replace(segment=segment), sources
 
 
-def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double) -> Float:
+def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double, z_up: bool) -> Float:
     """(HEIGHT, WIDTH, 3): what was measured, and the patches."""
-    filled = np.tile(_usual_sky(seen), (HEIGHT * WIDTH, 1))
+    filled = seen.trend(z_up)
     for patch, value in zip(used, radiance, strict=True):
         filled[patches == patch] = value
     filled = np.where(seen.coverage.clipped[:, None], np.maximum(filled, seen.radiance), filled)

@@ -12,13 +12,13 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Array, Bool, Float, Long
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.psquare import QuantileState
-from usdbrdf.transport.environment import pixels_of_directions
+from usdbrdf.transport.environment import directions_of_pixels, pixels_of_directions, solid_angles
 from usdbrdf.transport.rays import RayScene
 
 # Of the picture of the surroundings; three quarters of a degree, wider than what parallax in a
@@ -28,6 +28,10 @@ HEIGHT, WIDTH = 256, 512
 _STRIDE = 8
 _LEAST_OUTSIDE = calibration.number("outside.least_seen")
 _QUANTILE = 0.5
+_LEAST_SKY = calibration.number("outside.least_sky")
+_SLOPE = calibration.pair("outside.sky_slope")
+_SCATTER = calibration.number("outside.sky_scatter")
+_STEPS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,43 @@ class Surroundings:
         return cls(
             radiance=np.zeros((HEIGHT * WIDTH, 3), np.float32), coverage=CoverageMap.of(none, none)
         )
+
+    def trend(self, z_up: bool) -> Double:
+        """(D, 3): what the other directions are likely to show: of what was measured above the
+        horizon, the plane through the logarithms of its radiance over the direction's three
+        coordinates, as skies darken away from the sun and from the horizon (skies of the CIE's
+        standard S 011 do so within a factor of two). Below the horizon it goes on as at it. The
+        steeper it is for what little was measured, the less it is believed; where nothing was, it
+        is the median of all."""
+        directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
+        up = 2 if z_up else 1
+        usual = self.median()
+        flat = directions.copy()
+        flat[:, up] = np.maximum(flat[:, up], 0)
+        sky = self.coverage.measured & (directions[:, up] > 0) & (self.radiance > 0).all(axis=1)
+        solid = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[sky]
+        if solid.sum() < _LEAST_SKY:
+            return np.tile(usual, (len(sky), 1))
+        log = np.log(self.radiance[sky].astype(np.float64))
+        weight = solid / solid.sum()
+        centre, level = weight @ flat[sky], weight @ log
+        off, value = flat[sky] - centre, log - level
+        spread, both = (off * weight[:, None]).T @ off, (off * weight[:, None]).T @ value
+        # As many independent places as there are patches of this size.
+        places = solid.sum() / _LEAST_SKY
+        slope, steep = np.zeros((3, 3)), np.full(3, _SLOPE[1])
+        steep[up] = _SLOPE[0]
+        for _ in range(_STEPS):
+            scatter = (weight[:, None] * (value - off @ slope) ** 2).sum(axis=0)
+            for c in range(3):
+                noise = max(float(scatter[c]), _SCATTER**2) / places
+                slope[:, c] = np.linalg.solve(spread + noise * np.diag(steep**-2), both[:, c])
+        return np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
+
+    def median(self) -> Double:
+        """(3,) of what was measured, 0 without any."""
+        known = self.radiance[self.coverage.measured].astype(np.float64)
+        return np.median(known, axis=0) if len(known) else np.zeros(3)
 
 
 def share_outside(rays: RayScene, frames: Frames) -> Float:

@@ -1,7 +1,10 @@
-"""Values for texels that nobody saw, from the nearest seen ones of the same object."""
+"""Values for texels that nobody saw, from the nearest seen ones of the same object: of those far
+away from as large a part of them as they are away, since single texels say little about what is
+not beside them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +22,8 @@ _ZERO = 1e-6
 _SLACK = 0.25
 # Texels filled at a time, which bounds what their neighbours take.
 _AT_A_TIME = 1 << 18
+# How many times fewer sources each level has than the one before, and how many the last, at least.
+_COARSER, _FEWEST, _SEED = 4, 32, 0
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
 # is never far.
 _MOST_SOURCES = 1 << 18
@@ -27,7 +32,8 @@ _MOST_SOURCES = 1 << 18
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
     """Fill ``values`` (T, 3) where ``known`` (T,) is False; known ones are returned unchanged.
 
-    Geometric mean of 8 of the nearest known texels of the same object in position and normal. An
+    Geometric mean of 8 known texels of the same object that are near in position and normal: the
+    nearest ones, or for a texel at a distance evenly many over an area of about that size. An
     object of which nothing is known takes the nearest known texels of the scene; a scene of which
     nothing is known, or only black, becomes zero. Values in another unit give the same fill in that
     unit.
@@ -76,12 +82,29 @@ def _fill(
         )
 
     source = source[:: -(-len(source) // _MOST_SOURCES)]
-    tree = cKDTree(feature(source), balanced_tree=False, compact_nodes=False)
+    spacing = math.sqrt(float(texels.area[source].sum()) / len(source))
+    # Each level has a part of the one before, evenly: its sources lie that much further apart.
+    mixed = np.random.default_rng(_SEED).permutation(source)
+    counts = [len(source)]
+    while counts[-1] > _COARSER * _FEWEST:
+        counts.append(counts[-1] // _COARSER)
+    levels = [np.sort(mixed[:count]) for count in counts]
+    trees = [cKDTree(feature(own), balanced_tree=False, compact_nodes=False) for own in levels]
     k = min(_NEIGHBOURS, len(source))
     for start in range(0, len(missing), _AT_A_TIME):
         some = missing[start : start + _AT_A_TIME]
-        _, nearest = tree.query(feature(some), k=k, eps=_SLACK, workers=-1)
+        places = feature(some)
+        distance, nearest = trees[0].query(places, k=k, eps=_SLACK, workers=-1)
         neighbours = source[nearest.reshape(len(some), k)]
+        # Sources in a circle around it with half the distance as its radius, for each of k.
+        many = np.pi / 4 / k * (distance.reshape(len(some), k)[:, 0] / max(spacing, 1e-30)) ** 2
+        level = (np.log(np.maximum(many, 1)) / math.log(_COARSER)).astype(np.int64)
+        level = np.minimum(level, len(levels) - 1)
+        for number in range(1, len(levels)):
+            own = np.flatnonzero(level == number)
+            if len(own):
+                _, nearest = trees[number].query(places[own], k=k, eps=_SLACK, workers=-1)
+                neighbours[own] = levels[number][nearest.reshape(len(own), k)]
         for values, floor in zip(filled, floors, strict=True):
             if floor > 0:
                 logarithm = np.log(np.maximum(values[neighbours], floor))

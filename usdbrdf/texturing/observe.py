@@ -24,6 +24,7 @@ from usdbrdf.texturing.exposures import Probes
 from usdbrdf.texturing.psquare import QuantileState
 from usdbrdf.texturing.samples import (
     CLIPPED,
+    DARK,
     MIN_COSINE,
     SAMPLE,
     Picture,
@@ -153,13 +154,18 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 class FrameSamples(NamedTuple):
     """What one frame shows: texels with a sample (M,) int32 and their radiance (M, 3) float32;
-    texels that it saw saturated, clipped (K,) int32, and the radiance that saturates it."""
+    texels that it saw saturated, clipped (K,) int32, and the radiance that saturates it; texels
+    that were too dark for it, dark (D,) int32, their radiance with the noise (D, 3) float32, and
+    the radiance of its noise floor."""
 
     frame: int
     texel: Int
     radiance: Float
     clipped: Int
     saturation: float
+    dark: Int
+    darkness: Float
+    noise_floor: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +175,7 @@ class Measured:
     median       (T, 3) float32, the quantile that was asked for
     mean         (T, 3) float32, 0 where no frame measured it
     spread       (T, 3) float32, see ``psquare.spread``
-    count        (T,) int32, samples
+    count        (T,) int32, samples, or where there are none, frames that show how dark it is
     clipped      (T,) int32, frames in which the texel was visible but saturated
     lower_bound  (T,) float32, the largest radiance at which it still saturated
     probes       (P, N) float32, some texels' samples in each frame, see ``Probes``
@@ -190,12 +196,18 @@ class Observation:
 
     quantiles    of the valid samples
     clipped, lower_bound, probes  as in ``Measured``
+    dark         (T,) int32, frames in which the texel was visible but too dark
+    darkness     (T, 3) float32, its mean radiance in these, each weighted by the inverse of its
+                 noise floor's square; weight (T,) float64, the sum of the weights
     """
 
     first: int
     quantiles: QuantileState
     clipped: Int
     lower_bound: Float
+    dark: Int
+    darkness: Float
+    weight: Double
     probes: Probes
 
     @classmethod
@@ -207,6 +219,9 @@ class Observation:
             quantiles=QuantileState.empty(count),
             clipped=np.zeros(count, np.int32),
             lower_bound=np.zeros(count, np.float32),
+            dark=np.zeros(count, np.int32),
+            darkness=np.zeros((count, 3), np.float32),
+            weight=np.zeros(count, np.float64),
             probes=probes,
         )
 
@@ -217,6 +232,13 @@ class Observation:
         self.clipped[saturated] += 1
         limit = np.float32(seen.saturation)
         self.lower_bound[saturated] = np.maximum(self.lower_bound[saturated], limit)
+        dark = seen.dark - np.int32(self.first)
+        if len(dark):
+            own = seen.noise_floor**-2.0
+            self.dark[dark] += 1
+            self.weight[dark] += own
+            share = (own / self.weight[dark, None]).astype(np.float32)
+            self.darkness[dark] += share * (seen.darkness - self.darkness[dark])
         self.probes.add(seen.frame, seen.texel, seen.radiance)
 
     def arrays(self) -> dict[str, Array]:
@@ -225,6 +247,9 @@ class Observation:
             **self.quantiles._asdict(),
             "clipped": self.clipped,
             "lower_bound": self.lower_bound,
+            "dark": self.dark,
+            "darkness": self.darkness,
+            "weight": self.weight,
             "probes": self.probes.logarithm,
         }
 
@@ -244,12 +269,16 @@ class Observation:
         return True
 
     def measured(self, quantile: float) -> dict[str, Array]:
-        """The arrays of ``Measured``."""
+        """The arrays of ``Measured``. What is dark in all frames is what they show, without its
+        noise as far as they are many; in those that were exposed longer it is known better."""
+        dark = (self.quantiles.samples == 0) & (self.dark > 0)
+        values = psquare.quantile(self.quantiles, quantile), self.quantiles.mean
+        median, mean = (np.where(dark[:, None], self.darkness, value) for value in values)
         return {
-            "median": psquare.quantile(self.quantiles, quantile),
-            "mean": self.quantiles.mean,
+            "median": median,
+            "mean": mean,
             "spread": psquare.spread(self.quantiles, quantile),
-            "count": self.quantiles.samples,
+            "count": np.where(dark, self.dark, self.quantiles.samples),
             "clipped": self.clipped,
             "lower_bound": self.lower_bound,
             "probes": self.probes.logarithm,
@@ -273,11 +302,19 @@ def samples_from_frames(
         camera = frames.camera(i)
         which = blocks.texels_in_view(camera, MIN_COSINE)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
-        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped)
+        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped, pixels.dark)
         kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
-        sampled, saturation = kind == SAMPLE, float(frames.saturation_radiance[i])
-        clipped = which[kind == CLIPPED]
-        yield FrameSamples(i, which[sampled], radiance[sampled], clipped, saturation)
+        sampled, dark = kind == SAMPLE, kind == DARK
+        yield FrameSamples(
+            frame=i,
+            texel=which[sampled],
+            radiance=radiance[sampled],
+            clipped=which[kind == CLIPPED],
+            saturation=float(frames.saturation_radiance[i]),
+            dark=which[dark],
+            darkness=radiance[dark],
+            noise_floor=float(frames.noise_floor_radiance[i]),
+        )
 
 
 def spread_order(count: int) -> list[int]:

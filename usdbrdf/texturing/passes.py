@@ -43,9 +43,9 @@ class BytesPerTexel(NamedTuple):
     always: int = 0
 
 
-# Running statistics (120) and a texel's place among the blocks of texels while these are sorted
+# Running statistics (144) and a texel's place among the blocks of texels while these are sorted
 # out; then what becomes of the results while the maps are made.
-OF_TEXTURING = BytesPerTexel(grouped=180, result=48, after=200)
+OF_TEXTURING = BytesPerTexel(grouped=200, result=48, after=200)
 
 
 def in_passes(

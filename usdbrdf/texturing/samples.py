@@ -5,6 +5,7 @@ pixels around its projection (3 x 3, or as many as its footprint covers) all sho
 near its own tangent plane (so it is unoccluded, and away from depth edges and the image border),
 and where every pixel of its footprint lies between noise floor and saturation in every channel.
 Beside a lamp it takes none: no lens and no filter keeps all of a lamp's light to its own pixels.
+What no frame measures because it is too dark is known to be dark: that is told as well.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ MIN_COSINE = calibration.number("samples.min_cosine")
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
 _GLARE_CONTRAST = calibration.number("samples.glare_contrast")
-NOTHING, SAMPLE, CLIPPED = 0, 1, 2
+NOTHING, SAMPLE, CLIPPED, DARK = 0, 1, 2, 3
 
 
 class FirstSurfaces(NamedTuple):
@@ -100,11 +101,12 @@ class FirstSurfaces(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """One frame: radiance (H, W, 3) float32; valid, clipped (H, W) bool."""
+    """One frame: radiance (H, W, 3) float32; valid, clipped, dark (H, W) bool."""
 
     radiance: Float
     valid: Bool
     clipped: Bool
+    dark: Bool
 
 
 class Projection(NamedTuple):
@@ -128,6 +130,7 @@ class _Image(NamedTuple):
     radiance: Float
     valid: Bool
     clipped: Bool
+    dark: Bool
     glare: Float
 
 
@@ -159,8 +162,10 @@ def samples_from_frame(
     which: Int | None = None,
     beside_glare: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
-    """Of the texels ``which`` (M,) int32 (None: all): NOTHING, SAMPLE, or CLIPPED (visible, and
-    saturated all over its footprint), (M,) int8, and the samples' radiance, (M, 3) float32.
+    """Of the texels ``which`` (M,) int32 (None: all): NOTHING, SAMPLE, CLIPPED (visible, and
+    saturated all over its footprint) or DARK (visible, and below the noise floor in some channel
+    and pixel), (M,) int8; and the radiance (M, 3) float32 of what is SAMPLE or DARK, of the latter
+    with the noise.
 
     texel_object  (T,) int32
     beside_glare  take samples there too, for whom highlights matter
@@ -168,8 +173,9 @@ def samples_from_frame(
     if which is None:
         which = np.arange(len(texels), dtype=np.int32)
     none = np.zeros(picture.valid.shape, np.float32)
-    glare = none if beside_glare else brightest_glare(*picture)
-    image = _Image(*surfaces, picture.radiance, picture.valid, picture.clipped, glare)
+    radiance, valid, clipped, dark = picture
+    glare = none if beside_glare else brightest_glare(radiance, valid, clipped)
+    image = _Image(*surfaces, radiance, valid, clipped, dark, glare)
     surface = _Surface(
         texels.position, texels.geometric_normal, texels.step_x, texels.step_y, texel_object
     )
@@ -238,7 +244,7 @@ def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, val
         return NOTHING
     taps = taps_x * taps_y
     red, green, blue = 0.0, 0.0, 0.0
-    num_valid, num_clipped = 0, 0
+    num_valid, num_clipped, num_dark = 0, 0, 0
     for tap in range(taps):
         dx = (tap // taps_y + 0.5) / taps_x - 0.5
         dy = (tap % taps_y + 0.5) / taps_y - 0.5
@@ -252,18 +258,20 @@ def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, val
             w = (fx if a else 1 - fx) * (fy if b else 1 - fy)
             num_valid += image.valid[j + b, i + a]
             num_clipped += image.clipped[j + b, i + a]
+            num_dark += image.dark[j + b, i + a]
             red += w * image.radiance[j + b, i + a, 0]
             green += w * image.radiance[j + b, i + a, 1]
             blue += w * image.radiance[j + b, i + a, 2]
     # Partly saturated is no bound: a lamp's neighbour catches some of its light.
     if num_clipped == 4 * taps:
         return CLIPPED
-    if num_valid < 4 * taps or (
-        image.glare[row, column] * taps > _GLARE_CONTRAST * max(red, green, blue)
-    ):
+    # A lamp's light beside it makes what is dark brighter: it is at least as dark as it looks.
+    is_dark = num_dark > 0 and num_clipped == 0 and num_valid + num_dark == 4 * taps
+    glares = image.glare[row, column] * taps > _GLARE_CONTRAST * max(red, green, blue)
+    if not is_dark and (num_valid < 4 * taps or glares):
         return NOTHING
     value[0], value[1], value[2] = red / taps, green / taps, blue / taps
-    return SAMPLE
+    return DARK if is_dark else SAMPLE
 
 
 @kernel
