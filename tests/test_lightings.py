@@ -13,7 +13,7 @@ from pxr import Usd, UsdShade
 
 import usdbrdf
 from tests.scenes import make_capture, poses_down_and_up
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_edited, open_measured
 from usdbrdf.asset.readers.scene import aov_path, read_shading
@@ -78,7 +78,24 @@ def test_each_lighting_has_layers_and_maps_of_its_own(asset):
     each = {f"{role}.{name}.usda" for name in LIGHTINGS
             for role in ("texturing", "shading", "lights", "material")}  # fmt: skip
     shared = {"scan.usdc", "texturing_uv.usdc", "texturing.usda", "shading.usda", "material.usda"}
-    assert layers == each | shared
+    shared |= {"contents.usda", "photographs.usdc"}
+    steps = {name for name in each | {f"{role}.usda" for role in ROLES} if "lights." not in name}
+    interfaces = {name.replace(".usda", ".interface.usda") for name in steps}
+    assert layers == each | shared | interfaces
+    light = Usd.Stage.Open(str(asset.root_layer), Usd.Stage.LoadNone)
+    full = Usd.Stage.Open(str(asset.root_layer))
+    for name in LIGHTINGS:
+        chosen = []
+        for stage in (light, full):
+            stage.SetEditTarget(stage.GetSessionLayer())
+            sets = stage.GetDefaultPrim().GetVariantSets()
+            assert list(sets.GetVariantSet("lighting").GetVariantNames()) == sorted(LIGHTINGS)
+            sets.SetSelection("lighting", name)
+            known = {each: sets.GetVariantSet(each) for each in ("look", "lights")}
+            chosen.append(
+                {k: (v.GetVariantNames(), v.GetVariantSelection()) for k, v in known.items()}
+            )
+        assert chosen[0] == chosen[1], name
     for name, wall in zip(LIGHTINGS, (0.25, 0.25), strict=True):
         stage = open_edited(asset.in_lighting(name))
         file = aov_path(stage, "/room/geo/floor/floor", "lit")

@@ -154,6 +154,9 @@ def test_texture_coordinates_of_the_input_are_there_below_ours(stage, dressed, m
 def test_a_payload_may_stay_unloaded(dressed):
     stage = Usd.Stage.Open(str(dressed.root_layer), Usd.Stage.LoadNone)
     assert not stage.GetCompositionErrors()
+    assert not stage.GetPrimAtPath("/haus/first/box")
+    # Ours, and not yet those of the input.
+    stage.Load("/haus", Usd.LoadWithoutDescendants)
     assert not stage.GetPrimAtPath("/haus/first/box").IsDefined()
     stage.Load("/haus/first")
     assert stage.GetPrimAtPath("/haus/first/box").IsA(UsdGeom.Mesh)
