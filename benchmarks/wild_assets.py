@@ -1,13 +1,13 @@
 """Somebody else's USD asset, photographed by ourselves, converted, and validated by three.
 
     python benchmarks/wild_assets.py ASSET.usd OUTPUT [--root DIR] [--frames 20] [--width 160]
-        [--height 120] [--texel-size M] [--omni omni_asset_validate]
+        [--height 120] [--texel-size M] [--nvidia nvidia_usd_validate]
 
 The folder that ASSET lies in (or --root, one above it) is copied into OUTPUT/scan and photographed
 there: cameras on three rings around the asset, a constant sky and a sun with shadows, albedo from
 the asset's own materials (a texture's mean, else displayColor, else grey). `usdbrdf convert` makes
 OUTPUT/<name> of it. Printed as JSON: whether the copy is still byte for byte the original; and what
-our rules, USD's validators and omniverse-asset-validator find in the result, the errors that the
+our rules, USD's validators and usd-validation-nvidia find in the result, the errors that the
 original has already ("inherited", a count) apart from the others ("ours", all of them).
 """
 
@@ -60,7 +60,7 @@ def main() -> int:
     parser.add_argument("--width", type=int, default=160)
     parser.add_argument("--height", type=int, default=120)
     parser.add_argument("--texel-size", type=float, help="metres; default: 1/60 of the asset")
-    parser.add_argument("--omni", default="omni_asset_validate", help="its command")
+    parser.add_argument("--nvidia", default="nvidia_usd_validate", help="its command")
     options = parser.parse_args()
     if options.output.exists():
         parser.error(f"{options.output} exists. Name a folder that does not.")
@@ -95,13 +95,13 @@ def main() -> int:
         report["validate"] = sorted_out(
             {in_place(text, theirs, ours) for text in errors(mesh)}, errors(made.root_layer)
         )
-        tables = [options.output / f"omni_{which}.csv" for which in ("original", "result")]
-        found_by_omni = [
-            omni(options.omni, layer, table)
+        tables = [options.output / f"nvidia_{which}.csv" for which in ("original", "result")]
+        found_by_nvidia = [
+            nvidia(options.nvidia, layer, table)
             for layer, table in zip((mesh, made.root_layer), tables, strict=True)
         ]
-        report["omni"] = sorted_out(
-            {in_place(text, theirs, ours) for text in found_by_omni[0]}, found_by_omni[1]
+        report["nvidia"] = sorted_out(
+            {in_place(text, theirs, ours) for text in found_by_nvidia[0]}, found_by_nvidia[1]
         )
     print(json.dumps(report, indent=1))
     return converted.returncode
@@ -133,8 +133,8 @@ def errors(layer: Path) -> set[str]:
     return {str(item) for item in validate(layer) if item.severity is Severity.ERROR}
 
 
-def omni(command: str, layer: Path, table: Path) -> set[str]:
-    """What omniverse-asset-validator calls a failure or an error, each once: it looks at a stage
+def nvidia(command: str, layer: Path, table: Path) -> set[str]:
+    """What usd-validation-nvidia calls a failure or an error, each once: it looks at a stage
     once for each of its combinations of variants."""
     # Its messages list sets: equal in both runs only if strings hash the same.
     call = [command, "--csv-output", str(table), str(layer)]

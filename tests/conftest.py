@@ -18,9 +18,12 @@ SLOW = (
     "asset/test_schema.py",
     "capture/test_adapters.py",
     "dcc",
+    "delivery/test_acescg.py",
     "delivery/test_glb.py",
     "delivery/test_package_refused.py",
     "delivery/test_package_usdz.py",
+    "delivery/test_package_whole.py",
+    "delivery/test_publish.py",
     "evaluation",
     "faults/test_bad_captures.py",
     "faults/test_frames_that_disagree.py",
@@ -41,6 +44,7 @@ SLOW = (
     "shading/test_denoise.py",
     "shading/test_denoise_default.py",
     "shading/test_outside.py",
+    "tasks/test_directives.py",
     "tasks/test_texture.py",
     "test_cli.py",
     "test_convert.py",
@@ -68,6 +72,7 @@ SWEEPS = (
 
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
+    "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",
     "material/test_view_model.py::test_the_samples_tell_how_large_their_errors_are",

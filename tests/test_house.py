@@ -87,8 +87,7 @@ IMPORTERS: dict[str, set[str]] = {
         "texturing/",
         "transport/",
     },
-    "omni": {"validation/omniverse.py"},
-    "OpenImageIO": {"files/images.py"},
+    "OpenImageIO": {"files/images.py", "files/published_images.py"},
     "pickle": {"kernel.py"},
     "PIL": {"delivery/"},
     "psutil": {"job/memory.py"},
@@ -103,6 +102,7 @@ IMPORTERS: dict[str, set[str]] = {
     "threadpoolctl": {"material/fit_objects.py"},
     "tqdm": {"job/progress.py"},
     "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
+    "usd_validation_nvidia": {"validation/nvidia.py"},
     "xatlas": {"geometry/unwrap.py"},
 }
 
@@ -236,6 +236,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_FRAMES": "memory",
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
+    "_OTHER_SEED": "a seed",
     "_PARTS": "blocks of a jackknife",
     "_PER_CODE": "time",
     "_PER_PIXEL": "bytes",

@@ -5,22 +5,27 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
 import usdbrdf
 from tests.scenes import make_capture, poses_down_and_up
+from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_edited, open_measured
-from usdbrdf.asset.readers.scene import aov_path, read_shading
+from usdbrdf.asset.readers.scene import aov_path, read_fit, read_shading
 from usdbrdf.cli import main
-from usdbrdf.errors import OwnershipConflict, UsageError
+from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.page import report
+from usdbrdf.page.report import page_data
 
 COARSE = ["-q", "--texel-size", "0.3", "--standard-error", "0.1", "--rays", "64"]
 COARSE += ["--environment", "none", "--denoise", "none"]
@@ -203,8 +208,63 @@ def test_views_are_evaluated_in_the_lighting_that_is_named(asset, captures, tmp_
         assert found["lighting"] == name
         # The radiance of objects is a number, so L_d shows the frames but for edges.
         assert found["summary"]["l2_shown"]["baseline"] < 0.2
+    _page_of_the_night(asset, *places)
     with pytest.raises(UsageError, match=r"the asset has day, night. \[asset.lighting\]"):
         asset.in_lighting("dawn")
+
+
+def _page_of_the_night(asset, by_day, by_night):
+    """What the page tells is of one lighting throughout."""
+    asked = partial(usdbrdf.ReportOptions, lighting="night", environment="none")
+    with pytest.raises(
+        InputRefused, match=r"lighting 'day', not in 'night'.*\[report.evaluation\]"
+    ):
+        page_data(asset, asked(evaluation=by_day))
+    data = page_data(asset, asked(evaluation=by_night))
+    assert data["capture"]["lighting"] == "night"
+    assert data["capture"]["frames"] == len(data["rows"]) == 12
+    assert any("Photographs measured" in told for told in data["findings"])
+    assert any("standard error of" in told for told in data["findings"])
+    lamps = {row["id"]: row["radiance"] for row in data["objects"] if row["status"] == "lamp"}
+    assert list(lamps) == ["box"]
+    assert lamps["box"]["mean"][0] == pytest.approx(6, rel=0.01)
+
+
+def test_target_frames_are_counted_in_the_lighting_that_is_shown(asset, monkeypatch):
+    maps = AssetMaps(open_measured(asset.in_lighting("night")))
+    fit = read_fit(maps.stage, "/room/geo/floor")
+    for stored, shown in ((15, 3), (3, -1), (-1, -1)):
+        changed = replace(fit, target_frame=stored)
+        monkeypatch.setattr(report, "read_fit", lambda *_, changed=changed: changed)
+        assert report._in_own_frames(maps, "/room/geo/floor").target_frame == shown
+
+
+def test_lightings_of_one_asset_are_compared(asset, tmp_path):
+    options = usdbrdf.CompareOptions(lighting="day", other_lighting="night")
+    found = usdbrdf.compare(asset.folder, asset.folder, tmp_path / "compared", options)
+    assert found["lightings"] == ["day", "night"]
+    # One base colour for both, but S and L_d of each.
+    assert found["diffuse"]["albedo"]["nrmse"] == 0
+    assert found["lit"]["relit_a"] != found["lit"]["relit_b"]
+
+
+def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
+    folder = tmp_path / "room"
+    shutil.copytree(asset.folder, folder)
+    copy, name = Asset.made(folder), "/room/geo/floor.usdBrdf:shading:raysPerTexel"
+    edited = copy.in_lighting("night").layer("shading")
+    layer = Sdf.Layer.OpenAsAnonymous(str(edited))
+    layer.GetAttributeAtPath(name).default = 7777.0
+    layer.Export(str(edited))
+    (adopted,) = adopt(copy, [edited])
+    shutil.copyfile(asset.in_lighting("night").layer("shading"), edited)
+    edits = Sdf.Layer.OpenAsAnonymous(str(copy.edits_layer))
+    edits.subLayerPaths.append(f"./{adopted.name}")
+    edits.Export(str(copy.edits_layer))
+    stages = [open_edited(copy.in_lighting(lighting)) for lighting in LIGHTINGS]
+    stages.append(open_edited(asset.in_lighting("day")))
+    day, night, before = (stage.GetAttributeAtPath(name).Get() for stage in stages)
+    assert (day, night) == (before, 7777.0)
 
 
 def test_other_lightings_need_another_folder(base, asset, captures):

@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from usdbrdf.delivery.package import package as package
+    from usdbrdf.delivery.publish import publish as publish
     from usdbrdf.evaluation.compare_assets import compare as compare
     from usdbrdf.evaluation.evaluate_views import evaluate as evaluate
+    from usdbrdf.options import CompareOptions as CompareOptions
     from usdbrdf.options import ConvertOptions as ConvertOptions
     from usdbrdf.options import EvaluateOptions as EvaluateOptions
     from usdbrdf.options import FitOptions as FitOptions
     from usdbrdf.options import IngestOptions as IngestOptions
     from usdbrdf.options import Insert as Insert
     from usdbrdf.options import PackageOptions as PackageOptions
+    from usdbrdf.options import PublishOptions as PublishOptions
     from usdbrdf.options import RelightOptions as RelightOptions
     from usdbrdf.options import ReportOptions as ReportOptions
     from usdbrdf.options import Sampling as Sampling
@@ -40,12 +43,14 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "usdbrdf.options": (
-        *("ConvertOptions", "EvaluateOptions", "FitOptions", "IngestOptions", "Insert"),
-        *("PackageOptions", "RelightOptions", "ReportOptions", "Sampling"),
-        *("ShadeOptions", "TextureOptions"),
+        *("CompareOptions", "ConvertOptions", "EvaluateOptions", "FitOptions"),
+        *("IngestOptions", "Insert"),
+        *("PackageOptions", "PublishOptions", "RelightOptions", "ReportOptions"),
+        *("Sampling", "ShadeOptions", "TextureOptions"),
     ),
     "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
     "usdbrdf.delivery.package": ("package",),
+    "usdbrdf.delivery.publish": ("publish",),
     "usdbrdf.evaluation.compare_assets": ("compare",),
     "usdbrdf.evaluation.evaluate_views": ("evaluate",),
     "usdbrdf.page.report": ("report",),

@@ -37,11 +37,14 @@ class _Talking(TalkOptions, Command):
         return 0
 
 
-class _Run(_Talking):
+class _Locking(Command):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
     without_lock: bool = option("--without-lock", False)
     """go on where the file system has no locks: see that nothing else writes into the asset"""
+
+
+class _Run(_Locking, _Talking):
     strict: bool = option("--strict", False)
     "exit with 7 if a step of this asset warned, now or when it was done"
 
@@ -267,11 +270,12 @@ class Compare(_Talking):
     "another of the same scene; it is not changed"
     output: Path = option("-o --output FOLDER", Path("comparison"))
     "folder for figures and pictures, made if it is not there"
+    options: options.CompareOptions
 
     def run(self) -> int:
         with loading():
             from usdbrdf.evaluation import compare_assets as made
-        found = made.compare(self.first, self.second, self.output)
+        found = made.compare(self.first, self.second, self.output, self.options)
         written = f"{self.output / made.DOCUMENT}: written"
         summary = {"output": str(self.output), **made.figures(found)}
         return self.told(summary, made.comparison_line(found), written)
@@ -303,6 +307,28 @@ class Package(_WithAsset):
             from usdbrdf.delivery.package import package
         summary = package(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
+
+
+class Publish(_Locking, _WithAsset):
+    """Write the asset as a version that never changes, for others to take in."""
+
+    destination: Path = option("DEST", REQUIRED)
+    "folder of all its versions, made if it is not there"
+    options: options.PublishOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.delivery.publish import publish
+        summary = publish(
+            self.asset,
+            self.destination,
+            self.options,
+            wait_s=self.wait_s,
+            without_lock=self.without_lock,
+        )
+        done = f"written, {summary['files']} files, {summary['bytes']:,} bytes"
+        told = done if summary["new"] else "holds this already, nothing was written"
+        return self.told(summary, f"{summary['publish']}: {told}")
 
 
 class Report(_WithAsset):
@@ -420,6 +446,7 @@ _OTHERS = (
     Compare,
     Relight,
     Package,
+    Publish,
     Report,
     View,
     Validate,

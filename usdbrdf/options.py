@@ -69,6 +69,15 @@ def _allow_outside(who: str = "the capture's documents") -> tuple[Path, ...]:
     return option("--allow-outside DIR", (), unset="none", help=text)
 
 
+TextureSpace = Literal["rec709", "acescg"]
+
+
+def _texture_space() -> TextureSpace:
+    who = "acescg for programs that render in it and convert nothing"
+    text = f"linear space of textures and other colours: rec709, or {who}"
+    return option("--texture-space", "rec709", help=text)
+
+
 class TalkOptions(Options):
     """What is said while a command runs and at its end."""
 
@@ -100,7 +109,7 @@ class EditOptions(Options):
         return "adopt" if self.adopt else "discard" if self.discard else "refuse"
 
 
-class IngestOptions(Options):
+class CaptureOptions(Options):
     """What a user may say about a capture that its files do not say; the same for every adapter."""
 
     mesh: Path | None = option("--mesh FILE", None, unset="the capture's own", file=True)
@@ -125,14 +134,6 @@ class IngestOptions(Options):
     encoding: str | None = option("--input-space --encoding NAME", None, unset="as the format says")
     """colour space of the images by its OpenColorIO name: scene-linear (lin_ap1_scene), a camera's
     logarithm (ARRI LogC4), or for 8-bit photographs a display's (srgb_p3d65_scene)"""
-    exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
-    """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
-    or darker than the others do of the same surfaces is divided out"""
-    refine_poses: bool = option("--refine-poses", False)
-    """let every camera take a small step after which its frame agrees better with the others about
-    the mesh; the poses as captured are kept beside"""
-    vignetting: Literal["report", "estimate"] = option("--vignetting", "report")
-    "report: how much all frames darken towards their corners is told; estimate: and divided out"
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )
@@ -153,7 +154,20 @@ class IngestOptions(Options):
         return None
 
 
-class InspectOptions(IngestOptions):
+class IngestOptions(CaptureOptions):
+    """The same, and what is to be found out of the frames' pixels before they are used."""
+
+    exposure: Literal["stated", "estimate"] = option("--exposure", "stated")
+    """stated: frames are believed to hold radiance in one unit; estimate: what each shows brighter
+    or darker than the others do of the same surfaces is divided out"""
+    refine_poses: bool = option("--refine-poses", False)
+    """let every camera take a small step after which its frame agrees better with the others about
+    the mesh; the poses as captured are kept beside"""
+    vignetting: Literal["report", "estimate"] = option("--vignetting", "report")
+    "report: how much all frames darken towards their corners is told; estimate: and divided out"
+
+
+class InspectOptions(CaptureOptions):
     """What a user may say about a capture that is only looked at."""
 
     checked: int = option("--check N", 24, (2, 2**31 - 1))
@@ -303,6 +317,14 @@ class EvaluateOptions(Options):
         return math.isqrt(self.samples_per_pixel)
 
 
+class CompareOptions(Options):
+    """What of two assets is compared."""
+
+    lighting: str | None = _lighting()
+    other_lighting: str | None = option("--other-lighting NAME", None, unset="the one it opens in")
+    "the same of OTHER"
+
+
 class Insert(Options):
     """A model and what to do with it, lengths in units of the asset's stage. UsageError where it is
     placed in two ways, or where a matrix comes with a scale or a rotation, which it holds itself.
@@ -399,6 +421,25 @@ class PackageOptions(Options):
     lighting: str | None = _lighting()
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
+    texture_space: TextureSpace = _texture_space()
+    whole: bool = option("--whole", False)
+    """.usdz of the layers as they are, all looks and lightings as variants, in the place of one
+    look made flat"""
+
+
+class PublishOptions(Options):
+    """What a published version of an asset is."""
+
+    version: str | None = option("--version vNNN", None, unset="the one after the latest")
+    "its name"
+    uri: str | None = option("--uri TEMPLATE", None, unset="./NAME.usd")
+    """identifier in assetInfo, for a studio's resolver: a URI with {name} and {version}, such as
+    'ayon+entity://show/assets?product={name}&version={version}'"""
+    photographs: bool = option("--no-photographs", True)
+    "leave the photographs out; else they are copied without EXIF, GPS and the like"
+    texture_space: TextureSpace = _texture_space()
+    encoding: Literal["text", "binary"] = option("--encoding", "text")
+    "of the root layer, NAME.usd"
 
 
 class ReportOptions(Options):
@@ -413,6 +454,7 @@ class ReportOptions(Options):
     photographs: bool = option("--no-photographs", True)
     "leave all photographs out, and what they look like beside the model's pictures"
     environment: Surroundings = _environment()
+    lighting: str | None = _lighting()
     seed: int = _seed()
     allow_outside: tuple[Path, ...] = _allow_outside()
 

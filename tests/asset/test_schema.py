@@ -122,24 +122,32 @@ def test_every_attribute_is_known_and_documented(name):
             assert re.search(UNITS, spec.documentation), f"{attribute} has no unit"
         assert (spec.default is not None) or kind == "asset", f"{attribute} has no fallback"
         if spec.HasInfo("allowedTokens"):
-            assert spec.default in spec.GetInfo("allowedTokens")
+            # An empty one says nothing.
+            assert spec.default in ("", *spec.GetInfo("allowedTokens"))
             for token in spec.GetInfo("allowedTokens"):
                 assert token in spec.documentation, f"{attribute}: {token} is not explained"
 
 
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one; one of its
-    objects is made a metal, and its photographs were taken through a lens, by day."""
+    objects is made a metal, as a person asked, another a lamp, and its photographs were taken
+    through a lens, in log, by day."""
     verify()
     frames = built.scan.frames
     paths = frames.image_paths
-    frames = replace(frames, photographs=paths, masks=paths, lenses=("fisheye",) * len(frames))
+    frames = replace(
+        frames, photographs=paths, masks=paths, lenses=("fisheye",) * len(frames),
+        photograph_encoding="acescct_ap1",
+    )  # fmt: skip
     built.scan = replace(built.scan, frames=frames)
     built.write_layer("scan")
     first, *others = built.fitted
     metal = replace(first, kind="conductor", f0=(0.5, 0.25, 0.125), f0_error=0.03125)
+    metal = replace(metal, directive="metal")
     built.fitted = (metal, *others)
     built.write_layer("material")
+    lamp, *dark = built.shaded
+    built.shaded = (replace(lamp, directive="lamp"), *dark)
     built.outside = sky_of(built.asset)
     built.write_layer("shading")
     built.scan = replace(built.scan, frames=replace(frames, lightings=("day",) * len(frames)))

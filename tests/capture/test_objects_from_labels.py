@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from usdbrdf.capture.parts import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused
+from usdbrdf.model.mesh import ObjectName
 from usdbrdf.untrusted.mesh_files import FileMesh
 
 
@@ -25,7 +28,7 @@ def _squares(sides: list[float], **more) -> FileMesh:
 
 def test_connected_parts_come_largest_first_and_the_small_ones_together():
     split = segmentation(_squares([0.05, 2, 1, 0.05]), None, table_path=None, min_area=0.01)
-    assert [name for name, _ in split.labels] == ["part_001", "part_002", "rest"]
+    assert [name.label for name in split.labels] == ["part_001", "part_002", "rest"]
     assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
 
 
@@ -33,31 +36,32 @@ def test_connected_parts_come_largest_first_and_the_small_ones_together():
 def test_what_is_too_small_for_an_object_does_not_depend_on_the_unit(unit):
     sides = [unit * side for side in (0.005, 2, 1, 0.005)]
     split = segmentation(_squares(sides), None, table_path=None, min_area=None)
-    assert [name for name, _ in split.labels] == ["part_001", "part_002", "rest"]
+    assert [name.label for name in split.labels] == ["part_001", "part_002", "rest"]
     assert split.face_object.tolist() == [2, 2, 0, 0, 1, 1, 2, 2]
 
 
 @pytest.mark.fault("G9")
 def test_one_large_part_is_one_object():
     split = segmentation(_squares([2, 0.05]), None, table_path=None, min_area=0.01)
-    assert split.labels == (("scan", ""),)
+    assert split.labels == (ObjectName("scan"),)
     assert split.face_object.tolist() == [0] * 4
 
 
 @pytest.mark.fault("G10")
 def test_ids_may_be_sparse_and_negative(tmp_path):
     path = tmp_path / "objects.json"
-    path.write_text('{"objects": [{"id": 7, "name": "chair", "class_name": "seat"}, {"id": 9}]}')
+    chair = {"id": 7, "name": "chair", "class_name": "seat"}
+    path.write_text(json.dumps({"objects": [chair, {"id": 9, "directive": "lamp"}]}))
     labels = np.array([900000, 7, -5, 9, -1, 7])
     mesh = _squares([1, 1, 1], face_label=labels)
     split = segmentation(mesh, label_table(path), table_path=path, min_area=0.01)
     assert [split.labels[i] for i in split.face_object] == [
-        ("object_900000", ""),
-        ("chair", "seat"),
-        ("unlabelled", ""),
-        ("object_9", ""),
-        ("unlabelled", ""),
-        ("chair", "seat"),
+        ("object_900000", "", ""),
+        ("chair", "seat", ""),
+        ("unlabelled", "", ""),
+        ("object_9", "", "lamp"),
+        ("unlabelled", "", ""),
+        ("chair", "seat", ""),
     ]
 
 
@@ -68,7 +72,7 @@ def test_labels_of_the_document_count_the_broken_faces_too(tmp_path):
     split = segmentation(
         _squares([1, 1], kept=kept), label_table(path), table_path=path, min_area=0.01
     )
-    assert [name for name, _ in split.labels] == ["object_1", "object_3", "object_4", "object_5"]
+    assert [name.label for name in split.labels] == ["object_1", "object_3", "object_4", "object_5"]
 
 
 @pytest.mark.fault("G10")
@@ -90,7 +94,17 @@ def test_documents_of_another_shape_are_refused(tmp_path, text):
 
 
 def test_objects_without_faces_disappear():
-    labels = (("a", ""), ("b", "x"), ("c", ""))
+    labels = (ObjectName("a"), ObjectName("b", "x"), ObjectName("c", "", "metal"))
     face_object, objects = objects_with_faces(np.array([2, 1, 2], np.int32), labels)
     assert face_object.tolist() == [1, 0, 1]
-    assert [(o.label, o.class_name) for o in objects] == [("b", "x"), ("c", "")]
+    found = [(o.label, o.class_name, o.directive) for o in objects]
+    assert found == [("b", "x", ""), ("c", "", "metal")]
+
+
+def test_a_directive_that_is_none_is_refused(tmp_path):
+    path = tmp_path / "objects.json"
+    path.write_text('{"objects": [{"id": 4, "directive": "gold"}]}')
+    with pytest.raises(
+        InputRefused, match=r"'gold' of object 4 is none of .*\[objects.directive\]$"
+    ):
+        label_table(path)

@@ -11,7 +11,7 @@ from tests.scenes import edited, make_capture
 from usdbrdf.capture.raw_frames import develop_raw
 from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.files.images import read_radiance
+from usdbrdf.files.images import read_radiance, write_preview_png
 from usdbrdf.untrusted import raw_files
 
 tifffile = pytest.importorskip("tifffile")
@@ -83,6 +83,10 @@ def capture(tmp_path):
 
 
 def test_colours_exposures_and_clipping_come_out_right(capture, tmp_path, capsys):
+    (capture / "masks").mkdir()
+    write_preview_png(capture / "masks/0001.png", np.full((SIDE, 4 * SIDE, 3), 255, np.uint8))
+    with edited(capture / "transforms.json") as document:
+        document["frames"][1]["mask_path"] = "masks/0001.png"
     found = develop_raw(capture, tmp_path / "developed")
     document = json.loads((tmp_path / "developed/transforms.json").read_text())
     paths = [tmp_path / "developed" / frame["file_path"] for frame in document["frames"]]
@@ -102,6 +106,8 @@ def test_colours_exposures_and_clipping_come_out_right(capture, tmp_path, capsys
     assert "white balance drifts by up to 0.32 stops (0001.dng)" in capsys.readouterr().err
     assert document["frames"][0]["exposure_time"] == pytest.approx(1 / 50)
     assert (tmp_path / "developed/mesh.ply").is_file()
+    mask = tmp_path / "developed" / document["frames"][1]["mask_path"]
+    assert mask.read_bytes() == (capture / "masks/0001.png").read_bytes()
 
 
 def test_what_cannot_be_developed_is_refused(capture, tmp_path, monkeypatch):

@@ -8,11 +8,14 @@ import pytest
 import usdbrdf
 from tests.lens_scenes import capture_through, surface_of
 from tests.scenes import edited, make_capture, ring_of_poses
+from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.files.frames import read_frame
+from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 
 
 def read(asset, document):
@@ -73,6 +76,63 @@ def test_views_through_lenses_become_pinhole_frames(room, tmp_path, model, faces
             off = np.abs(pixels.radiance[own] / held_out.radiance[name] - 1)
             assert off.max(initial=0) < 0.01, (views.names[i], name)
     assert seen > 500
+
+
+# Linear Rec.709 to those of ACEScct and of Display P3 (SMPTE ST 2065-1, EG 432-1), by white D65
+# adapted to ACES' own after Bradford; and how either encodes them (S-2016-001; IEC 61966-2-1).
+AP1 = np.array(
+    [[0.61310, 0.33952, 0.04738], [0.07019, 0.91635, 0.01345], [0.02062, 0.10957, 0.86981]]
+)
+P3 = np.array([[0.82246, 0.17754, 0.0], [0.03319, 0.96681, 0.0], [0.01708, 0.07240, 0.91052]])
+
+
+def _acescct(image):
+    linear = image @ AP1.T
+    return np.where(
+        linear > 0.0078125, (np.log2(linear) + 9.72) / 17.52, 10.5402377 * linear + 0.0729
+    )
+
+
+def _display_p3(image):
+    linear = np.clip(image @ P3.T, 0, 1)
+    return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "encoded"), [("ACEScct", _acescct), ("srgb_p3d65_scene", _display_p3)]
+)
+def test_views_through_lenses_have_the_colours_of_the_captures_photographs(
+    tmp_path, encoding, encoded
+):
+    pytest.importorskip("pycolmap")
+    capture = capture_through(tmp_path / "scan", "OPENCV")
+    displayed = encoded is _display_p3
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            image = encoded(np.maximum(read_exr(capture.image(i)), 1e-9))
+            if displayed:
+                frame["file_path"] = f"frames/{i:04d}.png"
+                del frame["saturation_radiance"]
+                codes = (255 * image + 0.5).astype(np.uint8)
+                write_preview_png(capture.folder / frame["file_path"], codes)
+            else:
+                write_exr(capture.image(i), image.astype(np.float32), half=False)
+    options = usdbrdf.IngestOptions(encoding=encoding, assume_srgb=displayed)
+    with usdbrdf.working_on(tmp_path / "room") as asset:
+        usdbrdf.ingest(capture.folder, asset, options)
+    atlas = AssetMaps(open_weaker(asset, "texturing"))
+    assert atlas.frames.photograph_encoding == encoding
+    folder = tmp_path / "developed"
+    folder.mkdir()
+    views = photographs_of_views(capture.manifest, asset, atlas.stage, atlas.scene, folder)
+    pixels, shown = read_frame(views.frames, 3), surface_of(capture, views.frames.camera(3))
+    seen = 0
+    for k, name in enumerate(capture.names):
+        own = (shown == k) & pixels.valid
+        seen += int(own.sum())
+        off = np.abs(pixels.radiance[own] / capture.radiance[name] - 1)
+        assert off.max(initial=0) < 0.03, name
+    assert seen > 200
 
 
 def test_a_view_that_cannot_be_used_is_left_out(room, tmp_path):

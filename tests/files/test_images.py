@@ -186,7 +186,7 @@ def test_a_file_that_does_not_read_back_is_not_published(tmp_path, monkeypatch, 
     """A disk that loses what it said it wrote."""
     path = tmp_path / "a.exr"
     write_exr(path, radiance)
-    before, write = path.read_bytes(), images._write
+    before, write = path.read_bytes(), images.write_image
 
     def losing(path, staged, spec, pixels):
         pixels = np.array(pixels)
@@ -483,7 +483,7 @@ for more in (1, 16, 40, 64, 96, 110, 128):
 def test_whatever_the_decoder_raises_is_a_refusal(tmp_path, monkeypatch, radiance, error):
     """Damaged PIZ blocks have been seen to raise a SystemError."""
     write_exr(tmp_path / "a.exr", radiance)
-    source = images._open(tmp_path / "a.exr", images.MAX_SIDE)
+    source = images.open_image(tmp_path / "a.exr")
 
     class Stumbling:
         def __getattr__(self, name):

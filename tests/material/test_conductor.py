@@ -50,12 +50,13 @@ def _basis(seed: int):
     return basis
 
 
-def _found(radiance: np.ndarray, psi: float):
+def _found(radiance: np.ndarray, psi: float, *, certain: bool = False):
     noisy = radiance * (1 + 0.02 * np.random.default_rng(9).standard_normal(radiance.shape))
     dielectric = LobeEstimate(PHI, psi, 0.02, 0.1, 0.0, 1.0, 0.9)
     irradiance = np.full((len(TEXEL), 3), 1.5, np.float32)
     bases = _basis(2), _basis(3)
-    return conductor_of(noisy.astype(np.float32), TEXEL, irradiance, bases, dielectric)
+    noisy = noisy.astype(np.float32)
+    return conductor_of(noisy, TEXEL, irradiance, bases, dielectric, certain=certain)
 
 
 def test_a_metal_is_found_with_its_colour():
@@ -78,6 +79,21 @@ def test_a_dielectric_is_none(texture: float):
 def test_a_black_dielectric_is_none():
     # All that it shows is its lobe, as of a metal; but no metal reflects so little.
     assert _found((0.01 + F0_OF_PSI * 0.6) * _incident(1), 0.6) is None
+
+
+def test_who_says_that_it_is_a_metal_gets_one_and_no_measurement_of_what_contradicts():
+    diffuse = 0.5 * 1.5 / np.pi * np.array([1.0, 0.9, 0.7])
+    metal = _found(diffuse + (0.01 + F0_OF_PSI * 0.9) * _incident(1), 0.9, certain=True)
+    assert metal is not None
+    assert metal.clearer < 0
+    errors = {"metal_phi_error": 0.01, "f0_error": 0.02}
+    found = ObjectFit(0.1, 0.9, 0.01, 0.05, num_samples=500)._replace(
+        metal_phi=metal.phi, red=metal.f0[0], green=metal.f0[1], blue=metal.f0[2],
+        clearer=metal.clearer, **errors,
+    )  # fmt: skip
+    verdict = judged(found, _object(), FitOptions(), True, "metal")
+    assert (verdict.kind, verdict.status) == ("conductor", "prior")
+    assert judged(found._replace(clearer=0.4), _object(), FitOptions(), True).status == "measured"
 
 
 def _object() -> SceneObject:

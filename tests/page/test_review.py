@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from pxr import Sdf, Usd
@@ -110,7 +111,14 @@ def test_a_run_tells_what_changed_and_what_was_asked_for(built):
     write_review(asset, {CHAIR: said})
     changed, asked = notes_for_run(asset)
     assert changed.startswith(f"<{CHAIR}> accepted as measured, phi 0.90, psi 0.10; now ")
-    assert asked == f"<{CHAIR}> asks for 'metal', which is kept: no step acts on it yet."
+    will = "which the step fit will follow when it runs."
+    assert asked == f"<{CHAIR}> asks for 'metal', {will}"
+    built.fitted = tuple(
+        replace(item, directive="metal") if item.prim_path == CHAIR else item
+        for item in built.fitted
+    )
+    built.write_layer("material")
+    assert notes_for_run(asset)[1] == f"<{CHAIR}> was made as 'metal', as the directive asks."
 
 
 @pytest.mark.parametrize(

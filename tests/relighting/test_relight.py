@@ -164,6 +164,19 @@ def test_both_variants_render_a_folder_of_views(
     assert (pictures[0] != pictures[1]).any()  # noise of its own in each view
 
 
+def test_views_through_lenses_are_those_of_their_pinhole_frames(room: Path, tmp_path: Path) -> None:
+    views = _views(tmp_path, "a")
+    document = json.loads(views.read_text())
+    size = {"w": 64, "h": 32, "camera_model": "EQUIRECTANGULAR"}
+    views.write_text(json.dumps({"frames": document["frames"], **size}))
+    found = relight(room, tmp_path / "out", RelightOptions(views=views, samples=64, denoise="none"))
+    names = [Path(name).name for name in found["pictures"]]
+    assert names == [f"a.{face}.exr" for face in ("front", "right", "left", "up", "down", "back")]
+    # The document's camera looks down on the floor.
+    middle = read_radiance(tmp_path / "out" / "a.front.exr")[4:-4, 4:-4]
+    assert middle.mean() > 10 * read_radiance(tmp_path / "out" / "a.back.exr").mean()
+
+
 def test_views_without_images_need_their_size_stated(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

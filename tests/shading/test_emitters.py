@@ -121,6 +121,20 @@ def test_the_unseen_back_of_a_lamp_shines_with_it(world: World, lit: np.ndarray)
     np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
 
 
+def test_who_says_so_decides_what_shines(world: World, lit: np.ndarray):
+    everywhere, shading = np.ones(len(lit), bool), np.full_like(lit, SHADING)
+    said = {2: True, LAMP: False}
+    own = world.texels.object_index() == 2
+    found = find_emitters(world.texels, lit, shading, everywhere, ~everywhere, said=said)
+    np.testing.assert_array_equal(found.is_lamp, [i == 2 for i in range(7)])
+    np.testing.assert_array_equal(found.emissive, own)
+    np.testing.assert_allclose(found.radiance[2], lit[own][0], rtol=1e-5)
+    # One that nobody saw shines with what it was filled in with, at least.
+    found = find_emitters(world.texels, lit, shading, ~own, ~everywhere, said=said)
+    assert found.lower_bound[2]
+    np.testing.assert_allclose(found.radiance[2], lit[own][0], rtol=1e-5)
+
+
 def test_an_object_that_nobody_saw_is_no_lamp(world: World, lit: np.ndarray):
     own = world.texels.object_index() == LAMP
     found = _find(world, lit, seen=~own)

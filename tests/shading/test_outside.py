@@ -7,6 +7,7 @@ import pytest
 
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading import outside
 from usdbrdf.shading.outside import Outside, light_from_outside
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
 from usdbrdf.transport.environment import (
@@ -212,3 +213,28 @@ def test_a_sky_behind_a_slit_is_believed_in_where_its_light_is_seen(daylight: fl
     ).mean  # fmt: skip
     share = float(brought.sum() / arriving.sum())
     assert share < 0.02 if daylight == 0 else share > 0.1
+
+
+def test_the_ground_beyond_may_be_darker_than_the_sky_over_it(yard, monkeypatch):
+    """Frames show some of the sky; of the ground before the open side there is only its light."""
+    dark = np.array(SKY)
+    dark[_UP < 0] = 0.005
+    surface, lit, _ = _lit(yard, Environment(dark, True), texture=0.05)
+    every = CoverageMap.of(np.ones(len(lit), bool), np.zeros(len(lit), bool))
+    before = directions_of_pixels(HEIGHT, WIDTH, True)[..., 1] < -0.7
+
+    def of_sky() -> float:
+        """How bright the ground is found."""
+        found = light_from_outside(surface, lit, every, _seen(_UP > 0.4), True, 0)
+        assert found is not None
+        image = found.environment.image
+        ground, sky = (
+            np.median(image[part & before])
+            for part in ((_UP < 0) & (_UP > -0.3), (_UP > 0) & (_UP < 0.2))
+        )
+        return float(ground / sky)
+
+    found = of_sky()
+    monkeypatch.setattr(outside, "_ALIKE_OVER_HORIZON", outside._ALIKE)
+    assert found < 0.25
+    assert found < 0.5 * of_sky()

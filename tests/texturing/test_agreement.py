@@ -91,7 +91,7 @@ def test_the_convention_that_fits_is_named(capture, name, capsys):
     assert name in err
 
 
-def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, capsys):
+def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, tmp_path, capsys):
     rng = np.random.default_rng(1)
     with edited(capture.manifest) as document:
         for frame in document["frames"]:
@@ -100,7 +100,14 @@ def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, capsys):
             pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
             frame["transform_matrix"] = pose.tolist()
     assert main(["inspect", str(capture.folder)]) == 0
-    assert "[capture.agreement]" in capsys.readouterr().err
+    assert "[capture.agreement]" in capsys.readouterr().out
+    call = ["ingest", str(capture.folder), "-o", str(tmp_path / "out"), "--json", "--strict"]
+    assert main(call) == 7
+    told, err = capsys.readouterr()
+    warnings = json.loads(told)["steps"]["ingest"]["warnings"]
+    (warning,) = [one for one in warnings if one.endswith("[capture.agreement]")]
+    assert warning in err
+    assert str(tmp_path) not in warning
 
 
 def test_few_samples_say_nothing():
@@ -121,7 +128,9 @@ def test_estimated_exposures_reach_every_reader_of_frames(capture, tmp_path, cap
     arguments = ["ingest", str(capture.folder), "-o", str(out), "--json", "--exposure", "estimate"]
     assert main(arguments) == 0
     printed, err = capsys.readouterr()
-    found = json.loads(printed)["steps"]["ingest"]["estimated_exposures"]
+    told = json.loads(printed)["steps"]["ingest"]
+    assert any("[capture.exposure]" in warning for warning in told["warnings"])
+    found = told["estimated_exposures"]
     assert found == {f"{i:04d}.exr": pytest.approx(factor, rel=0.03) for i, factor in wrong.items()}
     assert "2 of 24 frames" in err
     assert "[capture.exposure]" in err

@@ -69,9 +69,21 @@ def test_what_was_darkened_comes_out_as_it_was(tmp_path, capsys):
     assert told["vignetting_stops"] == pytest.approx(1.3, abs=0.1)
     assert told["white_balance_drift_stops"] < 0.05
     assert "--vignetting estimate divides it out" in capsys.readouterr().err
+    assert any("[capture.vignetting]" in warning for warning in told["warnings"])
     asset = Asset.at(tmp_path / "asset")
     ingest(capture.folder, asset, IngestOptions(vignetting="estimate"))
     frames = frames_from_stage(open_weaker(asset, "texturing"))
     shown = read_frame(frames, 5)
     ratio = (shown.radiance / clean[5])[shown.valid]
     assert np.abs(ratio / np.median(ratio) - 1).max() < 0.06
+
+
+def test_a_frame_of_another_balance_is_one_of_the_warnings(tmp_path):
+    capture = make_capture(tmp_path / "capture", frames=16, size=(96, 72))
+    image = read_radiance(capture.image(4)) * np.array((1.3, 1, 0.8))
+    write_exr(capture.image(4), image.astype(np.float32), half=False)
+    told = ingest(capture.folder, Asset.at(tmp_path / "asset"), IngestOptions()).summary
+    (warning,) = told["warnings"]
+    assert "of 1 of 16 frames" in warning
+    assert capture.image(4).name in warning
+    assert warning.endswith("[capture.balance]")

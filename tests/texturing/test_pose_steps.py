@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ from tests.scenes import camera_at, edited, make_capture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_weaker
+from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import write_exr
+from usdbrdf.options import IngestOptions
 from usdbrdf.transport.rays import RayScene
 
 SIZE = (96, 72)
@@ -105,3 +109,26 @@ def test_disturbed_poses_come_back_and_the_captured_ones_are_kept(made, tmp_path
     np.testing.assert_allclose(matrices, poses, atol=1e-9)
     kept = np.array([frame["captured_transform_matrix"] for frame in written])
     np.testing.assert_allclose(kept, captured, atol=1e-12)
+    # What was written says that its poses are refined: they are not refined again.
+    assert (
+        main(["ingest", str(copy), "-o", str(tmp_path / "again"), "--json", "--refine-poses"]) == 0
+    )
+    printed, err = capsys.readouterr()
+    assert "refined already" in err
+    steps = json.loads(printed)["steps"]["ingest"]["refined_poses"]
+    assert [one["moved_m"] for one in steps] == pytest.approx(moved.tolist(), abs=1e-5)
+    again = Usd.Stage.Open(str(Asset.at(tmp_path / "again").layer("scan")))
+    camera = next(UsdGeom.Xformable(p) for p in again.Traverse() if p.IsA(UsdGeom.Camera))
+    for one, other in zip((first, second), camera.GetOrderedXformOps(), strict=True):
+        assert one.GetOpName() == other.GetOpName()
+        for time in range(1, 17):
+            np.testing.assert_allclose(other.Get(time), one.Get(time), atol=1e-9)
+
+
+def test_a_captured_pose_that_is_none_is_refused(made, tmp_path):
+    folder = tmp_path / "room"
+    shutil.copytree(made.folder, folder)
+    with edited(folder / "transforms.json") as document:
+        document["frames"][3]["captured_transform_matrix"] = [[1, 2], [3, 4]]
+    with pytest.raises(InputRefused, match=r"captured_transform_matrix.*\[capture.pose\]"):
+        read_scan(folder, IngestOptions())

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
+from usdbrdf.delivery.publish import publish
 from usdbrdf.files.images import write_exr
 from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 
 Types = Sdf.ValueTypeNames
 CHAIR, WALL, LAMP = (f"/room/geo/{name}/{name}" for name in ("Stuhl_No_1", "wall", "lamp"))
 CAMERA = "/room/cameras/capture"
-ALBEDO_TEXTURE = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/AlbedoTexture"
+COLOUR_TEXTURE = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture"
 SURFACE = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface"
 
 
@@ -65,12 +67,12 @@ def layer_edited_by_hand(built):
 
 def texture_by_absolute_path(built):
     file = built.asset.folder / "textures" / "Stuhl_No_1.albedo.exr"
-    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(str(file)))
+    opinion(built, COLOUR_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath(str(file)))
 
 
 def texture_outside_the_asset(built):
     write_exr(built.asset.folder.parent / "wood.exr", np.zeros((2, 2, 3), np.float32))
-    opinion(built, ALBEDO_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath("../wood.exr"))
+    opinion(built, COLOUR_TEXTURE, "inputs:file", Types.Asset, Sdf.AssetPath("../wood.exr"))
 
 
 def texture_deleted(built):
@@ -138,7 +140,7 @@ def albedo_above_one(built):
 
 
 def texture_read_as_srgb(built):
-    opinion(built, ALBEDO_TEXTURE, "inputs:sourceColorSpace", Types.Token, "auto")
+    opinion(built, COLOUR_TEXTURE, "inputs:sourceColorSpace", Types.Token, "auto")
 
 
 def specular_color_beside_ior(built):
@@ -213,11 +215,25 @@ def chair_that_was_judged_with_other_numbers(built):
     said_in_a_review(built, verdict="accept", **{**seen_of_chair(built), "phi": 0.99})
 
 
+def chair_that_is_to_be_a_metal(built):
+    said_in_a_review(built, directive="metal", **seen_of_chair(built))
+
+
 def seen_of_chair(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     prim = stage.GetPrimAtPath(CHAIR)
     names = ("status", "phi", "psi")
     return {name: prim.GetAttribute(f"usdBrdf:fit:{name}").Get() for name in names}
+
+
+def published_picture_changed(built):
+    folder = built.asset.folder
+    publish(folder, folder.parent / "versions")
+    shutil.rmtree(folder)
+    (folder.parent / "versions/v001").rename(folder)
+    picture = folder / "previews/lit.png"
+    picture.chmod(0o644)
+    picture.write_bytes(picture.read_bytes() + b"more")
 
 
 FAULTS = {
@@ -231,6 +247,7 @@ FAULTS = {
     "MissingTexture": texture_deleted,
     "MissingPhotograph": photograph_deleted,
     "OrphanTexture": texture_that_no_layer_names,
+    "PublishedFile": published_picture_changed,
     "CameraExposure": exposure_of_two,
     "CameraLens": focal_length_doubled,
     "TextureCoordinates": texture_coordinates_in_the_next_tile,
@@ -253,6 +270,7 @@ FAULTS = {
     "LightsSelection": lights_that_are_not_there,
     "LampTwice": lamp_that_glows_beside_its_lights,
     "ReviewRecord": verdict_of_another_word,
+    "ReviewDirectives": chair_that_is_to_be_a_metal,
     "ReviewRejected": chair_that_was_rejected,
     "ReviewOutdated": chair_that_was_judged_with_other_numbers,
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, UsdUtils
 
-from usdbrdf.asset.layout import Asset, relative_path
+from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path
 from usdbrdf.asset.readers.compose import try_in_child
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import temporary_beside
@@ -20,7 +20,8 @@ _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
 
 def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     """Copy edited tool-owned files beside edits.usda and return the copies, for the artist to use.
-    A layer becomes adopted-N.usda: text, its paths made right for the new place. Other files go to
+    A layer becomes adopted-N.usda: text, its paths made right for the new place; one of a single
+    lighting holds in that alone. Other files go to
     a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
     adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it."""
     layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
@@ -59,6 +60,28 @@ def is_damaged(path: Path) -> bool:
         return True
 
 
+def _lighting_of(path: Path, asset: Asset) -> str:
+    """The lighting that a layer is of alone; "" where it is of all."""
+    for one in asset.in_each_lighting:
+        own = [*map(one.layer, ROLES), one.lights_layer] if one.lighting else []
+        if path.name in {layer.name for layer in own} - {asset.layer("scan").name}:
+            return one.lighting
+    return ""
+
+
+def _confine_to(lighting: str, layer: Sdf.Layer) -> None:
+    """Move what a layer says of the default prim into a variant of the set ``lighting``: in the
+    root layer's stack it would hold in all of them."""
+    whole, root = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Path(f"/{layer.defaultPrim}")
+    whole.TransferContent(layer)
+    if not whole.GetPrimAtPath(root):
+        return
+    del layer.rootPrims[root.name]
+    variant = root.AppendVariantSelection(LIGHTING, lighting)
+    Sdf.CreatePrimInLayer(layer, variant)
+    Sdf.CopySpec(whole, root, layer, variant)
+
+
 def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, Path]) -> None:
     try:
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
@@ -82,6 +105,8 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
     own = {f"./{sub.name}" for sub in (asset.uv_layer, asset.materialx_layer, *lights)}
     text.subLayerPaths = [sub for sub in layer.subLayerPaths if sub not in own]
     UsdUtils.ModifyAssetPaths(text, from_new_place)
+    if lighting := _lighting_of(path, asset):
+        _confine_to(lighting, text)
     text.documentation = (
         f"Adopted from {path.absolute().relative_to(asset.folder).as_posix()}, which was edited by "
         "hand. Add this layer to the sublayers of edits.usda, or take from it what you need."

@@ -62,7 +62,7 @@ class Asset:
         if not root.is_file() or (place.is_file() and not place.samefile(root)):
             raise InputRefused(
                 f"{place}: there is no asset here. Name the folder that usdbrdf convert wrote, or "
-                "the NAME.usda in it. [asset.missing]"
+                "its root layer. [asset.missing]"
             )
         return asset
 
@@ -98,12 +98,26 @@ class Asset:
         return replace(self, lighting=name or "")
 
     @property
+    def is_published(self) -> bool:
+        """Whether it is a version that ``usdbrdf publish`` wrote: nothing in it changes again."""
+        return self._published_root.is_file() and not self._own_root.is_file()
+
+    @property
     def root_layer(self) -> Path:
+        return self._published_root if self.is_published else self._own_root
+
+    @property
+    def _own_root(self) -> Path:
         return self.folder / f"{self.name}.usda"
 
     @property
+    def _published_root(self) -> Path:
+        return self.folder / f"{self.name}.usd"
+
+    @property
     def edits_layer(self) -> Path:
-        return self.folder / "edits.usda"
+        """The artist's; of a published version, what it was then."""
+        return self.folder / ("layers/edits.usda" if self.is_published else "edits.usda")
 
     @property
     def contents_layer(self) -> Path:

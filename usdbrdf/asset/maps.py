@@ -24,7 +24,7 @@ from usdbrdf.asset.readers.scene import (
     scene_from_stage,
 )
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import display_exposure, to_display_srgb8
+from usdbrdf.files.colour import DATA, WORKING_SPACE, display_exposure, to_display_srgb8
 from usdbrdf.files.images import image_size, needs_float, read_exr, write_exr, write_preview_png
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.task import TaskRun
@@ -281,11 +281,13 @@ class AssetMaps:
 
 
 class TexelMap(NamedTuple):
-    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``."""
+    """values (T, ...) of all objects' texels; scale and unit as in ``Aov``. What is no colour must
+    not be converted as one: its files say so."""
 
     values: Float
     scale: float
     unit: str
+    colour: bool = True
 
 
 @dataclass(frozen=True)
@@ -305,7 +307,8 @@ class MapWriter:
 
         def write(place: Path, chosen: TexelMap) -> None:
             picture = self.texels.image(index, chosen.values)
-            write_exr(place, picture, half=not needs_float(picture))
+            space = WORKING_SPACE if chosen.colour else DATA
+            write_exr(place, picture, half=not needs_float(picture), encoding=space)
 
         # Compressing takes a core each, and flushing to the disk time.
         with ThreadPoolExecutor(_AT_A_TIME) as pool:

@@ -16,6 +16,10 @@ from usdbrdf.transport.renderer_match import (
 MICROFACET = "microfacet"
 
 
+# Of glass that was not measured: as clear and smooth as panes are.
+_CLEAR = 1.5
+
+
 class PreviewLobe(NamedTuple):
     """Inputs of UsdPreviewSurface, and the factor that its diffuse colour has been given."""
 
@@ -27,6 +31,9 @@ class PreviewLobe(NamedTuple):
 # Without a fitted lobe there is none: index of refraction 1 reflects nothing, and shading is
 # purely diffuse. Written out, because applications differ in what they assume.
 NO_LOBE = PreviewLobe(roughness=1.0, ior=1.0, diffuse=1.0)
+
+
+CLEAR_GLASS = PreviewLobe(roughness=0.0, ior=_CLEAR, diffuse=0.0)
 
 
 def preview_surface_from_fit(phi: float, psi: float, mapping: str = "measured") -> PreviewLobe:

@@ -116,6 +116,9 @@ OUTSIDE = Schema("Outside", "usdBrdf:outside", "Imageable", "sky", """The light 
     show.""")
 SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER, OUTSIDE)
 _CONFIDENCES = ("high", "low", "none")
+# What people may ask of the steps shade and fit, see ``asset.directives``.
+LAMP = "lamp"
+OF_SHADE, OF_FIT = (LAMP, "not-lamp"), ("ignore", "metal", "glass", "refit")
 _CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
     of the class the rest; none: {0} is the value of the class."""
 
@@ -180,6 +183,10 @@ class Photographs:
         photograph: its curve and its numbers that are not 0, in pixels fx, fy, cx and cy; k, d, p
         and s are radial, dividing, tangential and prism terms as OpenCV has them.""",
         samples="changes", when=lambda taken: any(taken.lens))]
+    photograph_encoding: Annotated[str, Fact(CAPTURE, "photographEncoding", "token", "", """Colour
+        space of the photographs that images were resampled from, in OpenColorIO's names; empty
+        where the images are the photographs themselves.""",
+        when=lambda taken: bool(taken.photograph_encoding))]
     lighting: Annotated[Sequence[str], Fact(CAPTURE, "lighting", "string", "", """Which lighting of
         the scene the photograph shows, a variant of the set lighting; empty where there is but
         one.""", samples="changes", when=lambda taken: any(taken.lighting))]
@@ -273,6 +280,10 @@ class ShadedObject(MeasuredObject):
         standard error of an estimated radiance, in the worst channel; without unit. Authored on
         estimated emitters only.""", low=0,
         when=lambda shaded: shaded.radiance_status == "estimated")]
+    directive: Annotated[str, Fact(SHADING, "directive", "token", "", """Whether the object shines
+        was said by a person, in review.usda or in the capture's objects. lamp: it does;
+        not-lamp: it does not; empty where its radiance told.""", tokens=OF_SHADE,
+        when=lambda shaded: bool(shaded.directive))] = ""
     area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
         object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
 
@@ -348,8 +359,14 @@ class FittedObject(MeasuredObject):
         microfacet: Smith's masking of alpha, and Fresnel's equations. All objects of an asset have
         the same.""", tokens=("paper", "microfacet"))] = "paper"
     kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
-        under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel.""",
-        tokens=("dielectric", "conductor"))] = "dielectric"
+        under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel;
+        transparent: clear glass, by directive alone, which was not fitted.""",
+        tokens=("dielectric", "conductor", "transparent"))] = "dielectric"
+    directive: Annotated[str, Fact(FIT, "directive", "token", "", """What a person asked of the fit,
+        in review.usda or in the capture's objects, and it followed. ignore: nothing was fitted;
+        metal: a conductor was, whatever explains the photographs better; glass: nothing was, and
+        the material is clear; refit: fitted with other random numbers.""", tokens=OF_FIT,
+        when=lambda fitted: bool(fitted.directive))] = ""
     f0: Annotated[Colour, Fact(FIT, "f0", "color3f", (0, 0, 0), """Reflectance of a conductor at
         normal incidence, per channel; 0 to 1, without unit.""", low=0, high=1,
         when=lambda fitted: fitted.is_metal)] = (0.0, 0.0, 0.0)
@@ -400,6 +417,10 @@ class FittedObject(MeasuredObject):
         return self.kind == "conductor"
 
     @property
+    def is_glass(self) -> bool:
+        return self.kind == "transparent"
+
+    @property
     def psi_of_channels(self) -> Colour:
         """F0 / 0.08 of the lobe as it was found: of a metal more than 1, and not grey."""
         red, green, blue = self.f0 if self.is_metal else (F0_OF_PSI * self.psi,) * 3
@@ -411,6 +432,8 @@ class FittedObject(MeasuredObject):
         names = ("phi", "psi", "phi_error", "psi_error", "psi_upper", "phi_confidence",
                  "psi_confidence", "status", "evidence", "target_frame", "kind")
         row = {name: getattr(self, name) for name in names}
+        if self.directive:
+            row["directive"] = self.directive
         if self.is_metal:
             row |= {"f0": [round(value, 4) for value in self.f0], "f0_error": self.f0_error}
         row |= {name: round(value, 4) if math.isfinite(value) else None

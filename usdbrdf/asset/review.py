@@ -8,28 +8,28 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf
+from pxr import Sdf, Tf, Usd
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.properties import FittedObject
+from usdbrdf.asset.properties import OF_SHADE, FittedObject
 from usdbrdf.asset.readers.compose import open_measured
-from usdbrdf.asset.readers.scene import read_fit
+from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.documents import read_text
+from usdbrdf.model.mesh import DIRECTIVES
 
 VERDICTS = ("accept", "reject")
-DIRECTIVES = ("ignore", "metal", "glass", "lamp", "refit")
 MAX_COMMENT = 2000
 # Bytes of the layer, and how deep its prims and dictionaries lie inside each other, at most.
 _LARGEST, _DEEPEST = 8 << 20, 200
@@ -209,11 +209,26 @@ def notes_for_run(asset: Asset) -> list[str]:
     """What a run that measured anew has to tell whoever judged before it, a sentence each."""
     said = _said(asset)
     found = [f"<{path}> {change}" for path, change in _changes(asset, said).items()]
-    return found + [
-        f"<{path}> asks for {one.directive!r}, which is kept: no step acts on it yet."
-        for path, one in said.items()
-        if one.directive
-    ]
+    if not any(one.directive for one in said.values()):
+        return found
+    return found + [f"<{path}> {told}" for path, told in followed(open_measured(asset), said)]
+
+
+def followed(stage: Usd.Stage, said: Mapping[str, Judgement]) -> Iterator[tuple[str, str]]:
+    """By prim path what became of each directive, in words."""
+    for path, one in said.items():
+        if not one.directive or not stage.GetPrimAtPath(path):
+            continue
+        of_shade = one.directive in OF_SHADE
+        made = read_shading(stage, path) if of_shade else read_fit(stage, path)
+        if made is not None and made.directive == one.directive:
+            yield path, f"was made as {one.directive!r}, as the directive asks."
+        else:
+            step = "shade" if of_shade else "fit"
+            yield (
+                path,
+                f"asks for {one.directive!r}, which the step {step} will follow when it runs.",
+            )
 
 
 def _said(asset: Asset) -> dict[str, Judgement]:

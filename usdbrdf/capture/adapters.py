@@ -21,7 +21,7 @@ from usdbrdf.job.progress import say
 
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan
-    from usdbrdf.options import IngestOptions
+    from usdbrdf.options import CaptureOptions
 
 
 # In the order in which they are asked: those whose folders hold other formats too come first.
@@ -72,7 +72,7 @@ class AdapterModule(Protocol):
         """Whether this looks like a capture of the format; a glance, nothing is parsed."""
         ...
 
-    def read(self, path: Path, options: IngestOptions) -> Scan:
+    def read(self, path: Path, options: CaptureOptions) -> Scan:
         """The capture, checked; raises the errors of ``usdbrdf.errors`` and no others."""
         ...
 
@@ -121,7 +121,7 @@ def list_adapters(*, plugins: bool = True) -> tuple[Adapter, ...]:
 
 
 def read_scan(
-    path: Path, options: IngestOptions, adapter: str | None = None, *, plugins: bool = True
+    path: Path, options: CaptureOptions, adapter: str | None = None, *, plugins: bool = True
 ) -> Scan:
     """Read a capture with the named adapter, or with the first that recognises it."""
     return read_with(choose_adapter(path, adapter, plugins=plugins), path, options)
@@ -207,7 +207,7 @@ def files_beside(adapter: Adapter, path: Path) -> list[Path]:
     return sorted(beside(path)) if beside is not None else []
 
 
-def read_with(adapter: Adapter, path: Path, options: IngestOptions) -> Scan:
+def read_with(adapter: Adapter, path: Path, options: CaptureOptions) -> Scan:
     """What a chosen adapter makes of a capture."""
     from usdbrdf.model.capture import Scan
 

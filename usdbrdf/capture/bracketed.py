@@ -76,11 +76,14 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
 
 
 def copy_beside(source: Path, document: Any, folder: Path) -> None:
-    """Copy the mesh and the objects that a transforms.json has beside it into another folder."""
-    for key, usual in (("mesh", "mesh.ply"), ("objects", "objects.json")):
-        beside = contained(source.parent, str(document.get(key, usual)))
+    """Copy the mesh, the objects and the masks that a transforms.json has beside it into another
+    folder."""
+    masks = {str(f["mask_path"]) for f in document["frames"] if f.get("mask_path") is not None}
+    usual = (("mesh", "mesh.ply"), ("objects", "objects.json"))
+    for name in (*(str(document.get(key, own)) for key, own in usual), *sorted(masks)):
+        beside = contained(source.parent, name)
         if beside.is_file():
-            place = contained(folder, str(document.get(key, usual)))
+            place = contained(folder, name)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(beside, place)
 

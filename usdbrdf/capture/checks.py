@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,7 @@ class FrameRecord:
                        that bends becomes one pinhole frame or several
     mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
                        not used; or None
+    captured_pose      world_from_camera before somebody refined it; None where it is as captured
     """
 
     name: str
@@ -50,12 +51,16 @@ class FrameRecord:
     noise_floor_radiance: float = 0.0
     lens: Lens = PINHOLE
     mask_path: Path | None = None
+    captured_pose: Double | None = None
 
 
 def frames_from_records(
     records: Sequence[FrameRecord], *, encoding: str, radiometric: bool
 ) -> Frames:
+    """The rows together. Poses count as refined where all are."""
+    captured = [r.captured_pose for r in records if r.captured_pose is not None]
     return Frames(
+        captured_pose=np.array(captured) if 0 < len(captured) == len(records) else None,
         image_paths=tuple(r.image_path for r in records),
         world_from_camera=np.array([r.world_from_camera for r in records]).reshape(-1, 4, 4),
         intrinsics=np.array([r.intrinsics for r in records], np.float64).reshape(-1, 4),
@@ -66,6 +71,18 @@ def frames_from_records(
         encoding=encoding,
         radiometric=radiometric,
     )
+
+
+# How many times as far as along another axis cameras must point up along y.
+_CLEARLY = 2.0
+
+
+def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
+    """The up axis where a format does not say: z, unless people held their cameras clearly upright
+    along y."""
+    axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
+    up = np.nan_to_num(axes.sum(axis=0))
+    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
 
 
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
@@ -237,20 +254,33 @@ def rigid_records(
             said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
             findings.drop(record.name, said, "capture.camera")
         else:
-            axes = pose[:3, :3] / (pose_scale or 1.0)
-            worst = max(worst, _refuse_not_rigid(axes, record.name, source, pose_scale))
-            rigid = pose.copy()
-            if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
-                left, _, right = np.linalg.svd(axes)
-                axes = left @ right
-            rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
-            kept.append(replace(record, world_from_camera=rigid))
+            rigid, off = _made_rigid(pose, record.name, source, pose_scale)
+            worst = max(worst, off)
+            captured = record.captured_pose
+            if captured is not None:
+                captured = _made_rigid(captured, record.name, source, pose_scale)[0]
+            kept.append(replace(record, world_from_camera=rigid, captured_pose=captured))
     if worst > _ROUNDING:
         findings.warn(
             f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
             "made rigid. [capture.pose]"
         )
     return kept
+
+
+def _made_rigid(
+    pose: Double, name: str, source: Path, pose_scale: float | None
+) -> tuple[Double, float]:
+    """An almost rigid pose made exactly so, and how far its axes were off; InputRefused for
+    others."""
+    axes = pose[:3, :3] / (pose_scale or 1.0)
+    off = _refuse_not_rigid(axes, name, source, pose_scale)
+    if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
+        left, _, right = np.linalg.svd(axes)
+        axes = left @ right
+    rigid = pose.copy()
+    rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
+    return rigid, off
 
 
 def is_camera_matrix(pose: Double) -> bool:

@@ -61,14 +61,16 @@ def frames_of_photographs(
     if kind_of_encoding(photographs.encoding) != "linear":
         plain = [False] * len(records)
     numbers, paths, views = [], [], list[View | None]()
-    poses, intrinsics, sizes = [], [], []
+    poses, captured, intrinsics, sizes = [], [], [], []
     for k, record in enumerate(records):
         stem = f"{k:05d}_{re.sub(_UNSAFE, '_', record.image_path.stem)}"
         for found in _views(record):
-            pose = record.world_from_camera.copy()
-            pose[:3, :3] = pose[:3, :3] @ found.photograph_from_frame
+            turn = np.eye(4)
+            turn[:3, :3] = found.photograph_from_frame
             numbers.append(k)
-            poses.append(pose)
+            poses.append(photographs.world_from_camera[k] @ turn)
+            if photographs.captured_pose is not None:
+                captured.append(photographs.captured_pose[k] @ turn)
             intrinsics.append(found.intrinsics)
             sizes.append(found.resolution)
             face = f".{found.face}" if found.face else ""
@@ -87,6 +89,7 @@ def frames_of_photographs(
         photographs,
         image_paths=tuple(paths),
         world_from_camera=np.array(poses),
+        captured_pose=np.array(captured) if captured else None,
         intrinsics=np.array(intrinsics, np.float64),
         resolution=np.array(sizes, np.int32),
         exposure_time=photographs.exposure_time[which],
@@ -114,7 +117,7 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
     """The frames with images below ``folder``; those that are ``views`` of photographs (see
     ``Scan``) are handed to ``place``, one after the other.
 
-    Images keep the encoding of the photographs, but for 8-bit ones, which become linear.
+    Images keep the encoding of the photographs where that is linear; others become linear.
     """
     if not any(views):
         return frames
@@ -128,6 +131,7 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
         frames,
         image_paths=tuple(folder / path for path in frames.image_paths),
         encoding=frames.encoding if stays else "lin_rec709_scene",
+        photograph_encoding=frames.encoding,
     )
 
 

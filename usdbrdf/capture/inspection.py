@@ -19,13 +19,14 @@ import numpy as np
 
 from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
 from usdbrdf.capture.checks import DroppedFrame, Findings, spread_evenly
+from usdbrdf.capture.native import own_faces
 from usdbrdf.errors import ImageRefused, UsageError, UsdBrdfError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames, Scan, View
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
-from usdbrdf.options import IngestOptions, InspectOptions
+from usdbrdf.options import CaptureOptions, InspectOptions
 
 # Frames whose radiance is measured, and what is named in one line.
 _MOST_MEASURED, _LISTED = 8, 6
@@ -55,6 +56,7 @@ class Inspection:
     frames, radiance      None where they could not be read
     views                 how frames come of photographs, as those of a Scan
     mesh, objects         in the capture's unit, meters_per_unit and up_axis those of a Scan
+    own_faces             of the mesh; second skins come after them
     dropped               frames that cannot be used
     looked_at             frames whose pixels were checked
     agreement             by how much frames that show the same points differ, as a share of what
@@ -71,6 +73,7 @@ class Inspection:
     radiance: Radiance | None = None
     mesh: ScanMesh | None = None
     objects: tuple[ObjectLabel, ...] = ()
+    own_faces: int = 0
     meters_per_unit: float | None = None
     up_axis: str | None = None
     dropped: tuple[DroppedFrame, ...] = ()
@@ -127,12 +130,16 @@ class Inspection:
     def _mesh_summary(self, mesh: ScanMesh) -> dict[str, Any]:
         size = np.ptp(mesh.points.astype(np.float64), axis=0)
         return {
-            "vertices": len(mesh.points),
-            "faces": len(mesh.triangles),
+            "vertices": self._own_points(mesh),
+            "faces": self.own_faces,
             "size": [float(length) for length in size],
             "meters_per_unit": self.meters_per_unit,
             "up_axis": self.up_axis,
         }
+
+    def _own_points(self, mesh: ScanMesh) -> int:
+        """Without those of second skins, of which each face has three."""
+        return len(mesh.points) - 3 * (len(mesh.triangles) - self.own_faces)
 
     def lines(self) -> list[str]:
         """The table for a person."""
@@ -172,7 +179,7 @@ class Inspection:
         unit = "" if self.meters_per_unit is None else f", a unit is {self.meters_per_unit:g} m"
         up = "" if self.up_axis is None else f", {self.up_axis} up"
         return (
-            f"{len(mesh.points):,} vertices, {len(mesh.triangles):,} faces, "
+            f"{self._own_points(mesh):,} vertices, {self.own_faces:,} faces, "
             f"{' x '.join(f'{length:.3g}' for length in size)} units{unit}{up}"
         )
 
@@ -217,7 +224,7 @@ def inspect(
     return seen if findings is None else _of_findings(seen, findings, options)
 
 
-def _of_scan(seen: Inspection, scan: Scan, options: IngestOptions) -> Inspection:
+def _of_scan(seen: Inspection, scan: Scan, options: CaptureOptions) -> Inspection:
     return replace(
         seen,
         frames=scan.frames,
@@ -225,6 +232,7 @@ def _of_scan(seen: Inspection, scan: Scan, options: IngestOptions) -> Inspection
         radiance=radiance_of_frames(scan.frames.as_recorded(), options.looked_at),
         mesh=scan.mesh,
         objects=scan.objects,
+        own_faces=own_faces(scan),
         meters_per_unit=scan.meters_per_unit,
         up_axis=scan.up_axis,
         looked_at=scan.counts.get("frames_looked_at", len(scan.frames)),
@@ -233,7 +241,7 @@ def _of_scan(seen: Inspection, scan: Scan, options: IngestOptions) -> Inspection
     )
 
 
-def _of_findings(seen: Inspection, findings: Findings, options: IngestOptions) -> Inspection:
+def _of_findings(seen: Inspection, findings: Findings, options: CaptureOptions) -> Inspection:
     """What is known of a capture that was refused on the way."""
     frames, geometry = findings.frames, findings.geometry
     if geometry is not None:
@@ -241,6 +249,7 @@ def _of_findings(seen: Inspection, findings: Findings, options: IngestOptions) -
             seen,
             mesh=geometry.mesh,
             objects=geometry.objects,
+            own_faces=len(geometry.mesh.triangles),
             meters_per_unit=options.meters_per_unit or geometry.meters_per_unit,
             up_axis=options.up_axis or geometry.up_axis,
         )

@@ -60,6 +60,7 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         write_ply(staged / "mesh.ply", points, *captured_faces(scan))
         objects = [
             {"id": i, "name": label.label, "class_name": label.class_name}
+            | ({"directive": label.directive} if label.directive else {})
             for i, label in enumerate(scan.objects)
         ]
         write_json(staged / "objects.json", {"objects": objects})
@@ -115,19 +116,19 @@ def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
     return entry
 
 
-def _own_faces(scan: Scan) -> int:
+def own_faces(scan: Scan) -> int:
     """How many faces the capture's own mesh has: second skins come after them."""
     return len(scan.mesh.triangles) if scan.turned_faces is None else len(scan.turned_faces)
 
 
 def captured_points(scan: Scan) -> int:
     """The same of its points: each face of a second skin has three of its own."""
-    return len(scan.mesh.points) - 3 * (len(scan.mesh.triangles) - _own_faces(scan))
+    return len(scan.mesh.points) - 3 * (len(scan.mesh.triangles) - own_faces(scan))
 
 
 def captured_faces(scan: Scan) -> tuple[Int, Int]:
     """Triangles (F, 3) as the capture winds them, and their objects (F,)."""
-    count = _own_faces(scan)
+    count = own_faces(scan)
     triangles = scan.mesh.triangles[:count].copy()
     if scan.turned_faces is not None:
         triangles[scan.turned_faces] = triangles[scan.turned_faces][:, [0, 2, 1]]

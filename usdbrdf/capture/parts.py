@@ -43,8 +43,16 @@ from usdbrdf.geometry.unwrap import connected_triangles
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Frames, Scan
-from usdbrdf.model.mesh import ObjectLabel, ScanGeometry, ScanMesh, doubled_areas, welded_ids
-from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.model.mesh import (
+    DIRECTIVES,
+    ObjectLabel,
+    ObjectName,
+    ScanGeometry,
+    ScanMesh,
+    doubled_areas,
+    welded_ids,
+)
+from usdbrdf.options import AUTO, CaptureOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
 
@@ -55,26 +63,27 @@ _ONE_OBJECT = (ObjectLabel(identifier="scan", label="scan"),)
 
 
 class LabelTable(NamedTuple):
-    """What objects.json says: label and class of each id, and optionally an id per face."""
+    """What objects.json says: name of each id, and optionally an id per face."""
 
-    entries: Mapping[int, tuple[str, str]]
+    entries: Mapping[int, ObjectName]
     face_id: Long | None
 
 
 class Segmentation(NamedTuple):
-    """face_object (F,) int32, index into ``labels``, which are (label, class name)."""
+    """face_object (F,) int32, index into ``labels``."""
 
     face_object: Int
-    labels: tuple[tuple[str, str], ...]
+    labels: tuple[ObjectName, ...]
 
 
 def label_table(path: Path) -> LabelTable:
-    """Read ``{"objects": [{"id", "name", "class_name"}], "face_object_id": [...]}``."""
+    """Read ``{"objects": [{"id", "name", "class_name", "directive"}], "face_object_id": [...]}``;
+    all but the ids may be left out."""
     document = read_json(path)
     rows = document.get("objects") if isinstance(document, dict) else None
     if not isinstance(rows, list):
         raise InputRefused(f'{path}: no list "objects". See the example capture. [objects.format]')
-    entries: dict[int, tuple[str, str]] = {}
+    entries: dict[int, ObjectName] = {}
     for row in rows:
         number = row.get("id") if isinstance(row, dict) else None
         if not isinstance(number, int) or isinstance(number, bool):
@@ -84,12 +93,18 @@ def label_table(path: Path) -> LabelTable:
             )
         if number in entries:
             raise InputRefused(f"{path}: the id {number} occurs twice. Keep one. [objects.format]")
-        names = [row.get(key) or "" for key in ("name", "class_name")]
-        if not all(isinstance(name, str) for name in names):
+        keys = ("name", "class_name", "directive")
+        name, class_name, directive = (row.get(key) or "" for key in keys)
+        if not (isinstance(name, str) and isinstance(class_name, str)):
             raise InputRefused(
                 f"{path}: name and class_name of object {number} must be strings. [objects.format]"
             )
-        entries[number] = (names[0] or f"object_{number}", names[1])
+        if directive not in ("", *DIRECTIVES):
+            raise InputRefused(
+                f"{path}: the directive {str(directive)[:40]!r} of object {number} is none of "
+                f"{', '.join(DIRECTIVES)}. Correct or remove it. [objects.directive]"
+            )
+        entries[number] = ObjectName(name or f"object_{number}", class_name, directive)
     ids = document.get("face_object_id")
     if ids is not None and not (isinstance(ids, list) and all(type(n) is int for n in ids)):
         raise InputRefused(
@@ -128,9 +143,9 @@ def segmentation(
     entries = table.entries if table is not None else {}
     names = dict(enumerate(mesh.label_names))
     labels = [
-        ("unlabelled", "")
+        ObjectName("unlabelled")
         if number < 0
-        else entries.get(number, (names.get(number, f"object_{number}"), ""))
+        else entries.get(number, ObjectName(names.get(number, f"object_{number}")))
         for number in ids.tolist()
     ]
     return Segmentation(face_object.astype(np.int32), tuple(labels))
@@ -148,32 +163,32 @@ def _connected_parts(mesh: FileMesh, min_area: float | None) -> Segmentation:
     order = np.argsort(-area, kind="stable")
     large = order[area[order] >= min_area][:_MAX_OBJECTS]
     if len(large) < 2:
-        return Segmentation(np.zeros(len(mesh.triangles), np.int32), (("scan", ""),))
+        return Segmentation(np.zeros(len(mesh.triangles), np.int32), (ObjectName("scan"),))
     object_of_part = np.full(len(parts), len(large), np.int32)
     object_of_part[large] = np.arange(len(large), dtype=np.int32)
-    labels = [(f"part_{i + 1:03d}", "") for i in range(len(large))]
+    labels = [ObjectName(f"part_{i + 1:03d}") for i in range(len(large))]
     if len(large) < len(parts):
-        labels.append(("rest", ""))
+        labels.append(ObjectName("rest"))
     return Segmentation(object_of_part[part_of_face], tuple(labels))
 
 
 def objects_with_faces(
-    face_object: Int, labels: tuple[tuple[str, str], ...]
+    face_object: Int, labels: tuple[ObjectName, ...]
 ) -> tuple[Int, tuple[ObjectLabel, ...]]:
     """Objects that still own a triangle, with unique identifiers, and the renumbered faces."""
     used, renumbered = np.unique(face_object, return_inverse=True)
     kept = [labels[i] for i in used.tolist()]
-    identifiers = unique_identifiers([label for label, _ in kept])
+    identifiers = unique_identifiers([name.label for name in kept])
     objects = tuple(
-        ObjectLabel(identifier=identifier, label=label, class_name=class_name)
-        for identifier, (label, class_name) in zip(identifiers, kept, strict=True)
+        ObjectLabel(identifier=identifier, **name._asdict())
+        for identifier, name in zip(identifiers, kept, strict=True)
     )
     return renumbered.astype(np.int32), objects
 
 
 def geometry_from_usd(
     path: Path,
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     capture_root: Path,
@@ -223,7 +238,7 @@ def geometry_from_usd(
 def geometry_from_file(
     mesh_path: Path,
     objects: Path | Literal["auto"] | Callable[[FileMesh], LabelTable] | None,
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     capture_root: Path,
@@ -307,7 +322,7 @@ def _recalling(read: Callable[P, Scan]) -> Callable[P, Scan]:
 def scan_from_parts(
     records: Sequence[FrameRecord],
     read_geometry: Callable[[], ScanGeometry],
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     name: str,
@@ -451,7 +466,7 @@ def _exposure_of_file(path: Path) -> float | None:
 
 
 def radiance_encoding(
-    options: IngestOptions, *, photographs: bool, stated: str | None = None
+    options: CaptureOptions, *, photographs: bool, stated: str | None = None
 ) -> str:
     """Colour space of the images: the options', that which the capture states, or the usual one;
     UsageError where the options contradict the images."""

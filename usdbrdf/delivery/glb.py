@@ -119,8 +119,9 @@ def gltf_material(
     numbers: dict[str, Any] = {
         "pbrMetallicRoughness": {
             **factors,
-            "baseColorFactor": [*map(float, np.clip(colour, 0, 1)), 1.0],
+            "baseColorFactor": [*map(float, np.clip(colour, 0, 1)), float(not material.clear)],
         },
+        **({"alphaMode": "BLEND"} if material.clear else {}),
         "doubleSided": surface.two_sided,
         "extensions": {IOR: {"ior": ior}},
     }

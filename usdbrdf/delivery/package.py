@@ -1,9 +1,9 @@
 """Asset folder in, one file out: the asset composed in one look becomes one layer that needs no
-other, and is packed with its pictures.
+other, and is packed with its pictures; or all its layers are packed, with every look and lighting.
 
-What is kept: geometry, the materials bound in that look with their UsdPreviewSurface networks,
-lights, cameras, and the numbers measured. What goes: the other looks, the maps behind them, render
-settings, the photographs, and every path of this machine."""
+What is kept of one look: geometry, the materials bound in it with their UsdPreviewSurface
+networks, lights, cameras, and the numbers measured. What goes: the other looks, the maps behind
+them, render settings, the photographs, and every path of this machine."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -25,9 +26,12 @@ from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
+from usdbrdf.delivery.colours import ColourTextures, convert_layer, in_space
+from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.glb import write_glb
 from usdbrdf.delivery.packaged_files import (
     EXR,
+    IMAGES,
     NewTexture,
     add_file,
     add_texture,
@@ -43,6 +47,7 @@ from usdbrdf.errors import (
     UsdBrdfError,
 )
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import code_version
 from usdbrdf.model.material import turned_up
@@ -233,6 +238,8 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     options = options or PackageOptions()
     asset = Asset.made(folder).in_lighting(options.lighting)
     options = replace(options, textures=_texture_format(output, asset, options))
+    if options.whole:
+        return _write_whole(output, asset, options)
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
@@ -256,10 +263,47 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     return {"output": str(output), "look": look_of(stage), "bytes": size, **summary}
 
 
+def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[str, Any]:
+    """The layers as they are, but without photographs, which no package holds."""
+    root = f"{asset.name}.usdc"  # some readers take no text first
+
+    def describe(layer: Sdf.Layer) -> None:
+        layer.documentation = "A packed asset: all its looks and lightings are variants."
+
+    with environment_failures(str(output)), _folder_of(output):
+        with TemporaryDirectory(prefix="usdbrdf-package-") as name:
+            found = write_copy(
+                asset,
+                Path(name),
+                root=root,
+                encoding="",
+                space=SPACES[options.texture_space],
+                photographs=False,
+                describe=describe,
+                accept=_refuse_unpacked,
+            )
+            members = {found.places[file] for file in (*found.layers, *found.named_by)} - {root}
+            write_usdz(output, Path(name), [root, *sorted(members)])
+        size, textures = output.stat().st_size, len(found.named_by)
+    return {"output": str(output), "look": "", "bytes": size, "textures": textures, "format": EXR}
+
+
+def _refuse_unpacked(file: Path) -> None:
+    if file.suffix.lower() not in IMAGES:
+        raise InputRefused(
+            f"{file}: USDZ holds {', '.join(sorted(IMAGES))} only. Convert it, or package one look "
+            "without --whole. [package.format]"
+        )
+
+
 def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOptions) -> int:
     """Returns the number of textures."""
     if options.profile == ARKIT:
         fit_for_arkit(flat, warn)
+    space, colours = SPACES[options.texture_space], ColourTextures()
+    if space != WORKING_SPACE:
+        colours.look_at(flat, space)
+        convert_layer(flat.GetRootLayer(), colours, space)
     with TemporaryDirectory(prefix="usdbrdf-package-") as name:
         folder = Path(name)
         textures: dict[tuple[Any, ...], NewTexture] = {}
@@ -268,8 +312,9 @@ def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOpt
             # Each once, however many nodes read it in the same way.
             key = (use.file, use.space, use.colour, use.reads_alpha)
             if key not in textures:
-                form = str(options.textures)
-                textures[key] = add_texture(use, folder, packed, form, options.max_size)
+                form, most = str(options.textures), options.max_size
+                convert = partial(in_space, space=space) if use.file in colours.files else None
+                textures[key] = add_texture(use, folder, packed, form, most, convert, space)
                 packed.add(textures[key].path)
             use_texture(flat, use, textures[key])
         others: dict[str, str] = {}
@@ -310,6 +355,21 @@ def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Lite
         raise UsageError(
             f"--textures exr: {'ARKit' if suffix == USDZ else 'glTF'} knows PNG and JPEG only. "
             "[package.textures]"
+        )
+    of_one_look = {
+        "--look": options.look, "--lighting": options.lighting, "--max-size": options.max_size,
+        "--profile": options.profile == ARKIT, "--textures png": options.textures == "png",
+        ".glb": suffix == GLB,
+    }  # fmt: skip
+    if options.whole and (excluded := [name for name, given in of_one_look.items() if given]):
+        raise UsageError(
+            f"--whole: packs all layers as they are, without {', '.join(excluded)}. Leave one of "
+            "both out. [package.whole]"
+        )
+    if options.texture_space != "rec709" and (eight_bit or options.textures == "png"):
+        raise UsageError(
+            f"--texture-space {options.texture_space}: 8-bit textures are sRGB, which programs "
+            "convert by themselves. Pack EXR textures. [package.space]"
         )
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")

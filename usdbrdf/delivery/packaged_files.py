@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from pxr import Gf, Sdf, Usd, UsdShade
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.surfaces import is_srgb, read_texture
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.colour import WORKING_SPACE, to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
+from usdbrdf.files.published_images import copy_without_metadata, write_texture
 from usdbrdf.model.arrays import Byte, Float
 
 Types = Sdf.ValueTypeNames
@@ -29,8 +29,8 @@ IMAGES = EIGHT_BIT | {".exr"}
 # What becomes EXR or PNG.
 CONVERTED = frozenset({".hdr", ".tif", ".tiff"})
 # The start of what no path of a file is, such as https://.
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-_COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
+ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
+COLOURS = frozenset({"diffuseColor", "emissiveColor", "specularColor"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,15 +72,15 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
         shader = UsdShade.Shader(prim)
         if not shader or shader.GetShaderId() != "UsdUVTexture":
             continue
-        value = _produced(shader, "file")
+        value = produced(shader, "file")
         if isinstance(value, Sdf.AssetPath) and value.path:
-            fed = _fed(prim)
+            fed = fed_inputs(prim)
             uses.append(
                 TextureUse(
                     prim_path=str(prim.GetPath()),
                     file=file_in_asset(value.path, asset),
-                    space=str(_produced(shader, "sourceColorSpace") or "auto"),
-                    colour=any(name in _COLOURS for name, _ in fed),
+                    space=str(produced(shader, "sourceColorSpace") or "auto"),
+                    colour=any(name in COLOURS for name, _ in fed),
                     reads_alpha=any(output == "a" for _, output in fed),
                 )
             )
@@ -88,22 +88,34 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
 
 
 def add_texture(
-    use: TextureUse, folder: Path, taken: Collection[str], format: str, max_size: int | None
+    use: TextureUse,
+    folder: Path,
+    taken: Collection[str],
+    format: str,
+    max_size: int | None,
+    convert: Callable[[Float], Float] | None = None,
+    encoding: str = WORKING_SPACE,
 ) -> NewTexture:
     """Write the texture of a node below ``folder``; returns where, and how to read it.
 
     taken     paths that the package has already
-    format    "exr" keeps files as they are, "png" makes 8 bits of floats
+    format    "exr" keeps pixels as they are, tiled and with smaller copies; "png" makes 8 bits of
+              floats
     max_size  of the longer side in pixels, None for any
+    convert   what to do to the pixels of an EXR, which ``encoding`` is the colour space of then
     """
-    width, height, channels = _checked_size(use.file)
+    width, height, channels = checked_size(use.file)
     source = use.file.suffix.lower()
     smaller = size_within(width, height, max_size)
     fits = smaller == (width, height)
     as_it_is = source in EIGHT_BIT or (format == EXR and source not in CONVERTED)
     if as_it_is and (fits or use.reads_alpha):
         path = _free(f"textures/{use.file.stem}{source}", taken, folder)
-        shutil.copyfile(use.file, folder / path)
+        if source in EIGHT_BIT:
+            copy_without_metadata(use.file, folder / path)
+        else:
+            converted = convert(read_exr(use.file)) if convert else None
+            write_texture(folder / path, use.file, converted=converted, encoding=encoding)
         return NewTexture(path=path, space="sRGB" if is_srgb(use.file, use.space) else "raw")
     if use.reads_alpha and format != EXR:
         raise InputRefused(
@@ -119,7 +131,8 @@ def add_texture(
         pixels = resized(pixels, *smaller)
     path = _free(f"textures/{use.file.stem}.{format}", taken, folder)
     if format == EXR:
-        write_exr(folder / path, pixels)
+        write_exr(folder / path, convert(pixels) if convert else pixels, encoding=encoding)
+        write_texture(folder / path, folder / path)
         return NewTexture(path=path, space="raw")
     stored, scale, bias = encoded_colour(pixels) if use.colour else encoded_data(pixels)
     write_preview_png(folder / path, stored)
@@ -129,14 +142,14 @@ def add_texture(
 def add_file(file: Path, below: Path, folder: Path, taken: Collection[str]) -> str:
     """Add a picture that is no texture of a material, such as a dome light's; returns its path in
     the package, which is the one that it has below ``below`` if that is free."""
-    _checked_size(file)
+    checked_size(file)
     convert = file.suffix.lower() in CONVERTED
     place = file.relative_to(below)
     path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken, folder)
     if convert:
         write_exr(folder / path, read_texture(file, "auto"))
     else:
-        shutil.copyfile(file, folder / path)
+        copy_without_metadata(file, folder / path)
     return path
 
 
@@ -161,7 +174,7 @@ def size_within(width: int, height: int, max_size: int | None) -> tuple[int, int
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def _checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
+def checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
     if file.suffix.lower() not in IMAGES | CONVERTED:
         known = ", ".join(sorted(IMAGES | CONVERTED))
         raise InputRefused(
@@ -186,8 +199,8 @@ def _free(path: str, taken: Collection[str], folder: Path) -> str:
 def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
     """Make a node read the new file and give the same values."""
     shader = UsdShade.Shader(flat.GetPrimAtPath(use.prim_path))
-    old_scale = Gf.Vec4f(_produced(shader, "scale") or Gf.Vec4f(1))
-    old_bias = Gf.Vec4f(_produced(shader, "bias") or Gf.Vec4f(0))
+    old_scale = Gf.Vec4f(produced(shader, "scale") or Gf.Vec4f(1))
+    old_bias = Gf.Vec4f(produced(shader, "bias") or Gf.Vec4f(0))
     _set(shader, "file", Types.Asset, Sdf.AssetPath(f"./{new.path}"))
     _set(shader, "sourceColorSpace", Types.Token, new.space)
     if new.scale != 1 or new.bias != 0:
@@ -196,7 +209,7 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
         _set(shader, "scale", Types.Float4, Gf.Vec4f(*scale, old_scale[3]))
         if any(bias) or any(old_bias):
             _set(shader, "bias", Types.Float4, Gf.Vec4f(*bias, old_bias[3]))
-        fallback = _produced(shader, "fallback")
+        fallback = produced(shader, "fallback")
         if fallback is not None:
             stored = [(fallback[i] - new.bias) / new.scale for i in range(3)]
             _set(shader, "fallback", Types.Float4, Gf.Vec4f(*stored, fallback[3]))
@@ -204,7 +217,7 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
 
 def file_in_asset(path: str, asset: Asset) -> Path:
     """The file at an absolute path, links followed; InputRefused unless it is in the asset."""
-    if _ADDRESS.match(path):
+    if ADDRESS.match(path):
         raise InputRefused(
             f"{path}: files from the network are not packaged. Save it in the asset's folder and "
             "name that copy in edits.usda. [package.outside]"
@@ -225,7 +238,7 @@ def file_in_asset(path: str, asset: Asset) -> Path:
     return place
 
 
-def _produced(shader: UsdShade.Shader, name: str) -> Any:
+def produced(shader: UsdShade.Shader, name: str) -> Any:
     """The value of an input, wherever a chain of connections takes it from."""
     wanted = shader.GetInput(name)
     producers = wanted.GetValueProducingAttributes() if wanted else []
@@ -238,7 +251,7 @@ def _set(shader: UsdShade.Shader, name: str, type_name: Sdf.ValueTypeName, value
     own.Set(value)
 
 
-def _fed(texture: Usd.Prim) -> list[tuple[str, str]]:
+def fed_inputs(texture: Usd.Prim) -> list[tuple[str, str]]:
     """Inputs in the same material that the texture feeds, each with which of its outputs."""
     material = texture.GetParent()
     while material.GetParent() and not material.IsA(UsdShade.Material):

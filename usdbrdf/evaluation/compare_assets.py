@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps, camera_hits
-from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.evaluation.metrics import MIN_SAMPLES, MapError, map_error
@@ -25,6 +24,7 @@ from usdbrdf.model.arrays import Bool, Byte, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
+from usdbrdf.options import CompareOptions
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import surface_texture
 
@@ -47,7 +47,9 @@ _SETS = {
 }
 
 
-def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[str, Any]:
+def compare(
+    first: str | Path, second: str | Path, output: str | Path, options: CompareOptions | None = None
+) -> dict[str, Any]:
     """Compare two assets of the same geometry and write figures and pictures to ``output``.
 
     first, second  asset folders, A and B; only read. Their texels need not be the same
@@ -59,7 +61,9 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
 
     Raises UsdBrdfError; ``output`` is then as it was.
     """
-    (place_a, a), (place_b, b) = measured_atlas(Path(first)), measured_atlas(Path(second))
+    chosen = options or CompareOptions()
+    place_a, a = measured_atlas(Path(first), chosen.lighting)
+    place_b, b = measured_atlas(Path(second), chosen.other_lighting)
     with output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
         forth, back = matched(a, b), matched(b, a)
         if not (forth[1].any() and back[1].any()):
@@ -72,6 +76,7 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
                 warn(f"only {name} has {', '.join(same.missing)}. [compare.objects]")
         found: dict[str, Any] = {
             "assets": [place_a.name, place_b.name],
+            **({"lightings": [a.lighting, b.lighting]} if a.lighting or b.lighting else {}),
             "texels": int(forth[1].sum()),
             "missing": [list(forth[0].missing), list(back[0].missing)],
         }
@@ -84,7 +89,7 @@ def compare(first: str | Path, second: str | Path, output: str | Path) -> dict[s
             found[key] = {name: error._asdict() for name, error in errors.items()}
             rows += _object_rows(key, *pair)
         write_text_atomic(work / "comparison.csv", table_text(rows))
-        _write_pictures(work / "pictures", *pair, frames_from_stage(a.stage))
+        _write_pictures(work / "pictures", *pair, a.frames)
         found["objects"] = rows
         found[FILES] = [*files_of(work), DOCUMENT]
         write_json(work / DOCUMENT, found)

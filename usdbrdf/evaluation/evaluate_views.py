@@ -85,7 +85,7 @@ def evaluate(
         report.write_plot(work / "evaluation.png", rows)
         found = {
             "asset": place.name,
-            **({"lighting": chosen.lighting} if chosen.lighting else {}),
+            **({"lighting": atlas.lighting} if atlas.lighting else {}),
             "views": Path(views).name,
             "samples_per_pixel": chosen.samples_per_pixel,
             "rays": chosen.rays,

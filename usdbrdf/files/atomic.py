@@ -79,21 +79,36 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(final: Path) -> Iterator[Path]:
-    """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
+def temporary_folder(final: Path) -> Iterator[Path]:
+    """A fresh folder beside ``final``; gone at the end unless published."""
     final.parent.mkdir(parents=True, exist_ok=True)
     staged = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
     staged.mkdir()
     try:
         yield staged
-        for file in staged.rglob("*"):
-            if file.is_file():
-                with file.open("rb") as written:
-                    os.fsync(written.fileno())
-        os.replace(staged, final)
-        flush_folder(final.parent)
     finally:
         shutil.rmtree(staged, ignore_errors=True)
+
+
+def publish_folder(staged: Path, final: Path) -> None:
+    """Give a finished folder its final name, durably; what is there must be an empty folder."""
+    for place in staged.rglob("*"):
+        if place.is_file():
+            with place.open("rb") as written:
+                os.fsync(written.fileno())
+        else:
+            flush_folder(place)
+    flush_folder(staged)
+    os.replace(staged, final)
+    flush_folder(final.parent)
+
+
+@contextmanager
+def whole_folder(final: Path) -> Iterator[Path]:
+    """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
+    with temporary_folder(final) as staged:
+        yield staged
+        publish_folder(staged, final)
 
 
 @contextmanager

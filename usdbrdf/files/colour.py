@@ -16,6 +16,8 @@ from usdbrdf.model.arrays import Float
 
 WORKING_SPACE = "lin_rec709_scene"
 DISPLAY_SPACE = "srgb_rec709_scene"
+ACESCG = "lin_ap1_scene"
+DATA = "data"  # numbers that are no colours
 _CONFIG = "studio-config-v5.0.0_aces-v2.1_ocio-v2.6"  # pinned: another config is another picture
 _KIND_OF_CONFIG = "studio-config-v"
 # How OpenColorIO calls what a space's values are.
@@ -96,6 +98,16 @@ def to_working_space(pixels: Float, encoding: str) -> Float:
             "of OpenColorIO's studio configuration. [colour.encoding]"
         )
     return _converted(pixels, encoding, WORKING_SPACE)
+
+
+def from_working_space(pixels: Float, encoding: str) -> Float:
+    """A copy of (H, W, 3) float32 pixels of linear Rec.709 in another scene-linear space."""
+    return _converted(pixels, WORKING_SPACE, encoding)
+
+
+def chromaticities_of(encoding: str) -> tuple[float, ...]:
+    """x, y of red, green, blue and white of a scene-linear space of ours."""
+    return _CHROMATICITIES[encoding]
 
 
 def to_display_srgb8(pixels: Float, *, exposure_scale: float) -> npt.NDArray[np.uint8]:

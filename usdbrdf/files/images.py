@@ -1,4 +1,4 @@
-"""Images in and out; the only importer of OpenImageIO.
+"""Images in and out; beside ``published_images`` the only importer of OpenImageIO.
 
 Reading gives every pixel or refuses: a truncated file never becomes zeros, and what is made of a
 file is bounded, whatever it stores. Writing clamps to what half floats hold, pins the date so that
@@ -59,7 +59,7 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
     H, W are the display window's; its pixels that the file does not hold are NaN (unknown, not
     black). NaN and infinity in the file are returned as they are. Integer images give [0, 1].
     """
-    source = _open(path, max_side)
+    source = open_image(path, max_side)
     names = source.spec().channelnames
     lower = [name.lower() for name in names]
     channels = [lower.index(letter) for letter in "rgb" if letter in lower]
@@ -68,7 +68,7 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
             f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
             "beauty pass as R, G, B. [image.channels]"
         )
-    pixels = _pixels(path, source)
+    pixels = pixels_of(path, source)
     if channels != list(range(len(names))):
         pixels = pixels[..., channels]
     return _in_display_window(source.spec(), np.ascontiguousarray(pixels))
@@ -76,35 +76,41 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
 
 def read_exr(path: Path) -> Float:
     """All channels of an image in file order, (H, W, C) float32, NaN outside the data window."""
-    source = _open(path, MAX_SIDE)
-    return _in_display_window(source.spec(), _pixels(path, source))
+    source = open_image(path)
+    return _in_display_window(source.spec(), pixels_of(path, source))
 
 
 def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
     """Width and height of the display window and the channel names, from the header alone."""
-    spec = _open(path, MAX_SIDE).spec()
+    spec = open_image(path).spec()
     return spec.full_width, spec.full_height, tuple(spec.channelnames)
 
 
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     """What an image's header says of its colour space: a name, "" without one; and x, y of red,
     green, blue and white, () without these."""
-    spec = _open(path, MAX_SIDE).spec()
+    spec = open_image(path).spec()
     name, places = spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
     sound = isinstance(places, tuple) and len(places) == 8
     return str(name or ""), tuple(float(place) for place in places) if sound else ()
 
 
+def stored_space(path: Path) -> tuple[str, int]:
+    """The colour space that an image's header names, "" for none, and how many channels it has."""
+    spec = open_image(path).spec()
+    return str(spec.getattribute("oiio:ColorSpace") or ""), int(spec.nchannels)
+
+
 def is_eight_bit(path: Path) -> bool:
     """Whether the image holds bytes, from the header alone."""
-    return str(_open(path, MAX_SIDE).spec().format) == "uint8"
+    return str(open_image(path).spec().format) == "uint8"
 
 
 def exif_exposure(path: Path) -> float | None:
     """How much light a photograph was given, from its EXIF data: exposure time in seconds times
     ISO / 100, over the square of the f-number; what is not told counts as ISO 100 and f/1. None
     without an exposure time."""
-    spec = _open(path, MAX_SIDE).spec()
+    spec = open_image(path).spec()
     time = spec.getattribute("ExposureTime")
     number, speed = spec.getattribute("FNumber"), spec.getattribute("Exif:PhotographicSensitivity")
     given = [v if isinstance(v, int | float) and v > 0 else None for v in (time, number, speed)]
@@ -143,7 +149,7 @@ def write_exr(
     if len(names) == 4:
         spec.alpha_channel = 3
     with temporary_beside(path) as staged:
-        _write(path, staged, spec, stored)
+        write_image(path, staged, spec, stored)
         if not np.array_equal(read_exr(staged), stored.astype(np.float32), equal_nan=holes):
             raise EnvironmentFailure(
                 f"{path}: the file does not read back as it was written. Check the disk. "
@@ -182,7 +188,7 @@ def write_preview_png(path: Path, rgb8: Byte) -> None:
     spec.attribute("DateTime", _PINNED_DATE)
     spec.set_colorspace("srgb_rec709_scene")
     with temporary_beside(path) as staged:
-        _write(path, staged, spec, np.ascontiguousarray(rgb8))
+        write_image(path, staged, spec, np.ascontiguousarray(rgb8))
         publish(staged, path)
 
 
@@ -195,15 +201,23 @@ def encoded_jpeg(rgb8: Byte, quality: int) -> bytes:
         path = Path(folder) / "picture.jpg"
         spec = _spec_of_preview(path, rgb8)
         spec.attribute("Compression", f"jpeg:{quality}")
-        _write(path, path, spec, np.ascontiguousarray(rgb8))
-        content = path.read_bytes()
+        write_image(path, path, spec, np.ascontiguousarray(rgb8))
+        return jpeg_without_metadata(path.read_bytes())
+
+
+def jpeg_without_metadata(content: bytes) -> bytes:
+    """A JPEG without applications' segments, EXIF and XMP among them, without comments and without
+    what follows its end; what says how its numbers are colours stays."""
     kept, position = content[:2], 2
     for kind, end in _segments_of_jpeg(content):
-        # Applications' segments, but for JFIF's, and comments.
-        if not (0xE1 <= kind <= 0xEF or kind == 0xFE):
-            kept += content[position:end]
+        part = content[position:end]
+        profile = kind == 0xE2 and part[4:16] == b"ICC_PROFILE\0"
+        adobe = kind == 0xEE and part[4:9] == b"Adobe"
+        if profile or adobe or not (0xE1 <= kind <= 0xEF or kind == 0xFE):
+            kept += part
         position = end
-    return kept + content[position:]
+    scans = content[position:]
+    return kept + scans[: scans.find(b"\xff\xd9") + 2 or None]
 
 
 def _segments_of_jpeg(content: bytes) -> Iterator[tuple[int, int]]:
@@ -223,7 +237,7 @@ def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
     return oiio.ImageSpec(rgb8.shape[1], rgb8.shape[0], 3, "uint8")
 
 
-def _open(path: Path, max_side: int) -> Any:
+def open_image(path: Path, max_side: int = MAX_SIDE) -> Any:
     """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
     part that has R, G and B, or the first if none has."""
     if path.suffix.lower() in RAW_SUFFIXES:
@@ -329,7 +343,7 @@ def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
         )
 
 
-def _pixels(path: Path, source: Any) -> Float:
+def pixels_of(path: Path, source: Any) -> Float:
     """The data window, (H, W, C) float32, complete."""
     if source.format_name() == "jpeg":
         # The decoder paints what is missing grey and only warns; look for the end mark. It is
@@ -364,7 +378,7 @@ def _in_display_window(spec: Any, data: Float) -> Float:
     return image
 
 
-def _write(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
+def write_image(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
     output = oiio.ImageOutput.create(str(staged))
     done = output is not None and output.open(str(staged), spec) and output.write_image(pixels)
     message = "" if done else _message(output or oiio)

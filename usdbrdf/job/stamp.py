@@ -87,6 +87,11 @@ def stamp_of(name: str, parameters: Mapping[str, Any], inputs: Mapping[str, str]
     )
 
 
+def name_in_lighting(name: str, lighting: str) -> str:
+    """What a task is called that is done for one of several lightings; its name where "" is."""
+    return f"{name}@{lighting}" if lighting else name
+
+
 def stamp_path(asset: Path, order: int, name: str) -> Path:
     return asset / STATE_FOLDER / "stamps" / f"{order}-{name}.json"
 

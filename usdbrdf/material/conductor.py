@@ -47,8 +47,11 @@ def conductor_of(
     irradiance: Float,
     bases: tuple[OfPhis, OfPhis],
     dielectric: LobeEstimate,
+    *,
+    certain: bool = False,
 ) -> Conductor | None:
-    """The metal that explains P samples clearly better than the best dielectric; None without one.
+    """The metal that explains P samples clearly better than the best dielectric; None without one,
+    unless it is ``certain`` to be a metal.
 
     radiance    (P, 3) of the samples; texel (P,) counted from 0 without gaps
     irradiance  (P, 3), W/m^2, S at the sample's texel
@@ -68,7 +71,7 @@ def conductor_of(
         errors[k] = _size(seen - base - f0 * slope, seen - other_base - f0 * other_slope)
     best = int(errors.argmin())
     f0 = reflectances[best]
-    if f0.mean() < _LEAST_F0:
+    if f0.mean() < _LEAST_F0 and not certain:
         return None
     found = [_relative(basis([dielectric.phi]), level) for basis in bases]
     psi = dielectric.psi * F0_OF_PSI
@@ -84,7 +87,7 @@ def conductor_of(
     paid = share * math.log(max(uniform, own) / (own * math.sqrt(2 * math.pi * share)))
     textured = math.log(own) + max(paid, 0.0)
     clearer = min(math.log(uniform), textured) - math.log(float(errors[best]))
-    if clearer < _CLEARER:
+    if clearer < _CLEARER and not certain:
         return None
     likely = np.exp(-0.5 * count * (np.log(errors / errors[best])))
     likely *= np.gradient(np.array(_PHIS))

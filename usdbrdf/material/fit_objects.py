@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +54,7 @@ from usdbrdf.transport.lobe_radiance import Mixture
 _AT_A_TIME = 3
 # A1 and A2 are counted on about this many pixels per frame.
 _COUNTED_PIXELS = 80_000
+_OTHER_SEED = 0x5EED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,16 +198,23 @@ class FirstLook(NamedTuple):
         return cls(lobes, int(arrays["num_samples"]))
 
 
+# What a person may ask of an object's fit, in words; and what is then not fitted.
+METAL, REFIT, GLASS = "metal", "refit", "glass"
+LEFT_OUT = ("ignore", GLASS)
 _NAMES = {PAPER: "paper", DIELECTRIC: "microfacet"}
 # Of the share that no lobe explains, summed over objects: what the two kinds must differ by.
 _PAPER_CLEARER = calibration.number("fit.paper_clearer")
 
 
 def fitted_by_likelier_lobe(
-    run: TaskRun, lightings: Sequence[Lighting], reader: FrameReader, options: FitOptions
+    run: TaskRun,
+    lightings: Sequence[Lighting],
+    reader: FrameReader,
+    options: FitOptions,
+    asked: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[int, list[ObjectFit]]:
     """The kind of lobe that the scene's surfaces have, and ``fit_object`` of every object with
-    that.
+    that; ``asked``: what a person wants of some, by number.
 
     Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
     the model of facets, unless the paper's explains the views of all objects clearly better.
@@ -221,7 +230,8 @@ def fitted_by_likelier_lobe(
     lobe = PAPER if paper else DIELECTRIC
 
     def work(i: int) -> dict[str, Array]:
-        return fit_object(lobe, lightings, reader, i, options, looks[i]).arrays()
+        word = asked.get(i, "")
+        return fit_object(lobe, lightings, reader, i, options, looks[i], asked=word).arrays()
 
     found = _of_each_object(run, "object", sizes, work, label="fit")
     return lobe, [ObjectFit.from_arrays(one).rounded() for one in found]
@@ -315,12 +325,17 @@ def fit_object(
     options: FitOptions,
     look: FirstLook | None = None,
     mixture: Mixture = MIXTURE,
+    asked: str = "",
 ) -> ObjectFit:
     """The lobe of one object by the chosen method, of a kind (``brdf``).
 
     lightings: one alone where the method takes one frame. look: what has been fitted already.
-    mixture: see sampled_object.
+    mixture: see sampled_object. asked: what a person wants, see ``LEFT_OUT`` and others.
     """
+    if asked in LEFT_OUT:
+        return ObjectFit()
+    if asked == REFIT:  # random numbers that nothing has been fitted with
+        options, look = replace(options, seed=(options.seed + _OTHER_SEED) % 2**32), None
     survey = max((one.survey for one in lightings), key=lambda survey: survey.shown[index])
     target = int(survey.target[index])
     if options.method != "views":
@@ -336,7 +351,7 @@ def fit_object(
         return found
 
     first = look.lobes.get(lobe) if look else None
-    fitted, metal = fit_views(lobe, sampled, options.seed, first)
+    fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     found = ObjectFit(
         *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
         num_samples=used, target=target,
@@ -371,8 +386,13 @@ def _fit_of_frame(
     )  # fmt: skip
 
 
-def judged(found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bool) -> Verdict:
-    """What to publish and to show of a fit; ``observed``: some frame shows the object."""
+def judged(
+    found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bool, asked: str = ""
+) -> Verdict:
+    """What to publish and to show of a fit; ``observed``: some frame shows the object; ``asked``:
+    what a person wanted of it."""
+    if asked == GLASS:
+        return replace(verdict_on_views(None, observed), kind="transparent")
     if options.method == "views":
         lobe = LobeEstimate(
             found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
@@ -380,7 +400,8 @@ def judged(found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bo
         )  # fmt: skip
         if math.isfinite(found.clearer):
             f0 = found.red, found.green, found.blue
-            return verdict_on_metal(found.metal_phi, f0, found.metal_phi_error, found.f0_error)
+            errors = found.metal_phi_error, found.f0_error
+            return verdict_on_metal(found.metal_phi, f0, *errors, likelier=found.clearer > 0)
         verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
     else:
         keep, phi = options.method == "paper", (found.phi, found.phi_error)

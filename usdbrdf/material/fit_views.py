@@ -198,13 +198,18 @@ def fit_kinds(
 
 
 def fit_views(
-    lobe: int, sampled: Callable[[], SampledObject], seed: int, first: LobeEstimate | None = None
+    lobe: int,
+    sampled: Callable[[], SampledObject],
+    seed: int,
+    first: LobeEstimate | None = None,
+    *,
+    metal: bool = False,
 ) -> tuple[LobeEstimate, Conductor | None]:
     """The lobe, of a kind (``brdf``), and the metal that explains the samples better, if one does;
     where S is not known none is looked for.
 
     sampled: asked for where something is left to be traced. first: the fit with the rays of
-    ``first_seed(seed)``, if there is one.
+    ``first_seed(seed)``, if there is one. metal: it is known to be one.
     """
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
@@ -212,14 +217,17 @@ def fit_views(
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
     bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE
-    if not bright or (irradiance := sampled().irradiance) is None:
+    if not (bright or metal) or (irradiance := sampled().irradiance) is None:
         return found, None
     samples = sampled().samples
     kind = PAPER if lobe == PAPER else CONDUCTOR
     one, other = (
         partial(sampled().basis(0, own_seed), kind) for own_seed in range(3 * seed, 3 * seed + 2)
     )
-    return found, conductor_of(samples.radiance, samples.texel, irradiance, (one, other), found)
+    conductor = conductor_of(
+        samples.radiance, samples.texel, irradiance, (one, other), found, certain=metal
+    )
+    return found, conductor
 
 
 def _footprints(

@@ -181,7 +181,8 @@ class Verdict:
     """phi, psi and their standard deviations (NaN: not known); status "measured", "prior",
     "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper: what psi exceeds
     with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown instead of what
-    was found (NaN: that itself); kind "dielectric" or "conductor"; f0 of that, and its error."""
+    was found (NaN: that itself); kind "dielectric", "conductor" with its f0 and the error of that,
+    or "transparent"."""
 
     phi: float
     psi: float
@@ -233,12 +234,18 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
 
 
 def verdict_on_metal(
-    phi: float, f0: tuple[float, float, float], phi_error: float, f0_error: float
+    phi: float,
+    f0: tuple[float, float, float],
+    phi_error: float,
+    f0_error: float,
+    *,
+    likelier: bool = True,
 ) -> Verdict:
-    """On a metal that explains many views better than any dielectric."""
+    """On a metal; ``likelier``: it explains many views better than any dielectric, without which
+    nothing of it is measured, whoever says that it is one."""
     phi_sure = "high" if phi_error <= MAX_PHI_ERROR else "low"
     f0_sure = "high" if f0_error <= _MAX_F0_ERROR else "low"
-    measured = (phi_sure, f0_sure) == ("high", "high")
+    measured = (phi_sure, f0_sure) == ("high", "high") and likelier
     # psi is at the bound of all dielectrics.
     psi_error = float(min(f0_error / F0_OF_PSI, NOTHING_KNOWN))
     return Verdict(

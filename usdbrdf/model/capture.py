@@ -34,6 +34,7 @@ class Frames:
                           is the photograph itself; () where all are
     masks                 whose black pixels these images do not have, in the same way
     lenses                the lenses of these photographs in words, "" where there is none
+    photograph_encoding   colour space of these photographs, "" where there are none
     vignetting            k1, k2: the lens passes exp(k1 rho^2 + k2 rho^4) of the light, rho in half
                           diagonals of the image from the principal point; it is to be divided out
     gain                  (N,) float64 or None: what the pixels of radiometric images are too bright
@@ -55,6 +56,7 @@ class Frames:
     photographs: tuple[Path | None, ...] = ()
     masks: tuple[Path | None, ...] = ()
     lenses: tuple[str, ...] = ()
+    photograph_encoding: str = ""
     gain: Double | None = None
     captured_pose: Double | None = None
     vignetting: tuple[float, float] = (0.0, 0.0)

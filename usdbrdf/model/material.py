@@ -26,6 +26,7 @@ class Material:
     base, metallic   (H, W, 3) and (H, W, 1) float32, of what diffuse and f0 of a metal were mixed;
                None where there is no metal
     lobe       the kind of specular lobe (``transport.brdf``): 0 the paper's, 1 a dielectric's
+    clear      light passes as if nothing was there, as through a pane
     """
 
     diffuse: Float
@@ -36,6 +37,7 @@ class Material:
     base: Float | None = None
     metallic: Float | None = None
     lobe: int = 0
+    clear: bool = False
 
     @property
     def emits(self) -> bool:

@@ -6,19 +6,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 
+# What a person may ask of the steps about an object.
+DIRECTIVES = ("ignore", "metal", "glass", "lamp", "not-lamp", "refit")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectLabel:
-    """One object of the segmentation: a USD identifier, the name as captured, its class."""
+    """One object of the segmentation: a USD identifier, the name as captured, its class, and which
+    of ``DIRECTIVES`` the capture has for it, "" for none."""
 
     identifier: str
     label: str
     class_name: str = ""
+    directive: str = ""
+
+
+class ObjectName(NamedTuple):
+    """What a capture calls an object; of a Segmentation."""
+
+    label: str
+    class_name: str = ""
+    directive: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

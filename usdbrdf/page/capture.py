@@ -14,25 +14,29 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress
-from usdbrdf.job.stamp import read_stamp, stamp_path
+from usdbrdf.job.stamp import name_in_lighting, read_stamp, stamp_path
 from usdbrdf.model.arrays import Byte, Double, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.page.pictures import data_uri
 from usdbrdf.transport.lit_scene import LitScene
 
 STEPS = ("ingest", "texture", "shade", "fit")
+# Those that are done for each lighting apart.
+_OF_LIGHTING = ("texture", "shade")
 # Frames that are read for their exposures, and pixels across the map, at most.
 _MOST_READ, _MAP_WIDTH = 96, 480
 _FLOORLESS = np.array((40, 44, 52), np.uint8)
 
 
 def summaries(asset: Asset) -> dict[str, dict[str, Any]]:
-    """What each step found when it ran, by its name; empty where its stamp is gone."""
-    stamps = {
-        name: read_stamp(stamp_path(asset.folder, number, name))
-        for number, name in enumerate(STEPS, start=1)
-    }
-    return {name: dict(stamp.summary) if stamp else {} for name, stamp in stamps.items()}
+    """What each step found when it ran, in the asset's lighting, by its name; empty where its stamp
+    is gone."""
+    found = {}
+    for number, name in enumerate(STEPS, start=1):
+        own = asset.lighting if name in _OF_LIGHTING else ""
+        stamp = read_stamp(stamp_path(asset.folder, number, name_in_lighting(name, own)))
+        found[name] = dict(stamp.summary) if stamp else {}
+    return found
 
 
 def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.properties import FittedObject, ShadedObject
+from usdbrdf.asset.properties import LAMP, FittedObject, ShadedObject
 from usdbrdf.asset.readers.scene import read_shading
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, predict_view
 from usdbrdf.evaluation.metrics import finite
@@ -78,6 +78,7 @@ def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) 
         "status": status,
         "fit": fit.status,
         "kind": fit.kind,
+        "directive": fit.directive or (shading.directive if shading else ""),
         "phi": finite(fit.phi, 4),
         "phi_error": finite(fit.phi_error, 4),
         "phi_confidence": fit.phi_confidence,
@@ -107,6 +108,8 @@ def _radiance(shading: ShadedObject | None) -> dict[str, Any] | None:
 
 def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
     """In a sentence or two, why the numbers of an object are to be believed, or not."""
+    if directive := _by_directive(fit, shading):
+        return directive
     if status == "lamp":
         known = shading.radiance_status if shading else "measured"
         return {
@@ -129,6 +132,20 @@ def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
     known = f"Only {sure[0]} is determined." if sure else "Neither number is determined."
     bound = f" psi is below {fit.psi_upper:.2f} with 95 %." if fit.psi_upper < 0.995 else ""
     return f"{explained} {known}{bound}"
+
+
+def _by_directive(fit: FittedObject, shading: ShadedObject | None) -> str:
+    """The same where a person said what is to be done; "" where the numbers speak."""
+    if shading is not None and shading.directive == LAMP:
+        return "It counts as a lamp by directive, whatever its radiance says."
+    told = {
+        "ignore": "It was left out by directive: nothing was fitted.",
+        "glass": "It is clear glass by directive: nothing was fitted.",
+        "metal": "It is fitted as a metal by directive"
+        + ("." if fit.is_metal else ", of which the photographs do not show enough.")
+        + (" Dielectrics explain the photographs no worse." if fit.status == "prior" else ""),
+    }
+    return told.get(fit.directive, "")
 
 
 def _pictures(

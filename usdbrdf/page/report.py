@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -100,10 +101,12 @@ def _part(name: str) -> str:
 
 def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     """All that the page tells, as JSON."""
-    place, atlas = measured_atlas(asset.folder)
+    place, atlas = measured_atlas(asset.folder, options.lighting)
+    # Where none is asked for it is the one that the asset opens in.
+    place = place.in_lighting(atlas.lighting or None)
     up_axis = read_header(place.layer("scan")).up_axis
     seen = viewed_asset(place, atlas, options.environment)
-    fits = [read_fit(atlas.stage, obj.prim_path) for obj in atlas.scene.objects]
+    fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
     frames, found = atlas.frames, summaries(place)
@@ -126,6 +129,7 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             "frames": len(frames),
             "resolution": frames.resolution[0].tolist(),
             "encoding": frames.encoding,
+            "lighting": atlas.lighting,
             "radiometric": bool(frames.radiometric),
             "adapter": str(found["ingest"].get("adapter", "")),
             "triangles": len(atlas.scene.triangles),
@@ -158,6 +162,16 @@ def reviewed(asset: Asset) -> dict[str, Any]:
         "review": {path: {w: getattr(one, w) for w in words} for path, one in said.items()},
         "changed": changes_since(asset),
     }
+
+
+def _in_own_frames(atlas: AssetMaps, prim_path: str) -> FittedObject | None:
+    """A fit with its target frame counted among the frames of the lighting that is shown; -1 where
+    it is one of another."""
+    fit, own = read_fit(atlas.stage, prim_path), atlas.own_frames
+    if fit is None:
+        return None
+    inside = fit.target_frame in own
+    return replace(fit, target_frame=fit.target_frame - own.start if inside else -1)
 
 
 def _frames_to_search(count: int, fits: Sequence[FittedObject]) -> list[int]:

@@ -36,7 +36,8 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
     try:
         with TemporaryDirectory(prefix="usdbrdf-room-") as folder:
             file = Path(folder) / "room.glb"
-            package(asset.folder, file, PackageOptions(max_size=_TEXTURE))
+            options = PackageOptions(max_size=_TEXTURE, lighting=asset.lighting or None)
+            package(asset.folder, file, options)
             content = file.read_bytes()
     except UsdBrdfError as error:
         say(f"report: without the room in 3D: {error}")

@@ -95,7 +95,7 @@ def _shown(view: ScoredView, photographs: bool) -> ShownView:
 
 def evaluated_views(folder: Path, asset: Asset) -> tuple[list[ShownView], list[figures.Row]]:
     """The same of a folder that ``evaluate`` wrote. InputRefused where it is none, is of another
-    asset, or lacks a picture."""
+    asset or lighting, or lacks a picture."""
     document = read_json(folder / DOCUMENT)
     rows = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(rows, list) or not rows or not all(map(_is_row, rows)):
@@ -107,6 +107,13 @@ def evaluated_views(folder: Path, asset: Asset) -> tuple[list[ShownView], list[f
         raise InputRefused(
             f"{folder / DOCUMENT}: these are views of {document.get('asset')!r}, not of "
             f"{asset.name!r}. Run usdbrdf evaluate on this asset. [report.evaluation]"
+        )
+    if document.get("lighting", "") != asset.lighting:
+        shown = document.get("lighting") or "one that it does not name"
+        raise InputRefused(
+            f"{folder / DOCUMENT}: these are views in the lighting {shown!r}, not in "
+            f"{asset.lighting!r}. Run usdbrdf evaluate with --lighting {asset.lighting}. "
+            "[report.evaluation]"
         )
     listed = [str(name) for name in document.get(figures.FILES, ())]
     listed = [name for name in listed if name.endswith(".png") and ".flip_" not in name]

@@ -67,7 +67,8 @@ def mitsuba_scene(mi: Any, scene: RelitScene, *, bounces: int) -> Any:
         # Of the vertices of a path the first is what the camera sees.
         "integrator": {"type": "path", "max_depth": bounces + 1, "rr_depth": 5},
     }
-    for i, surface in enumerate(scene.surfaces):
+    # A clear pane would only hide the lights behind it from the rays that look for them.
+    for i, surface in enumerate(s for s in scene.surfaces if not s.material.clear):
         parts[f"surface_{i}"] = _mesh(mi, surface)
     for i, light in enumerate(scene.lights):
         parts[f"light_{i}"] = _light(mi, light, centre, radius)

@@ -6,7 +6,9 @@ each of the groups sends to a few thousand measured texels is traced, and their 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -150,9 +152,13 @@ def estimate_clipped_light(
     coverage: CoverageMap,
     environment: Environment,
     seed: int,
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> ClippedLight:
-    """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates."""
+    """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
+    said: of objects whether they are lamps, where that is known."""
     groups = clipped_groups(surface.texels, lit, coverage)
+    known = [said.get(i, lamp) for i, lamp in zip(groups.object.tolist(), groups.lamp, strict=True)]
+    groups = replace(groups, lamp=np.array(known, np.bool_))
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")

@@ -276,6 +276,8 @@ def _shares(
 
 _ABOVE_LIMIT = calibration.pair("outside.above_limit")
 _SKY_DEVIATION = calibration.number("outside.sky_deviation")
+_ALIKE = calibration.number("outside.alike")
+_ALIKE_OVER_HORIZON = calibration.number("outside.alike_over_horizon")
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
 _LEAST_SUN = calibration.number("outside.least_sun")
 _MOST_SUN_ERROR = calibration.number("outside.most_sun_error")
@@ -305,8 +307,10 @@ def _sky(
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
     near = np.argwhere(np.triu(centre @ centre.T > np.cos(_BESIDE), 1))
     near = near[~bound[near].any(axis=1)]
+    below = centre[:, 2 if z_up else 1] < 0
+    apart = np.where(below[near[:, 0]] == below[near[:, 1]], _ALIKE, _ALIKE_OVER_HORIZON)
     deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
-    return Sources(share[used], mean, deviation, bound, near)
+    return Sources(share[used], mean, deviation, bound, near, apart)
 
 
 def _with_sun(
@@ -324,6 +328,7 @@ def _with_sun(
         deviation=np.append(sky.deviation, _SUN_DEVIATION),
         bound=np.append(sky.bound, False),
         pairs=sky.pairs,
+        apart=sky.apart,
     )
     chosen = asked.of(kept)
     segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)

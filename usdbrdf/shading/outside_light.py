@@ -36,13 +36,15 @@ class Asked(NamedTuple):
 class Sources(NamedTuple):
     """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
     the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
-    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2)."""
+    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), and by how much
+    these are apart, (P,)."""
 
     share: Double
     mean: Double
     deviation: Double
     bound: Bool
     pairs: Long
+    apart: Double
 
     def irradiance(self, log_radiance: Double) -> Double:
         """(N, 3) W/m^2 of all of them."""
@@ -54,7 +56,6 @@ _INDEPENDENT = calibration.number("outside.independent")
 _USUAL_ALBEDO = calibration.pair("outside.albedo")
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
-_ALIKE = calibration.number("outside.alike")
 _ITERATIONS = 40
 _LEAST_NOISE = calibration.number("outside.least_noise")
 
@@ -164,12 +165,12 @@ def _add_priors(
     precision = sources.deviation**-2.0 / np.where(sources.bound, 1, max((~sources.bound).sum(), 1))
     curvature[index, index] += precision
     gradient[:k] += precision * off
-    for a, b in sources.pairs:
-        apart = (g[a] - g[b]) / _ALIKE**2
-        for one, other, sign in ((a, b, 1.0), (b, a, -1.0)):
-            curvature[one, one] += _ALIKE**-2
-            curvature[one, other] -= _ALIKE**-2
-            gradient[one] -= sign * apart
+    for (a, b), deviation in zip(sources.pairs, sources.apart, strict=True):
+        pull = deviation**-2
+        for one, other in ((a, b), (b, a)):
+            curvature[one, one] += pull
+            curvature[one, other] -= pull
+            gradient[one] -= pull * (g[one] - g[other])
     segment = np.arange(k, last)
     off = albedo - mean
     precision_of = _OF_SEGMENT**-2

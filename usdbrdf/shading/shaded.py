@@ -6,9 +6,10 @@ reflector: such texels shine by themselves."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -57,6 +58,7 @@ def find_emitters(
     clipped: Bool,
     unknown_lamp: float = 0.0,
     unseen_lamps: Int | None = None,
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
@@ -65,6 +67,7 @@ def find_emitters(
     then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
+    said: of objects whether they shine as a whole or not at all, whatever they show
     """
     light = radiance.mean(axis=1)
     shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
@@ -81,11 +84,13 @@ def find_emitters(
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
         is_lamp[i] = area.sum() > 0 and (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
+        is_lamp[i] = said.get(i, is_lamp[i])
         if is_lamp[i]:
             emissive[own] = True
-        else:
+        elif i not in said:
             emissive[own] = _connected(texels, i, shines[own] & known[own])
-        if unseen_lamps is not None and i in unseen_lamps:
+        unseen = unseen_lamps is not None and i in unseen_lamps
+        if unseen or (is_lamp[i] and not area.any()):
             is_lamp[i], lower_bound[i], emissive[own] = True, True, True
             mean[i] = radiance[own].mean(axis=0)
             continue
@@ -285,21 +290,24 @@ def shade_surface(
     outside: Outside | None,
     sampling: Sampling,
     lightmap_filter: str,
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> Shaded:
     """Trace S with the light ``lit`` (T, 3), L_d as texturing left it; divide; find the emitters.
 
     run      keeps what is done for a run that goes on
     outside  the light from outside; None for none
+    said     of objects, by number, whether they are lamps, where a person says so
     """
+    dark = [i for i, shines in said.items() if not shines]
     environment = outside.environment if outside else black_environment()
     # In the light of what it may be that no frame shows; not both that and an open scan's.
     unseen = (
         UnseenLamps.none()
         if outside
-        else estimate_unseen_lamps(run, surface, lit, coverage, sampling.seed)
+        else estimate_unseen_lamps(run, surface, lit, coverage, sampling.seed, dark)
     )
     lit = unseen.with_light(surface.texels, lit)
-    light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed)
+    light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed, said)
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
@@ -307,7 +315,9 @@ def shade_surface(
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
     may_shine, dimmest = light.may_shine(coverage.clipped), light.least_of_lamps()
-    emitters = find_emitters(texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object)
+    emitters = find_emitters(
+        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said
+    )
     albedo, over = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level

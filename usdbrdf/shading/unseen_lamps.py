@@ -8,6 +8,7 @@ that only reflects could be where it is shines by itself; the others keep what w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,12 +69,17 @@ class UnseenLamps:
 
 
 def estimate_unseen_lamps(
-    run: TaskRun, surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int
+    run: TaskRun,
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    seed: int,
+    dark: Sequence[int] = (),
 ) -> UnseenLamps:
-    """Of a closed scan with the radiance ``lit`` (T, 3)."""
+    """Of a closed scan with the radiance ``lit`` (T, 3); the objects ``dark`` are none."""
 
     def compute() -> dict[str, Array]:
-        return dict(vars(lamps_that_explain(surface, lit, coverage, seed)))
+        return dict(vars(lamps_that_explain(surface, lit, coverage, seed, dark)))
 
     found = UnseenLamps(**run.checkpoint("unseen", compute))
     if len(found.object):
@@ -82,9 +88,10 @@ def estimate_unseen_lamps(
 
 
 def lamps_that_explain(
-    surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int
+    surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int, dark: Sequence[int] = ()
 ) -> UnseenLamps:
-    """The unseen objects that must shine for plain surfaces to be plain."""
+    """The unseen objects that must shine for plain surfaces to be plain, without those that are
+    known to be ``dark``."""
     texels = surface.texels
     owner = texels.object_index()
     area, observed = (
@@ -92,6 +99,7 @@ def lamps_that_explain(
         for weights in (texels.area, texels.area * coverage.observed)
     )
     seen = observed / np.maximum(area, 1e-12)
+    seen[list(dark)] = 1.0
     asked = asked_texels(texels, lit, coverage, seed)
     if asked is None or not (seen < _UNSEEN).any():
         return UnseenLamps.none()
@@ -169,6 +177,7 @@ def _strengths(
         deviation=np.full(count, _DEVIATION),
         bound=np.zeros(count, np.bool_),
         pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
     )
     found = solved(asked, sources)
     error = jackknife(asked, sources, found).max(axis=1)

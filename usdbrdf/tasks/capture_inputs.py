@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.layout import Asset, relative_path
 from usdbrdf.capture.adapters import refuse_missing
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.documents import json_text, read_json
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.tasks.task import HANDED_ON
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
 
 
@@ -49,21 +54,41 @@ def inputs_of_capture(
     outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
     if options.frames is not None:
         outside["frames"] = options.frames.resolve()
+    objects = options.objects if isinstance(options.objects, Path) else folder / "objects.json"
     inputs = {
-        label: hash_of_files(files_below(place, without=asset.folder), place)
+        label: hash_of_files(
+            [f for f in files_below(place, without=asset.folder) if f != objects.resolve()], place
+        )
         for label, place in ({"capture": folder} | outside).items()
-    }
+    } | _inputs_of_objects(objects)
     if beside:
         inputs["beside"] = hash_of_files(beside)
-    mesh, objects = options.mesh, options.objects
+    mesh = options.mesh
     if mesh is not None and mesh.is_file():
         # What a USD mesh refers to may lie beside it, out of the capture.
         usd = mesh.suffix.lower() in USD_SUFFIXES
         layers = layers_of_usd(mesh, (folder, *options.allow_outside)) if usd else [mesh]
         inputs["mesh"] = hash_of_files(layers)
-    if isinstance(objects, Path) and objects.is_file():
-        inputs["objects"] = hash_of_files([objects])
     named = {"mesh": mesh.resolve()} if mesh is not None else {}
     places = {"capture": capture.resolve()} | named | outside
     here = asset.layer("scan").parent
     return inputs, {name: relative_path(place, here) for name, place in places.items()}
+
+
+def _inputs_of_objects(file: Path) -> dict[str, str]:
+    """Of an objects.json what the scan depends on, and apart from that its directives: these alone
+    may change without a new scan. Where it is none its adapter will say so."""
+    if not file.is_file():
+        return {}
+    whole = {"objects": hash_of_files([file])}
+    with suppress(InputRefused):
+        document = read_json(file)
+        rows = document.get("objects") if isinstance(document, dict) else None
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            return whole
+        asked = [str(row.pop("directive", "")) for row in rows]
+        texts = {"objects": json_text(document)}
+        if any(asked):
+            texts[HANDED_ON] = json_text(asked)
+        return {k: hashlib.sha256(text.encode()).hexdigest() for k, text in texts.items()}
+    return whole

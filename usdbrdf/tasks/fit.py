@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, replace
 from typing import Any
 
+import numpy as np
+
+from usdbrdf.asset.directives import by_number, directives_of
 from usdbrdf.asset.header import read_provenance
 from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.preview_lobe import MICROFACET
-from usdbrdf.asset.properties import FittedObject
+from usdbrdf.asset.properties import OF_FIT
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import Lighting, fitted_by_likelier_lobe, judged, survey_frames
+from usdbrdf.material.fit_objects import LEFT_OUT, Lighting, fitted_by_likelier_lobe, survey_frames
 from usdbrdf.material.refine import frame_reader
 from usdbrdf.options import FitOptions, kind_of_light
-from usdbrdf.tasks.refined import refined_objects
+from usdbrdf.tasks.refined import fitted_objects, refined_objects
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
@@ -52,6 +53,9 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
     lightmap_filter = chosen_filter(AUTO) if filtered else NONE
     chosen = {k: v for k, v in asdict(options).items() if k != "memory"}
     chosen["environment"] = kind_of_light(options.environment)
+    asked = directives_of(asset, maps[0].stage, OF_FIT)
+    if asked:
+        chosen["directives"] = asked
     inputs: dict[str, str] = {}
     read = (*_READ, *_WEIGHED) if len(maps) > 1 else _READ
     for own in maps:
@@ -68,6 +72,9 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
+        words = by_number(asked, maps[0].scene.objects)
+        left_out = [i for i, word in words.items() if word in LEFT_OUT]
+        fitted = ~np.isin(maps[0].texels.object_index(), left_out)
         lit = [own.lit_scene(own.environment(options.environment)) for own in maps]
         reader = frame_reader(lit, maps[0].all_frames, options.memory)
         lightings = [
@@ -76,7 +83,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
                 survey_frames(
                     run.part(own.lighting),
                     scene,
-                    own.coverage.measured & ~own.emissive,
+                    own.coverage.measured & ~own.emissive & fitted,
                     reader,
                     options,
                     own.own_frames,
@@ -85,24 +92,8 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
             )
             for own, scene in zip(maps, lit, strict=True)
         ]
-        lobe, found = fitted_by_likelier_lobe(run, lightings, reader, options)
-        microfacet = lobe != PAPER
-        mapping = MICROFACET if microfacet and options.mapping == "matched" else options.mapping
-        objects = [
-            FittedObject(
-                prim_path=obj.prim_path,
-                identifier=obj.identifier,
-                cost=own.cost,
-                evidence=own.evidence,
-                target_frame=own.target if math.isfinite(own.phi) else -1,
-                num_pixels=own.num_samples,
-                method=options.method,
-                mapping=mapping,
-                lobe=MICROFACET if microfacet else "paper",
-                **vars(judged(own, obj, options, any(some.is_observed(i) for some in maps))),
-            )
-            for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True))
-        ]
+        lobe, found = fitted_by_likelier_lobe(run, lightings, reader, options, words)
+        objects = fitted_objects(maps, found, options, words, microfacet=lobe != PAPER)
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured")
         if options.method == "views":

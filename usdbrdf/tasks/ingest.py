@@ -45,16 +45,16 @@ def ingest(
     copy_to: Path | None = None,
 ) -> TaskResult:
     """Read and check a capture, or several of one scene in as many lightings, and write it as the
-    weakest layer of ``asset``, and a single one as a capture of our own format into the new folder
-    ``copy_to``. Raises InputRefused for a capture that cannot be used, OwnershipConflict where
-    ``copy_to`` is taken or the asset is of other lightings; nothing is published then."""
+    weakest layer of ``asset``, and a single one as a capture of our own format into ``copy_to``.
+    Raises InputRefused, and OwnershipConflict where ``copy_to`` is taken or the asset is of other
+    lightings; nothing is published then."""
     paths = (capture,) if isinstance(capture, Path) else tuple(capture)
     lightings = names_of_lightings(paths)
     captures = dict(zip(lightings or ("",), paths, strict=True))
     if copy_to is not None:
         if lightings:
             raise UsageError(
-                "--write-capture: a capture has one lighting. Write them one by one. [usage.option]"
+                "--write-capture: a capture has one lighting. Write each. [usage.option]"
             )
         refuse_taken(copy_to, paths[0])
     check_lightings(asset, lightings)
@@ -67,13 +67,8 @@ def ingest(
     # Our own adapters change with the version of the code, which every stamp holds.
     if packages := sorted({one.package for one in chosen.values() if one.package}):
         parameters["adapter_package"] = ", ".join(packages)
-    task = Task(
-        asset=asset,
-        name="ingest",
-        role="scan",
-        parameters={"adapter": adapter or "recognised", "places": places, **parameters},
-        inputs=inputs,
-    )
+    parameters = {"adapter": adapter or "recognised", "places": places, **parameters}
+    task = Task(asset=asset, name="ingest", role="scan", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
         scans = {name: read_with(chosen[name], path, options) for name, path in captures.items()}
@@ -85,11 +80,11 @@ def ingest(
         for name, scan in scans.items():
             # Photographs through lenses become frames when nothing but pixels can be refused.
             scan = in_own_folder(scan, name)
-            files = [str(path) for path in scan.frames.image_paths]
-            frames = developed(scan.frames, scan.views, asset.folder, run.output_kept)
-            scan = replace(scan, frames=frames)
-            images = [run.kept.get(file, Path(file)) for file in files]
+            files, views, home = scan.frames.image_paths, scan.views, asset.folder
+            scan = replace(scan, frames=developed(scan.frames, views, home, run.output_kept))
+            images = [run.kept.get(str(file), file) for file in files]
             scans[name], told[name] = asked_of_its_pixels(scan, images, options)
+            warnings += told[name].pop("warnings")
             if copy_to:
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
@@ -110,6 +105,7 @@ def ingest(
             "frames": len(scan.frames),
             "objects": len(scan.objects),
             "objects_from": scan.label_source,
+            "directives": {one.identifier: one.directive for one in scan.objects if one.directive},
             "triangles": len(scan.mesh.triangles),
             "radiometric": scan.frames.radiometric,
             "counts": scan.counts,

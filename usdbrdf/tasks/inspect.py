@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,9 +14,11 @@ from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
+from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
-from usdbrdf.tasks.objects import segmented
+from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
+from usdbrdf.texturing.agreement import doubts_about_agreement
 
 
 def inspect(
@@ -23,20 +26,26 @@ def inspect(
 ) -> Inspection:
     """``capture.inspection``, and whether poses, mesh and frames agree."""
     found = inspect_capture(capture, options, adapter, plugins=plugins)
-    if found.mesh is None or found.frames is None or not found.could_be_read:
+    mesh, every = found.mesh, found.frames
+    if mesh is None or every is None or not found.could_be_read:
         return found
+
+    def developed_frames(numbers: Sequence[int], folder: str) -> Frames:
+        views = [found.views[i] for i in numbers] if found.views else []
+        return developed_in(every.at(numbers), views, Path(folder))
+
     try:
         with TemporaryDirectory(prefix="usdbrdf-") as folder:
-            asked = spread_evenly(len(found.frames), ASKED)
-            views = [found.views[i] for i in asked] if found.views else []
-            frames = developed_in(found.frames.at(asked), views, Path(folder))
-            read = partial(read_frame, frames)
-            agrees = agreement_of_frames(found.mesh, frames, read, capture)
+            frames = developed_frames(spread_evenly(len(every), ASKED), folder)
+            agrees = agreement_of_frames(mesh, frames, partial(read_frame, frames), capture)
+            objects = found.objects
             if options.objects == AUTO:
-                every = developed_in(found.frames, found.views, Path(folder))
-                read = partial(read_frame, every)
-                mesh, objects, _ = segmented(found.mesh, None, every, read)
-                found = replace(found, mesh=mesh, objects=objects)
+                frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)
+                read = partial(read_frame, frames)
+                mesh, objects, _ = segmented(mesh, found.own_faces, frames, read)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))
-    return replace(found, agreement=agrees and agrees.ratio)
+    warnings = (*found.warnings, *doubts_about_agreement(agrees, capture))
+    return replace(
+        found, mesh=mesh, objects=objects, warnings=warnings, agreement=agrees and agrees.ratio
+    )

@@ -18,7 +18,7 @@ from usdbrdf.job.progress import progress, say
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import ObjectLabel, ScanMesh, doubled_areas
+from usdbrdf.model.mesh import ObjectLabel, ObjectName, ScanMesh, doubled_areas
 from usdbrdf.transport.rays import RayScene
 
 # Frames that tell the colours, and numbers that each of them keeps.
@@ -26,17 +26,15 @@ _FRAMES, _MOST_NUMBERS = 32, 1 << 26
 
 
 def segmented(
-    mesh: ScanMesh, turned: Bool | None, frames: Frames, read: Read
+    mesh: ScanMesh, own: int, frames: Frames, read: Read
 ) -> tuple[ScanMesh, tuple[ObjectLabel, ...], dict[str, Any]]:
     """The mesh divided into objects, these, and how many of each kind, for the record.
 
-    turned  as of ``Scan``: as long as the capture's own faces, behind which come second skins
-    read    the frames' pixels
+    own   how many faces are the capture's own, behind which come second skins
+    read  the frames' pixels
     """
-    own = len(mesh.triangles if turned is None else turned)
     rays = RayScene(mesh.points, mesh.triangles)
-    most = max(1, _MOST_NUMBERS // (3 * len(mesh.triangles)))
-    asked = spread_evenly(len(frames), min(_FRAMES, most))
+    asked = frames_that_tell_colours(mesh, len(frames))
 
     def shown() -> Iterator[tuple[Camera, Float, Bool]]:
         images = read_frames(read, asked)
@@ -55,7 +53,7 @@ def segmented(
     )
     labels, number = _labels(found.face, divided, found.planes, found.parts)
     face_object, objects = objects_with_faces(
-        _with_second_skins(mesh, number[divided]), tuple((label, "") for label in labels)
+        _with_second_skins(mesh, number[divided]), tuple(map(ObjectName, labels))
     )
     told = {
         "planes": found.planes,
@@ -67,6 +65,12 @@ def segmented(
         f"{told['colours_on_planes']} other colours on them, {told['parts']} parts"
     )
     return replace(mesh, face_object=face_object), objects, told
+
+
+def frames_that_tell_colours(mesh: ScanMesh, count: int) -> list[int]:
+    """Numbers of those of ``count`` frames that are asked, as many as the memory holds."""
+    most = max(1, _MOST_NUMBERS // (3 * len(mesh.triangles)))
+    return spread_evenly(count, min(_FRAMES, most))
 
 
 def _labels(face: Int, divided: Int, planes: int, parts: int) -> tuple[list[str], Int]:

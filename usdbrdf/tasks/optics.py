@@ -9,7 +9,7 @@ import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.files.frames import Read, read_frames
-from usdbrdf.job.progress import progress, warn
+from usdbrdf.job.progress import progress
 from usdbrdf.model.capture import Scan
 from usdbrdf.texturing.agreement import points_of_surface
 from usdbrdf.texturing.optics import (
@@ -25,10 +25,12 @@ from usdbrdf.transport.rays import RayScene
 _ASKED, _LISTED = 32, 6
 
 
-def asked_of_its_optics(scan: Scan, read: Read, *, estimate: bool) -> tuple[Scan, dict[str, Any]]:
-    """The scan, its frames' vignetting to be divided out if ``estimate``; and what was found, of
-    which the user is told where it is much: stops that corners are darker by, and that the balance
-    of red or blue to green is off by in the worst frame."""
+def asked_of_its_optics(
+    scan: Scan, read: Read, *, estimate: bool
+) -> tuple[Scan, dict[str, Any], list[str]]:
+    """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
+    that corners are darker by, and that the balance of red or blue to green is off by in the worst
+    frame; and a sentence for the user on each of them that is much."""
     frames, mesh = scan.frames, scan.mesh
     surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
     asked = spread_evenly(len(frames), _ASKED)
@@ -40,9 +42,10 @@ def asked_of_its_optics(scan: Scan, read: Read, *, estimate: bool) -> tuple[Scan
     falloff, drift = falloff_of_frames(samples), balance_drift(samples)
     told: dict[str, Any] = {"vignetting_stops": falloff and round(falloff.stops, 3)}
     told["white_balance_drift_stops"] = None if drift is None else round(float(drift.max()), 3)
+    doubts = []
     if falloff is not None and falloff.is_clear:
         done = "that was divided out" if estimate else "--vignetting estimate divides it out"
-        warn(
+        doubts.append(
             f"{scan.source.name}: all frames are {falloff.stops:.2f} stops darker in their corners "
             f"than in the middle (error {falloff.error:.2f}); {done}. [capture.vignetting]"
         )
@@ -52,9 +55,9 @@ def asked_of_its_optics(scan: Scan, read: Read, *, estimate: bool) -> tuple[Scan
         off = [frames.image_paths[asked[k]].name for k in np.flatnonzero(drifts(drift))]
         named = ", ".join(off[:_LISTED])
         more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
-        warn(
+        doubts.append(
             f"{scan.source.name}: the white balance of {len(off)} of {len(asked)} frames is off "
             f"that of the others, by {drift.max():.2f} stops at most: {named}{more}. Develop "
             "all frames with one balance. [capture.balance]"
         )
-    return scan, told
+    return scan, told, doubts

@@ -7,6 +7,7 @@ from pathlib import Path
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.properties import LightFromOutside, colour
+from usdbrdf.files.colour import DATA
 from usdbrdf.files.images import needs_float, write_exr
 from usdbrdf.job.task import TaskRun
 from usdbrdf.options import NO_LIGHT, ShadeOptions
@@ -32,7 +33,8 @@ def write_outside(run: TaskRun, asset: Asset, outside: Outside) -> LightFromOuts
     """Its pictures, and the record that names them."""
     image, sun = outside.environment.image, outside.environment.sun
     write_exr(run.output(asset.sky), image, half=not needs_float(image))
-    write_exr(run.output(asset.sky_confidence), outside.confidence[..., None], half=True)
+    confidence = outside.confidence[..., None]
+    write_exr(run.output(asset.sky_confidence), confidence, half=True, encoding=DATA)
     return LightFromOutside(
         sky=asset.sky,
         confidence=asset.sky_confidence,

@@ -13,9 +13,10 @@ import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS
+from usdbrdf.capture.native import own_faces
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frame, read_frames
-from usdbrdf.job.progress import progress, warn
+from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
@@ -23,15 +24,17 @@ from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
+from usdbrdf.tasks.task import warned
 from usdbrdf.texturing.agreement import (
     Agreement,
     agreement,
+    doubts_about_agreement,
     is_doubtful,
     logarithms_in_frame,
     other_convention,
     points_of_surface,
 )
-from usdbrdf.texturing.exposures import with_estimated_exposures
+from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
 
 # Frames that are asked whether they agree.
@@ -42,19 +45,24 @@ def asked_of_its_pixels(
     scan: Scan, images: Sequence[Path], options: IngestOptions
 ) -> tuple[Scan, dict[str, Any]]:
     """The scan, whose frames lie in ``images`` now, its exposures estimated if that is wanted, and
-    what was found, for the record."""
+    what was found, for the record: under "warnings" what the user has been warned of."""
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
-    scan, told = asked_of_its_optics(scan, read, estimate=options.vignetting == "estimate")
-    told["agreement"] = agrees and agrees.ratio
+    warnings = warned(doubts_about_agreement(agrees, scan.source))
+    estimate = options.vignetting == "estimate"
+    scan, told, doubts = asked_of_its_optics(scan, read, estimate=estimate)
+    warnings += warned(doubts)
+    told |= {"agreement": agrees and agrees.ratio, "warnings": warnings}
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.refine_poses:
         scan, told["refined_poses"] = with_refined_poses(scan, read)
     if options.exposure == "estimate":
-        scan, told["estimated_exposures"] = estimated_exposures(scan, read)
+        scan, off = estimated_exposures(scan, read)
+        told["estimated_exposures"] = off
+        warnings += warned(doubts_about_exposures(off, len(scan.frames), scan.source))
         read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.objects == AUTO:
-        mesh, objects, found = segmented(scan.mesh, scan.turned_faces, scan.frames, read)
+        mesh, objects, found = segmented(scan.mesh, own_faces(scan), scan.frames, read)
         scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
     return scan, told
 
@@ -62,7 +70,8 @@ def asked_of_its_pixels(
 def agreement_of_frames(
     mesh: ScanMesh, frames: Frames, read: Read, source: Path
 ) -> Agreement | None:
-    """How far some frames agree; None where they see too few points in common.
+    """How far some frames agree; None where they see too few points in common. Of much the user
+    is to be told by ``doubts_about_agreement``.
 
     Raises InputRefused, in the name of ``source``, where they hardly do and would under another
     reading of the poses.
@@ -93,28 +102,16 @@ def agreement_of_frames(
             f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
             "Convert the poses. [capture.convention]"
         )
-    if given is not None:
-        warn(
-            f"{source}: frames that show the same points of the mesh differ by {given.ratio:.0%} "
-            "of what any two pixels do, under every usual reading of the poses. Check that poses, "
-            "mesh and images belong together. [capture.agreement]"
-        )
     return given
 
 
 def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]:
     """The scan with its frames exposed as their pixels say; image and gain of those that
-    contradicted the others by much, of which the user is told."""
+    contradicted the others by much."""
     frames, mesh = scan.frames, scan.mesh
     surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
     images = read_frames(read, range(len(frames)))
     seen = progress(images, total=len(frames), label="exposures", unit="frames")
     columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]
     frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1))
-    if off:
-        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in off.items())
-        warn(
-            f"{scan.source.name}: {len(off)} of {len(frames)} frames contradicted the others, "
-            f"{named}; what all are off by was divided out. [capture.exposure]"
-        )
     return replace(scan, frames=frames), off

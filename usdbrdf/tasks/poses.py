@@ -24,8 +24,11 @@ _MOST_ACROSS, _MOST_PIXELS = 1024, 1 << 27
 def with_refined_poses(scan: Scan, read: Read) -> tuple[Scan, list[dict[str, Any]]]:
     """The scan with poses that agree better, and for each frame by how much it was moved (metres)
     and turned (degrees), and how far it differs from what the others show, before and after, from 0
-    to 1; of this the user is told."""
+    to 1; of this the user is told. What was refined before stays as it is."""
     frames, mesh = scan.frames, scan.mesh
+    if frames.captured_pose is not None:
+        say(f"ingest: the poses of {scan.source.name} are refined already; they stay as they are")
+        return scan, _steps(scan)
     shrink = _shrink(frames)
     images = read_frames(read, range(len(frames)))
     seen = progress(images, total=len(frames), label="poses: reading", unit="frames")
@@ -34,25 +37,33 @@ def with_refined_poses(scan: Scan, read: Read) -> tuple[Scan, list[dict[str, Any
     cameras = [frames.camera(i) for i in range(len(frames))]
     found = refined_poses(mesh, rays, cameras, pictures)
     captured, refined = frames.world_from_camera, found.world_from_camera
+    changed = replace(frames, world_from_camera=refined, captured_pose=captured)
+    scan = replace(scan, frames=changed)
+    told = _steps(scan)
+    for row, before, after in zip(told, found.before, found.after, strict=True):
+        row |= {"differed": round(float(before), 4), "differs": round(float(after), 4)}
+    say(
+        f"ingest: {(found.after < found.before).sum()} of {len(frames)} cameras took a step, at "
+        f"most {1000 * max(row['moved_m'] for row in told):.1f} mm and "
+        f"{max(row['turned_deg'] for row in told):.2f} degrees"
+    )
+    return scan, told
+
+
+def _steps(scan: Scan) -> list[dict[str, Any]]:
+    """By how much each frame's pose differs from that captured, in metres and degrees."""
+    captured, refined = scan.frames.captured_pose, scan.frames.world_from_camera
+    assert captured is not None
     moved = _distances(captured, refined) * scan.meters_per_unit
     turned = _degrees(captured, refined)
-    steps = found.after < found.before
-    say(
-        f"ingest: {steps.sum()} of {len(frames)} cameras took a step, at most "
-        f"{1000 * moved.max():.1f} mm and {turned.max():.2f} degrees"
-    )
-    told = [
+    return [
         {
             "frame": path.name,
             "moved_m": round(float(moved[i]), 6),
             "turned_deg": round(float(turned[i]), 5),
-            "differed": round(float(found.before[i]), 4),
-            "differs": round(float(found.after[i]), 4),
         }
-        for i, path in enumerate(frames.image_paths)
+        for i, path in enumerate(scan.frames.image_paths)
     ]
-    changed = replace(frames, world_from_camera=refined, captured_pose=captured)
-    return replace(scan, frames=changed), told
 
 
 def _shrink(frames: Frames) -> int:

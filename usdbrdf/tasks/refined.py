@@ -1,8 +1,10 @@
-"""What the task fit does with the lobes that it found: maps that are free of their light."""
+"""What the task fit does with the lobes that it found: records, and maps that are free of their
+light."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +12,46 @@ import numpy as np
 from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_refined_layer
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
+from usdbrdf.asset.preview_lobe import MICROFACET
 from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.task import TaskRun
+from usdbrdf.material.fit_objects import ObjectFit, judged
 from usdbrdf.material.refine import Lighting, Lobes, refined_light
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.lit_scene import LitScene
+
+
+def fitted_objects(
+    maps: Sequence[AssetMaps],
+    found: Sequence[ObjectFit],
+    options: FitOptions,
+    asked: Mapping[int, str],
+    *,
+    microfacet: bool,
+) -> list[FittedObject]:
+    """What is published of each object's fit; ``asked``: what a person wants of some, by number."""
+    mapping = MICROFACET if microfacet and options.mapping == "matched" else options.mapping
+    objects = []
+    for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True)):
+        word, observed = asked.get(i, ""), any(some.is_observed(i) for some in maps)
+        objects.append(
+            FittedObject(
+                prim_path=obj.prim_path,
+                identifier=obj.identifier,
+                cost=own.cost,
+                evidence=own.evidence,
+                target_frame=own.target if math.isfinite(own.phi) else -1,
+                num_pixels=own.num_samples,
+                method=options.method,
+                mapping=mapping,
+                lobe=MICROFACET if microfacet else "paper",
+                directive=word,
+                **vars(judged(own, obj, options, observed, word)),
+            )
+        )
+    return objects
 
 
 def refined_objects(

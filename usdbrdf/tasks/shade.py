@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.asset.directives import by_number, directives_of
 from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.task_layers import write_shading_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import ShadedObject, colour
+from usdbrdf.asset.properties import LAMP, OF_SHADE, ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
@@ -29,33 +30,27 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
     maps = AssetMaps(open_weaker(asset, "shading"))
-    task = Task(
-        asset=asset,
-        name="shade",
-        role="shading",
-        parameters={
-            **asdict(options.sampling),
-            "denoise": lightmap_filter,
-            "environment": kind_of_light(options.environment),
-        },
-        inputs=hashes_of_inputs(
-            asset,
-            "shading",
-            maps,
-            aovs=("lit", "coverage"),
-            environment=options.environment,
-            photographs=options.environment == ESTIMATE,
-        ),
-    )
+    asked = directives_of(asset, maps.stage, OF_SHADE)
+    inputs = hashes_of_inputs(
+        asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
+        photographs=options.environment == ESTIMATE,
+    )  # fmt: skip
+    parameters = {
+        **asdict(options.sampling),
+        "denoise": lightmap_filter,
+        "environment": kind_of_light(options.environment),
+        **({"directives": asked} if asked else {}),
+    }
+    task = Task(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
-        shaded = shade_surface(
-            run, maps.surface, maps.lit, maps.coverage, outside, options.sampling, lightmap_filter
-        )
+        said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
+        given = maps.surface, maps.lit, maps.coverage, outside
+        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
-        objects = _write_maps(writer, shaded)
+        objects = _write_maps(writer, shaded, asked)
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
         lamps = [
@@ -81,18 +76,19 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
     return task.run(work)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
+def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> list[ShadedObject]:
     """Every object's pictures, and the record that names them."""
     traced = shaded.traced
     maps = {
         "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
-        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2"),
+        "stderr": TexelMap(traced.standard_error, 1 / np.pi, "W/m^2", colour=False),
         "albedo": TexelMap(shaded.albedo, 1.0, "1"),
     }
     if shaded.irradiance is not traced.mean:
         maps["irradiance_raw"] = TexelMap(traced.mean, 1 / np.pi, "W/m^2")
     if shaded.unexplained.any():
-        maps["unexplained"] = TexelMap(shaded.unexplained.astype(np.float32), 1.0, "1")
+        unexplained = shaded.unexplained.astype(np.float32)
+        maps["unexplained"] = TexelMap(unexplained, 1.0, "1", colour=False)
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
     emitters, objects = shaded.emitters, []
     for i, obj in enumerate(writer.scene.objects):
@@ -112,6 +108,7 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
                 rays_per_texel=float(traced.rays[own].mean()),
                 standard_error=float(np.median(shaded.relative_error[own])),
                 escaped_fraction=float(mean(traced.escaped)),
+                directive=asked.get(obj.identifier, ""),
             )
         )
     return objects

@@ -9,10 +9,13 @@ from typing import Any, TypeVar
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.progress import say, warn
-from usdbrdf.job.stamp import code_version
+from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
 
 Options = TypeVar("Options")
+# The input that later steps follow and a task only hands on: a layer that told of it would change
+# with it, and all steps after that.
+HANDED_ON = "directives"
 
 
 def in_each_lighting(
@@ -59,7 +62,7 @@ class Task:
         """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
         return run_task(
             self.asset.folder,
-            f"{self.name}@{self.asset.lighting}" if self.asset.lighting else self.name,
+            name_in_lighting(self.name, self.asset.lighting),
             order=1 + ROLES.index(self.role),
             parameters=self.parameters,
             inputs=self.inputs,
@@ -68,8 +71,9 @@ class Task:
 
     @property
     def provenance(self) -> Provenance:
+        told = {k: v for k, v in self.inputs.items() if k.split(".")[0] != HANDED_ON}
         return Provenance(
-            role=self.role, version=code_version(), parameters=self.parameters, inputs=self.inputs
+            role=self.role, version=code_version(), parameters=self.parameters, inputs=told
         )
 
     @property

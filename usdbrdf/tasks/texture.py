@@ -89,9 +89,9 @@ def _write_maps(
     maps = {
         "lit": TexelMap(found.lit, 1.0, "W/(m^2 sr)"),
         "mean": TexelMap(found.mean, 1.0, "W/(m^2 sr)"),
-        "spread": TexelMap(found.spread, 1.0, "W/(m^2 sr)"),
-        "samples": TexelMap(found.samples, 1 / 32, "1"),
-        "coverage": TexelMap(found.coverage.stored(), 1.0, "1"),
+        "spread": TexelMap(found.spread, 1.0, "W/(m^2 sr)", colour=False),
+        "samples": TexelMap(found.samples, 1 / 32, "1", colour=False),
+        "coverage": TexelMap(found.coverage.stored(), 1.0, "1", colour=False),
     }
     scene, texels = writer.scene, writer.texels
     assert scene.corner_uv is not None

@@ -7,7 +7,8 @@ tells the frames' gains too, before hours are spent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -131,3 +132,13 @@ def other_convention(given: Agreement | None, others: Mapping[str, Agreement | N
 def is_doubtful(given: Agreement | None) -> bool:
     """Whether other readings of the poses are worth trying."""
     return given is None or given.ratio > _AGREES
+
+
+def doubts_about_agreement(found: Agreement | None, source: Path) -> Iterator[str]:
+    """A sentence where the frames hardly agree, under whatever reading of the poses."""
+    if found is not None and is_doubtful(found):
+        yield (
+            f"{source.name}: frames that show the same points of the mesh differ by "
+            f"{found.ratio:.0%} of what any two pixels do, under every usual reading of the poses. "
+            "Check that poses, mesh and images belong together. [capture.agreement]"
+        )

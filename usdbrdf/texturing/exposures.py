@@ -10,7 +10,9 @@ cannot be known; their median is 0.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -137,6 +139,17 @@ def with_estimated_exposures(frames: Frames, logarithm: Float) -> tuple[Frames, 
         gain=gain * (1.0 if frames.gain is None else frames.gain) if frames.radiometric else None,
     )
     return changed, {frames.image_paths[i].name: round(float(gain[i]), 2) for i in off}
+
+
+def doubts_about_exposures(off: Mapping[str, float], count: int, source: Path) -> Iterator[str]:
+    """A sentence where some of so many frames contradicted the others, by image their gains, which
+    were divided out."""
+    if off:
+        named = ", ".join(f"{name} ({gain:.2f} x)" for name, gain in off.items())
+        yield (
+            f"{source.name}: {len(off)} of {count} frames contradicted the others, "
+            f"{named}; what all are off by was divided out. [capture.exposure]"
+        )
 
 
 def _contradict(gains: Gains) -> Bool:

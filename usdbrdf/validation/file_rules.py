@@ -12,9 +12,11 @@ from pathlib import Path
 from pxr import Ar, Sdf, Usd
 
 from usdbrdf.asset.layout import ROLES
+from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.scene import asset_file
+from usdbrdf.errors import InputRefused
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
 
@@ -247,3 +249,18 @@ def orphan_texture(scene: AssetStage) -> Iterator[Fault]:
         known = file.name in named or any(tile.fullmatch(file.name) for tile in tiles)
         if not known and file.is_file() and not file.name.startswith("."):
             yield Fault(scene.asset_root, f"no layer names @{file}@.")
+
+
+@rule(Severity.ERROR)
+def published_file(scene: AssetStage) -> Iterator[Fault]:
+    """The files of a published version are those of its manifest, byte for byte. Others may have
+    taken the version in already: one that changes shows two people two things under one name.
+
+    Bring the file back from a copy, or publish the next version."""
+    if not (scene.asset and scene.asset_root and scene.asset.is_published):
+        return
+    try:
+        for file, what in changes(scene.asset.folder):
+            yield Fault(scene.asset_root, f"@{file}@ {what} since it was published.")
+    except InputRefused as problem:
+        yield Fault(scene.asset_root, str(problem).rpartition(" [")[0])

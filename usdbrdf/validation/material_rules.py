@@ -9,7 +9,7 @@ from typing import Any
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from usdbrdf.asset.preview_lobe import MICROFACET, preview_surface_from_fit
+from usdbrdf.asset.preview_lobe import CLEAR_GLASS, MICROFACET, preview_surface_from_fit
 from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
@@ -104,7 +104,8 @@ def show_record(site: Site) -> bool:
 @rule(Severity.ERROR, show_record)
 def lobe_matches_fit(scene: AssetStage) -> Iterator[Fault]:
     """Roughness, ior and the factor on the colour of an object's material are those that its
-    recorded phi and psi stand for under the recorded mapping; of a metal the roughness is. Where
+    recorded phi and psi stand for under the recorded mapping; of a metal the roughness is, of glass
+    all are those of a clear pane. Where
     they differ, the file contradicts itself: somebody edited the record, which changes no picture,
     or a layer of ours. What an artist's layer says about the material is not judged.
 
@@ -129,9 +130,10 @@ def _contradictions(scene: AssetStage, item: Usd.Prim) -> Iterator[tuple[Usd.Att
         return
     if not (0 <= phi <= 1 and 0 <= psi <= 1):
         return
-    wanted = preview_surface_from_fit(phi, psi, _mapping(item))
-    metal = authored(item, "usdBrdf:fit:kind") == "conductor"
-    diffuse = None if metal else surface.GetInput("diffuseColor")
+    kind = authored(item, "usdBrdf:fit:kind")
+    glass, metal = kind == "transparent", kind == "conductor"
+    wanted = CLEAR_GLASS if glass else preview_surface_from_fit(phi, psi, _mapping(item))
+    diffuse = None if metal or glass else surface.GetInput("diffuseColor")
     sources = diffuse.GetConnectedSources()[0] if diffuse else []
     scale = UsdShade.Shader(sources[0].source.GetPrim()).GetInput("scale") if sources else None
     roughness, ior = (surface.GetInput(name) for name in ("roughness", "ior"))

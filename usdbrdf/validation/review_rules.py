@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from usdbrdf.asset.readers.scene import read_fit
-from usdbrdf.asset.review import Judgement, read_review, review_file
+from usdbrdf.asset.review import Judgement, followed, read_review, review_file
 from usdbrdf.errors import InputRefused
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, rule
 
@@ -38,6 +38,15 @@ def review_record(scene: AssetStage) -> Iterator[Fault]:
             yield Fault(scene.asset_root, f"{file.name} judges <{path}>, which is no object.")
         elif judgement.fault:
             yield Fault(known[path], f"in {file.name} {judgement.fault}")
+
+
+@rule(Severity.INFO)
+def review_directives(scene: AssetStage) -> Iterator[Fault]:
+    """What a person asked of an object has been done, and nothing of it is left to a next run.
+
+    Run `usdbrdf convert` again, or the step that is named."""
+    for path, told in followed(scene.stage, _review(scene)):
+        yield Fault(scene.stage.GetPrimAtPath(path), told)
 
 
 @rule(Severity.WARNING)

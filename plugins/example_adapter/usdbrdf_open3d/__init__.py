@@ -23,7 +23,7 @@ from usdbrdf.capture.parts import (
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf_open3d.trajectory import read_trajectory
 
 NAME = "open3d"
@@ -38,7 +38,7 @@ def matches(path: Path) -> bool:
     return (path / DOCUMENT).is_file()
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     """Read and check the capture."""
     path = path.resolve()
     findings = Findings()
@@ -75,7 +75,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
     )
 
 
-def _records(path: Path, options: IngestOptions) -> list[FrameRecord]:
+def _records(path: Path, options: CaptureOptions) -> list[FrameRecord]:
     """One record per camera; Open3D names no images, their order is all there is."""
     poses = read_trajectory(path / DOCUMENT)
     folder = path / "images"

@@ -43,7 +43,13 @@ from usdbrdf.asset.layers.looks import (
     surface,
 )
 from usdbrdf.asset.layout import LIGHTING, Asset, path_in_layer
-from usdbrdf.asset.preview_lobe import NO_LOBE, PreviewLobe, preview_surface_from_fit, shown_metal
+from usdbrdf.asset.preview_lobe import (
+    CLEAR_GLASS,
+    NO_LOBE,
+    PreviewLobe,
+    preview_surface_from_fit,
+    shown_metal,
+)
 from usdbrdf.asset.properties import (
     EMITTER,
     Colour,
@@ -243,10 +249,13 @@ def write_material_layer(
         shown = NO_LOBE
         if item.is_known:
             shown = preview_surface_from_fit(*item.shown, item.mapping)
+            shown = CLEAR_GLASS if item.is_glass else shown
             lobe(layer, material, shown.roughness, shown.ior)
             shader = over(layer, f"{material}/{SURFACE}")
             author_inputs(shader, Types.Float, metallic=float(item.is_metal))
             author_inputs(shader, Types.Int, useSpecularWorkflow=0)
+            if item.is_glass:
+                author_inputs(shader, Types.Float, opacity=0.0)
         apart = len(shading) > 1 and _emits(item, *shading)
         texture = "" if apart else _author_diffuse(layer, material, item, shown.diffuse, shading[0])
         glows = f"{material}/{EMISSION_TEXTURE}"
@@ -269,9 +278,13 @@ def write_material_layer(
 def _author_diffuse(
     layer: Sdf.Layer, material: str, item: FittedObject, scale: float, shading: Sdf.Layer
 ) -> str:
-    """A metal's reflectance, or the diffuse colour; returns its texture as ``_author_colour``."""
+    """A metal's reflectance, the diffuse colour, or of glass none; returns its texture as
+    ``_author_colour``."""
     if item.is_metal:
-        return _author_metal(layer, material, item)
+        metal = shown_metal(item.phi, item.f0, item.mapping)
+        return _author_plain(layer, material, metal, shading)
+    if item.is_glass:
+        return _author_plain(layer, material, (0.0, 0.0, 0.0), shading)
     return _author_colour(layer, material, item, scale, shading)
 
 
@@ -286,6 +299,7 @@ def _author_colour(
                 layer, material, "diffuseColor", "BaseColorTexture", aov.file,
                 scale=scale, fallback=item.mean_color,
             )  # fmt: skip
+            _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
             return path_in_layer(aov.file)
     albedo = shading.GetAttributeAtPath(f"{material}/{ALBEDO_TEXTURE}.inputs:file")
     if albedo is None:
@@ -295,10 +309,16 @@ def _author_colour(
     return str(albedo.default.path)
 
 
-def _author_metal(layer: Sdf.Layer, material: str, item: FittedObject) -> str:
+def _leave_out(layer: Sdf.Layer, node: str, shading: Sdf.Layer) -> None:
+    """Deactivate a node of a weaker layer that nothing in the network reads any more."""
+    if shading.GetPrimAtPath(node):
+        over(layer, node).active = False
+
+
+def _author_plain(layer: Sdf.Layer, material: str, colour: Colour, shading: Sdf.Layer) -> str:
     """One reflectance in the place of a texture; returns that there is none."""
-    colour = shown_metal(item.phi, item.f0, item.mapping)
     shader = over(layer, f"{material}/{SURFACE}")
+    _leave_out(layer, f"{material}/{ALBEDO_TEXTURE}", shading)
     author_inputs(shader, Types.Color3f, diffuseColor=Gf.Vec3f(*colour))
     # An empty list that is explicit takes off the connection of the layer beneath.
     spec = layer.GetAttributeAtPath(f"{shader.path}.inputs:diffuseColor")
@@ -320,6 +340,9 @@ def _author_network(
         base_metalness=float(item.is_metal), specular_weight=1.0,
         specular_roughness=shown.roughness, specular_ior=shown.ior,
     )  # fmt: skip
+    if item.is_glass:
+        author_inputs(prim, Types.Float, transmission_weight=1.0)
+        author_inputs(prim, Types.Bool, geometry_thin_walled=True)
     if not file:
         colour = shown_metal(item.phi, item.f0, item.mapping)  # black of what is no metal
         author_inputs(prim, Types.Color3f, base_color=Gf.Vec3f(*colour))

@@ -12,6 +12,7 @@ from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
+from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
@@ -43,6 +44,7 @@ def open_weaker(asset: Asset, role: str) -> Usd.Stage:
 
 def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's, in the asset's lighting."""
+    refuse_converted(asset)
     common = replace(asset, lighting="")
     return _in_lighting(_sublayered(common, [common.layer(role) for role in ROLES]), asset)
 
@@ -50,6 +52,7 @@ def open_measured(asset: Asset) -> Usd.Stage:
 def open_edited(asset: Asset) -> Usd.Stage:
     """The asset as everybody else opens it: the root layer, with the artist's opinions.
     InputRefused where it does not compose, or USD crashes on it."""
+    refuse_converted(asset)
     try_in_child(asset.root_layer)
     stage = open_stage(asset.root_layer)
     if asset.photographs_layer.is_file():

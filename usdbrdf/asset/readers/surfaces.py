@@ -82,7 +82,8 @@ class _MaterialReader:
             name: self._read(shader.GetInput(name) if shader else None, fallback)
             for name, fallback in _FALLBACKS.items()
         }
-        if known["opacity"].min() < 1:
+        clear = not known["opacity"].any()
+        if known["opacity"].min() < 1 and not clear:
             self.warn(f"<{path}>: opacity is not rendered; the surface is taken as opaque.")
         ior, roughness = float(known["ior"].flat[0]), float(known["roughness"].mean())
         fitted_by = ("matched", MICROFACET)
@@ -105,7 +106,7 @@ class _MaterialReader:
         kind = DIELECTRIC if MICROFACET in (mapping, lobe) else PAPER
         if kind == DIELECTRIC and known["useSpecularWorkflow"].any():
             kind = CONDUCTOR  # any reflectance, which Fresnel's equations of a dielectric have not
-        return replace(material, wrap=self.wrap or "clamp", lobe=kind)
+        return replace(material, wrap=self.wrap or "clamp", lobe=kind, clear=clear)
 
     def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""

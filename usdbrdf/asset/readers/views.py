@@ -29,15 +29,16 @@ from usdbrdf.capture.checks import (
 )
 from usdbrdf.capture.develop import developed_in, frames_of_photographs
 from usdbrdf.capture.formats.transforms import frame_records
+from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import kind_of_encoding
+from usdbrdf.files.colour import WORKING_SPACE, kind_of_encoding
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
 from usdbrdf.job.progress import warn
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 # A reference may leave much of a picture unknown; a view that holds next to nothing is dropped.
 _MAX_UNKNOWN = 0.999
@@ -53,11 +54,12 @@ class Views:
 
 
 def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tuple[Camera, ...]:
-    """The cameras of a document, named after their images, to render from. Images need not exist
-    where the document states width and height. InputRefused where a view cannot be used, or two
-    have images of one name."""
+    """The cameras of a document, named after their images, to render from: of a lens that bends
+    light those of the pinhole frames that its photograph becomes, their faces in the names. Images
+    need not exist where the document states width and height. InputRefused where a view cannot be
+    used, or two have images of one name."""
     findings = Findings()
-    records = _rigid_records(source, asset, IngestOptions(), findings, images=False)
+    records = _rigid_records(source, asset, CaptureOptions(), findings, images=False)
     if findings.dropped:
         first = findings.dropped[0]
         raise InputRefused(
@@ -71,18 +73,22 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
         )
     cameras = []
     for record in records:
-        pose = record.world_from_camera.copy()
-        pose[:3, 3] *= metres_per_unit
-        width, height = record.resolution
-        cameras.append(
-            Camera(
-                name=record.name,
-                world_from_camera=pose,
-                intrinsics=record.intrinsics,
-                width=width,
-                height=height,
+        place = Path(record.name)
+        for view in views_of(record.lens, record.intrinsics, record.resolution):
+            pose = record.world_from_camera.copy()
+            pose[:3, :3] = pose[:3, :3] @ view.photograph_from_frame
+            pose[:3, 3] *= metres_per_unit
+            face = f"{place.stem}.{view.face}{place.suffix}" if view.face else place.name
+            width, height = view.resolution
+            cameras.append(
+                Camera(
+                    name=str(place.with_name(face)),
+                    world_from_camera=pose,
+                    intrinsics=view.intrinsics,
+                    width=width,
+                    height=height,
+                )
             )
-        )
     return tuple(cameras)
 
 
@@ -103,15 +109,17 @@ def photographs_of_views(
     captured = frames_from_stage(stage)
     captured = captured.at(captured.of_lighting(lighting_of_stage(stage)))
     findings = Findings()
-    options = IngestOptions(allow_outside=allow_outside)
+    options = CaptureOptions(allow_outside=allow_outside)
     records = _rigid_records(source, asset, options, findings)
     records = with_masks(records, findings)
     total = len(records) + len(findings.dropped)
-    encoding = captured.encoding
+    encoding = captured.photograph_encoding or captured.encoding
+    displayed = kind_of_encoding(encoding) == "display"
     if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
-        if kind_of_encoding(encoding) != "display":
-            encoding = PHOTOGRAPH_ENCODING
+        encoding = encoding if displayed else PHOTOGRAPH_ENCODING
         records = [_as_the_captures_photographs(r, captured) for r in records]
+    elif displayed:  # which no image of radiance is
+        encoding = WORKING_SPACE
     _refuse_none(len(records), findings, source)
     taken = frames_from_records(records, encoding=encoding, radiometric=captured.radiometric)
     taken = replace(taken, vignetting=captured.vignetting)
@@ -140,7 +148,7 @@ def photographs_of_views(
 
 
 def _rigid_records(
-    source: Path, asset: Asset, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, asset: Asset, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> list[FrameRecord]:
     """The usable frames of a document, in the capture's unit; the others are in ``findings``."""
     records = frame_records(source, options, findings, images=images)
@@ -150,11 +158,13 @@ def _rigid_records(
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
     """8-bit record with its limits in the unit that ingest gave the capture's photographs."""
-    # What was resampled from photographs is linear.
-    if kind_of_encoding(captured.encoding) != "display" and not captured.photographs:
+    encoding = captured.photograph_encoding or captured.encoding
+    # What was resampled from photographs is linear; older assets do not say what these were.
+    unsaid = captured.photographs and not captured.photograph_encoding
+    if kind_of_encoding(encoding) != "display" and not unsaid:
         raise InputRefused(
             f"{record.image_path}: an 8-bit photograph, but the capture's images are "
-            f"{captured.encoding}. Use views of the same kind. [evaluate.views]"
+            f"{encoding}. Use views of the same kind. [evaluate.views]"
         )
     unit = captured.saturation_radiance[0] * captured.exposure_time[0] / PHOTOGRAPH_SATURATION
     scale = float(unit / record.exposure_time)

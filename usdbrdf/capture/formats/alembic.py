@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.errors import InputRefused
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "alembic"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -20,7 +20,7 @@ def matches(path: Path) -> bool:
     return path.suffix.lower() == ".abc" and path.is_file()
 
 
-def read(path: Path, options: IngestOptions) -> NoReturn:
+def read(path: Path, options: CaptureOptions) -> NoReturn:
     raise InputRefused(
         f"{path}: Alembic cameras are not read. Import the file into Blender (File > Import > "
         "Alembic) or Houdini, export camera and meshes as USD, and convert that. [capture.format]"

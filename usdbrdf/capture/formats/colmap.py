@@ -37,7 +37,7 @@ from usdbrdf.files.images import image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import ColmapCamera, ColmapModel, colmap_model, model_files
 
 NAME = "colmap"
@@ -62,7 +62,7 @@ def matches(path: Path) -> bool:
     return path.is_dir() and next(iter(_workspaces(path)), None) is not None
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     findings = Findings()
     chosen = _chosen(path, options, findings)
@@ -178,7 +178,7 @@ def _workspaces(path: Path) -> list[_Workspace]:
     return found
 
 
-def _chosen(path: Path, options: IngestOptions, findings: Findings) -> _Chosen:
+def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     """The first model that has images whose size its cameras are for, or the first with images."""
     workspaces = _workspaces(path)
     candidates: list[_Chosen] = []
@@ -214,7 +214,7 @@ def _chosen(path: Path, options: IngestOptions, findings: Findings) -> _Chosen:
 
 
 def _images_fit(
-    path: Path, one: _Chosen, others: Sequence[_Chosen], options: IngestOptions
+    path: Path, one: _Chosen, others: Sequence[_Chosen], options: CaptureOptions
 ) -> bool:
     """Whether the first image that is there has the shape that its camera is for, and is not what
     another model, one of pinholes, calls its own."""
@@ -249,7 +249,7 @@ def _joined(folder: str, name: str) -> str:
 
 
 def _records(
-    path: Path, chosen: _Chosen, options: IngestOptions, findings: Findings
+    path: Path, chosen: _Chosen, options: CaptureOptions, findings: Findings
 ) -> list[FrameRecord]:
     records = []
     for k, name in enumerate(chosen.model.names):
@@ -273,7 +273,7 @@ def _records(
     return records
 
 
-def _mask(path: Path, name: str, options: IngestOptions) -> Path | None:
+def _mask(path: Path, name: str, options: CaptureOptions) -> Path | None:
     """COLMAP's own masks: masks/NAME.png, black where no feature is to be taken."""
     mask = path_in_capture(path, f"masks/{name}.png", options)
     return mask if mask.is_file() else None
@@ -289,7 +289,7 @@ def world_from_camera(camera_from_world: Double) -> Double:
     return pose
 
 
-def _mesh(path: Path, options: IngestOptions) -> Path:
+def _mesh(path: Path, options: CaptureOptions) -> Path:
     for workspace in _WORKSPACES:
         for name in _MESHES:
             mesh = path_in_capture(path, _joined(workspace, name), options)

@@ -23,7 +23,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.e57_files import StationPicture, pictures_of_e57
 
 NAME = "e57"
@@ -43,7 +43,7 @@ def _file_of(path: Path) -> Path | None:
     return files[0] if len(files) == 1 else None
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     source = _file_of(path.resolve())
     if source is None:
         raise InputRefused(f"{path}: no E57 file, or several. Name the file. [capture.format]")

@@ -28,7 +28,7 @@ from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "eyeful-tower"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -44,7 +44,7 @@ def matches(path: Path) -> bool:
     return b'"KRT"' in beginning_of(path / "cameras.json" if path.is_dir() else path)
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     source = path / "cameras.json" if path.is_dir() else path
     folder, findings = source.parent, Findings()

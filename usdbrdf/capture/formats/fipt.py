@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
-from usdbrdf.capture.formats.named_pictures import mesh_beside, rigid_pose, scan_of, up_axis_of
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of, up_axis_of
+from usdbrdf.capture.formats.named_pictures import mesh_beside, rigid_pose, scan_of
 from usdbrdf.capture.parts import LabelTable
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
@@ -28,7 +28,7 @@ from usdbrdf.files.tables import number_rows
 from usdbrdf.model.arrays import Double, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import FileMesh
 
@@ -47,7 +47,7 @@ def matches(path: Path) -> bool:
     return photographed or ((train / "transforms.json").is_file() and (train / "Image").is_dir())
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     if (folder / "cam.txt").is_file():
         source, records = folder / "cam.txt", _photographed(folder, findings)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
 from usdbrdf.capture.formats.named_pictures import (
     mask_beside,
     mesh_beside,
@@ -20,12 +20,11 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
-    up_axis_of,
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import read_array
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "llff"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -37,7 +36,7 @@ def matches(path: Path) -> bool:
     return (path / "poses_bounds.npy").is_file()
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     source = folder / "poses_bounds.npy"
     if not source.is_file():

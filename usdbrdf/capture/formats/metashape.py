@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
@@ -25,7 +25,6 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
-    up_axis_of,
     warn_of_unused,
 )
 from usdbrdf.errors import InputRefused
@@ -33,7 +32,7 @@ from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, r
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "metashape"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -55,7 +54,7 @@ def _documents(path: Path) -> list[Path]:
     return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     documents = _documents(path.resolve())
     if len(documents) != 1:
         said = f"{len(documents)} exports of cameras" if documents else "no export of cameras"

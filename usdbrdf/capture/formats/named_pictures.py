@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES
@@ -44,13 +43,6 @@ def rigid_pose(rotation: Double, centre: Double) -> Double:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, centre
     return pose
-
-
-def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
-    """The axis along which the cameras' own point up on the whole, where the format does not say:
-    people hold cameras upright."""
-    up = sum((r.world_from_camera[:3, 1] for r in records), np.zeros(3))
-    return "Y" if abs(up[1]) > abs(up[2]) else "Z"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +100,7 @@ def _nearness(path: Path) -> int:
     return SUFFIXES.index(path.suffix.lower())
 
 
-def pictures_of(folder: Path, options: IngestOptions, *usual: str) -> Pictures:
+def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
     """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders (or of
     those that most programs use) that holds any."""
     if options.frames is not None:
@@ -159,7 +151,7 @@ def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
         )
 
 
-def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> Path:
+def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:
     """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
     of the folder; InputRefused, which says ``how`` to get one, where there is none."""
     if options.mesh is not None:
@@ -178,7 +170,7 @@ def mesh_beside(folder: Path, options: IngestOptions, *usual: str, how: str) -> 
 def scan_of(
     records: Sequence[FrameRecord],
     geometry: Path | Callable[[], ScanGeometry],
-    options: IngestOptions,
+    options: CaptureOptions,
     findings: Findings,
     *,
     adapter: str,

@@ -25,7 +25,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import number_rows
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "nice-slam"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -39,7 +39,7 @@ def matches(path: Path) -> bool:
     return (path / "traj.txt").is_file() and (path / "results").is_dir()
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     source = folder / "traj.txt"
     if not source.is_file():
@@ -124,7 +124,7 @@ def _camera(folder: Path, findings: Findings) -> dict[str, float]:
     return dict(zip(_KEYS, map(float, numbers), strict=True))
 
 
-def _mesh(folder: Path, options: IngestOptions) -> Path:
+def _mesh(folder: Path, options: CaptureOptions) -> Path:
     outside = folder.parent / f"{folder.name}_mesh.ply"
     if options.mesh is None and not (folder / "mesh.ply").is_file() and outside.is_file():
         return outside

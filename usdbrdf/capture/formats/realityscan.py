@@ -37,7 +37,7 @@ from usdbrdf.files.tables import Element, beginning_of, csv_rows, number_in, rea
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "realityscan"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -73,7 +73,7 @@ def _is_sidecar(file: Path) -> bool:
     return b"capturingreality.com/ns/xcr" in beginning_of(file)
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     tables, findings = _tables(path), Findings()
     folder = path if path.is_dir() else path.parent

@@ -12,7 +12,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.formats import nice_slam
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "replica"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -24,7 +24,7 @@ def matches(path: Path) -> bool:
     return (path / "mesh.ply").is_file() and any((path / mark).is_file() for mark in marks)
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder = path.resolve()
     if not (folder / "traj.txt").is_file():
         raise InputRefused(

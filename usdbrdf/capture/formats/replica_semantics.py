@@ -18,6 +18,7 @@ from usdbrdf.capture.parts import LabelTable
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Double, Long
+from usdbrdf.model.mesh import ObjectName
 from usdbrdf.untrusted.mesh_files import FileMesh
 from usdbrdf.untrusted.replica_files import labelled_faces
 
@@ -45,13 +46,13 @@ def semantics_beside(mesh: Path) -> Callable[[FileMesh], LabelTable] | None:
             for i, on_pane in enumerate(_panes(glass, found)):
                 if on_pane.any():
                     number[on_pane] = first + i
-                    entries[first + i] = (f"pane_{i + 1}", "glass")
+                    entries[first + i] = ObjectName(f"pane_{i + 1}", "glass")
         return LabelTable(entries, number)
 
     return objects
 
 
-def _entries(info: Path) -> dict[int, tuple[str, str]]:
+def _entries(info: Path) -> dict[int, ObjectName]:
     document: Any = read_json(info)
     rows: Any = document.get("objects") if isinstance(document, dict) else None
     sound = isinstance(rows, list) and all(
@@ -63,7 +64,7 @@ def _entries(info: Path) -> dict[int, tuple[str, str]]:
             "[objects.format]"
         )
     classes = {row["id"]: str(row.get("class_name") or "") for row in rows}
-    return {number: (f"{name or 'object'}_{number}", name) for number, name in classes.items()}
+    return {n: ObjectName(f"{name or 'object'}_{n}", name) for n, name in classes.items()}
 
 
 def _panes(glass: Path, mesh: FileMesh) -> list[Bool]:

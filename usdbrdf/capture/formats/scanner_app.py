@@ -29,7 +29,7 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import image_size
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 NAME = "scanner-app"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -43,7 +43,7 @@ def matches(path: Path) -> bool:
     return path.is_dir() and any(_FRAME.fullmatch(p.name) for p in path.glob("frame_*.json"))
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder = path.resolve()
     findings = Findings()
     encoding = radiance_encoding(options, photographs=True)
@@ -67,7 +67,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
     )
 
 
-def _records(folder: Path, options: IngestOptions, findings: Findings) -> list[FrameRecord]:
+def _records(folder: Path, options: CaptureOptions, findings: Findings) -> list[FrameRecord]:
     documents = sorted(p for p in folder.glob("frame_*.json") if _FRAME.fullmatch(p.name))
     records = []
     for document in documents:
@@ -139,7 +139,7 @@ def _numbers(document: Mapping[str, Any], key: str, count: int) -> list[float] |
     return [float(v) for v in values] if sound else None
 
 
-def _mesh(folder: Path, options: IngestOptions) -> Path:
+def _mesh(folder: Path, options: CaptureOptions) -> Path:
     others = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".ply", ".obj"))
     for name in (*_MESHES, *others):
         path = path_in_capture(folder, name, options)

@@ -27,7 +27,8 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Scan
-from usdbrdf.options import IngestOptions
+from usdbrdf.model.mesh import ObjectName
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_model, model_files
 from usdbrdf.untrusted.mesh_files import FileMesh
 
@@ -41,7 +42,7 @@ def matches(path: Path) -> bool:
     return (path / "scans").is_dir() and bool(model_files(path / "dslr" / "colmap"))
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
     source = folder / "dslr" / "colmap"
     if not model_files(source):
@@ -111,7 +112,7 @@ def _annotated(scans: Path) -> Callable[[FileMesh], LabelTable] | None:
     return objects
 
 
-def _groups(path: Path) -> tuple[dict[int, tuple[str, str]], dict[int, int]]:
+def _groups(path: Path) -> tuple[dict[int, ObjectName], dict[int, int]]:
     """Name and class of each object, and the object of each segment: of several, the smallest."""
     document: Any = read_json(path)
     rows: Any = document.get("segGroups") if isinstance(document, dict) else None
@@ -129,7 +130,7 @@ def _groups(path: Path) -> tuple[dict[int, tuple[str, str]], dict[int, int]]:
     entries, object_of_segment = {}, {}
     for row in sorted(rows, key=lambda row: -len(row["segments"])):
         number, label = row.get("objectId", row.get("id")), str(row.get("label") or "")
-        entries[number] = (f"{label or 'object'}_{number}", label)
+        entries[number] = ObjectName(f"{label or 'object'}_{number}", label)
         object_of_segment.update(dict.fromkeys(row["segments"], number))
     return entries, object_of_segment
 

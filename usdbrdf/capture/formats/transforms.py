@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from usdbrdf.capture.checks import (
     clause_of,
     is_camera_matrix,
     refuse_photographs,
+    up_axis_of,
 )
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.parts import (
@@ -36,10 +37,10 @@ from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Curve, Lens, whole_sphere
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 
 
-def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
+def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path:
     """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
     for folder in options.allow_outside if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
@@ -52,8 +53,6 @@ def path_in_capture(root: Path, candidate: str, options: IngestOptions) -> Path:
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
-# How many times as far as along another axis cameras must point up along y.
-_CLEARLY = 2.0
 _CURVES: dict[str, Curve] = {
     "PINHOLE": "perspective", "SIMPLE_PINHOLE": "perspective", "OPENCV": "perspective",
     "PERSPECTIVE": "perspective", "SIMPLE_RADIAL": "perspective", "RADIAL": "perspective",
@@ -78,7 +77,7 @@ def matches(path: Path) -> bool:
     return (path / "transforms.json").is_file() or (path.suffix == ".json" and path.is_file())
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     source = path / "transforms.json" if path.is_dir() else path
     findings = Findings()
@@ -104,7 +103,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
             "clipped pixels pass for radiance. [capture.saturation]"
         )
     up_axis = _stated(capture, "up_axis", ("Y", "Z"))
-    if up_axis is None and options.up_axis is None and (up_axis := _upright(records)) == "Y":
+    if up_axis is None and options.up_axis is None and (up_axis := up_axis_of(records)) == "Y":
         findings.warn(
             f"{source.name}: states no up_axis, and its cameras are upright along y, not "
             "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
@@ -132,30 +131,16 @@ def read(path: Path, options: IngestOptions) -> Scan:
     )
 
 
-def _upright(records: Sequence[FrameRecord]) -> str:
-    """The up axis: z, as nerfstudio has it, unless people held their cameras upright along y."""
-    axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
-    up = np.nan_to_num(axes.sum(axis=0))
-    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
-
-
 def frame_records(
-    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> list[FrameRecord]:
     """The frames of a document alone, in the capture's frame and unit, where there is no mesh.
 
     Those without pose or file are in ``findings``; poses are not yet known to be rigid. Without
-    ``images`` no file is asked for where the document itself states width and height, and lenses
-    that bend light are refused: nothing is rendered through them.
+    ``images`` no file is asked for where the document itself states width and height.
     """
     source = source.resolve()
     _, records = _captured(source, options, findings, images=images)
-    bent = next((record for record in records if record.lens.bends), None)
-    if bent is not None and not images:
-        raise InputRefused(
-            f"{source}: the view {bent.name!r} has a lens that bends light. Undistort the images "
-            "to a pinhole camera first. [capture.camera]"
-        )
     return at_image_size(records, findings, source) if images else records
 
 
@@ -170,7 +155,7 @@ class _Capture:
 
     source: Path
     document: Mapping[str, Any]
-    options: IngestOptions
+    options: CaptureOptions
     images: bool = True
     is_legacy: bool = False
     first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
@@ -208,7 +193,7 @@ class _Capture:
 
 
 def _captured(
-    source: Path, options: IngestOptions, findings: Findings, *, images: bool = True
+    source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> tuple[_Capture, list[FrameRecord]]:
     """The document and its frames, but for those without pose or file."""
     # A camera that could not be placed costs its frame, not the capture.
@@ -274,6 +259,7 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         name=name,
         image_path=path,
         world_from_camera=_undo_applied_transform(capture, pose),
+        captured_pose=_captured_pose(capture, frame, name),
         intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
         lens=lens,
@@ -300,6 +286,19 @@ def _pose(matrix: object) -> Double | None:
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
     return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def _captured_pose(capture: _Capture, frame: Mapping[str, Any], name: str) -> Double | None:
+    """The pose before it was refined, which says that it was."""
+    stated = frame.get("captured_transform_matrix")
+    pose = _pose(stated)
+    if stated is not None and (pose is None or not is_camera_matrix(pose)):
+        raise capture.refuse(
+            f"the captured_transform_matrix of the frame {name!r} is not a matrix of 4 x 4 finite "
+            "and sensible numbers. Correct or remove it.",
+            "capture.pose",
+        )
+    return None if pose is None else _undo_applied_transform(capture, pose)
 
 
 def _intrinsics(

@@ -31,7 +31,7 @@ from usdbrdf.files.naming import identifier_from
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.usd_cameras import UsdCamera, cameras_from_usd
 from usdbrdf.untrusted.usd_files import USD_SUFFIXES
 
@@ -71,7 +71,7 @@ def _stage_of(path: Path) -> Path | None:
     return files[0] if len(files) == 1 else None
 
 
-def read(path: Path, options: IngestOptions) -> Scan:
+def read(path: Path, options: CaptureOptions) -> Scan:
     stage = _stage_of(path.resolve())
     if stage is None:
         raise InputRefused(f"{path}: no USD file, or several. Name the file. [capture.format]")
@@ -108,7 +108,7 @@ def read(path: Path, options: IngestOptions) -> Scan:
 
 
 def _records(
-    shots: list[_Shot], stage: Path, options: IngestOptions, findings: Findings
+    shots: list[_Shot], stage: Path, options: CaptureOptions, findings: Findings
 ) -> Iterator[FrameRecord]:
     by_plate = options.frames is None and any(s.camera.images[s.i] for s in shots)
     if by_plate:
@@ -167,7 +167,7 @@ def _identifiers(stem: str) -> set[str]:
     return {identifier_from(stem), re.sub(r"\W|^\d", "_", stem, flags=re.ASCII)}
 
 
-def _plate_file(shot: _Shot, folder: Path, options: IngestOptions) -> Path | None:
+def _plate_file(shot: _Shot, folder: Path, options: CaptureOptions) -> Path | None:
     """The file of a back plate, of a sequence too: plate.####.exr, plate.%04d.exr."""
     plate = shot.camera.images[shot.i]
     if not plate:

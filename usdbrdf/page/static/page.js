@@ -38,6 +38,7 @@
     }
     if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
     const told = [
+      ...(facts.lighting ? [['Lighting', facts.lighting]] : []),
       ['Photographs', `${facts.frames}, ${facts.resolution.join(' \u00d7 ')} pixels, ${facts.encoding}`],
       ['Read as', facts.adapter || 'unknown'],
       ['Radiometric', facts.radiometric ? 'yes' : 'no: numbers are relative'],
@@ -337,7 +338,7 @@
     const { one } = entry, now = judged(one.prim), name = `verdict-${one.id}`;
     const comment = el('textarea', { maxlength: 2000, rows: 3 });
     comment.value = now.comment;
-    const directive = el('select', {}, ...['', 'ignore', 'metal', 'glass', 'lamp', 'refit']
+    const directive = el('select', {}, ...['', 'ignore', 'metal', 'glass', 'lamp', 'not-lamp', 'refit']
       .map((word) => el('option', { value: word, selected: word === now.directive }, word || 'none')));
     const choices = [['', 'none yet'], ['accept', 'accept'], ['reject', 'reject']].map(([value, text]) =>
       el('label', {}, el('input', { type: 'radio', name, value, checked: value === now.verdict, onchange: note }), ` ${text}`));
@@ -353,7 +354,7 @@
     const form = el('fieldset', {}, el('legend', {}, `Your verdict on ${one.label}`),
       el('div', { class: 'bar' }, ...choices),
       el('label', {}, 'Comment', comment),
-      el('label', {}, 'For the next run (kept; no step acts on it yet) ', directive));
+      el('label', {}, 'For the next run ', directive));
     return form;
   }
 

@@ -1,4 +1,4 @@
-"""Our rules in omniverse-asset-validator, which finds this module by its entry point.
+"""Our rules in usd-validation-nvidia, which finds this module by its entry point.
 
 Its engine looks at stages once per combination of variants where a rule asks for prims. Ours look
 at whole stages, and at every look by themselves. They offer it no fixes: it would write them into
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import omni.asset_validator as validator
+import usd_validation_nvidia as validator
 from pxr import Sdf, Usd
 
 from usdbrdf.validation.rule import AssetStage, Rule, Severity

@@ -1,4 +1,4 @@
-"""omniverse-asset-validator, an application of others, runs our rules and finds what they find."""
+"""usd-validation-nvidia, an application of others, runs our rules and finds what they find."""
 
 import csv
 import importlib.util
@@ -15,8 +15,8 @@ from usdbrdf.asset.schemas import plugin_path
 from usdbrdf.validation.validate import RULES
 
 pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("omni") is None,
-    reason="omniverse-asset-validator is not installed (extra dcc)",
+    importlib.util.find_spec("usd_validation_nvidia") is None,
+    reason="usd-validation-nvidia is not installed (extra dcc)",
 )
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,8 +25,9 @@ ROOT = Path(__file__).resolve().parents[2]
 # crashes now and then. Its engine, called like this, does all in one.
 _ENGINE = """
 import sys
-from omni.asset_validator import ValidationEngine
-found = [str(issue) for issue in ValidationEngine().validate(sys.argv[1]).issues()]
+from usd_validation_nvidia import ValidationEngine
+engine = ValidationEngine(variants=len(sys.argv) < 3)
+found = [str(issue) for issue in engine.validate(sys.argv[1]).issues()]
 sys.exit("\\n".join(found) or 0)
 """
 
@@ -34,15 +35,15 @@ sys.exit("\\n".join(found) or 0)
 @pytest.fixture
 def run(tmp_path):
     """The command, in an environment where the package is installed as pyproject.toml says."""
-    group = "omni.asset_validator"
+    group = "usd_validation_nvidia"
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    (entry,) = re.findall(rf'^\[project.entry-points."{group}"\]\nusdbrdf = "(.+)"$', project, re.M)
+    (entry,) = re.findall(rf'^\[project.entry-points.{group}\]\nusdbrdf = "(.+)"$', project, re.M)
     info = tmp_path / "installed" / "usdbrdf-0.0.dist-info"
     info.mkdir(parents=True)
     (info / "entry_points.txt").write_text(f"[{group}]\nusdbrdf = {entry}\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: usdbrdf\nVersion: 0.0\n")
 
-    def command(*arguments, schemas="", program=("-m", "omni.asset_validator")):
+    def command(*arguments, schemas="", program=("-m", "usd_validation_nvidia")):
         path = os.pathsep.join([str(info.parent), str(ROOT)])
         return subprocess.run(
             [sys.executable, *program, *map(str, arguments)],
@@ -75,7 +76,7 @@ def test_it_finds_nothing_in_any_variant_of_a_sound_asset(run, built):
 
 def test_its_engine_finds_a_fault(run, built):
     FAULTS["BindingBesideLooks"](built)
-    done = run(built.asset.root_layer, program=("-c", _ENGINE))
+    done = run(built.asset.root_layer, "as selected", program=("-c", _ENGINE))
     assert done.returncode == 1
     assert "UsdBrdfBindingBesideLooks" in done.stderr
 

@@ -1,0 +1,218 @@
+"""Versions of an asset: complete in themselves, never changed, the same for the same content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdUtils
+
+from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
+from usdbrdf.delivery.package import stage_in_look
+from usdbrdf.delivery.publish import publish, versions_in
+from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
+from usdbrdf.files.images import read_exr
+from usdbrdf.job.ownership import folder_lock
+from usdbrdf.options import PublishOptions
+from usdbrdf.validation.validate import own_findings
+
+RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
+over "Stuhl_No_1" { over "PreviewSurface" {
+    float inputs:roughness = 0.125
+} } } } } }"""
+
+
+def bytes_of(folder):
+    return {
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
+    edit(room, RED)
+    here = surfaces_of(stage_in_look(room.asset, "shaded"))
+    told = publish(room.asset.folder, tmp_path / "dest")
+    assert (told["version"], told["new"]) == ("v001", True)
+    shutil.move(tmp_path / "dest/v001", moved := tmp_path / "elsewhere")
+    shutil.rmtree(room.asset.folder)
+    shutil.rmtree(tmp_path / "capture")
+    layers, assets, missing = UsdUtils.ComputeAllDependencies(str(moved / "room.usd"))
+    assert missing == []
+    assert len(assets) > 20
+    for place in [*(layer.realPath for layer in layers), *assets]:
+        assert place.startswith(f"{moved}{os.sep}")
+    for file in moved.rglob("*.usd*"):
+        assert str(tmp_path) not in Sdf.Layer.OpenAsAnonymous(str(file)).ExportToString()
+    stage = Usd.Stage.Open(str(moved / "room.usd"))
+    looks = stage.GetDefaultPrim().GetVariantSet("look")
+    assert {"shaded", "lit", "albedo"} <= {*looks.GetVariantNames()}
+    info = stage.GetDefaultPrim().GetAssetInfo()
+    assert (info["version"], info["identifier"].path) == ("v001", "./room.usd")
+    there = surfaces_of(stage)
+    assert there.keys() == here.keys()
+    for name, surface in here.items():
+        assert np.array_equal(there[name].points, surface.points)
+        for part in ("diffuse", "f0", "roughness", "emission"):
+            ours = getattr(surface.material, part)
+            assert np.array_equal(getattr(there[name].material, part), ours), (name, part)
+    assert own_findings(stage) == []
+
+
+def test_versions_follow_each_other_and_never_change(room, tmp_path):
+    dest, folder = tmp_path / "new" / "dest", room.asset.folder
+    publish(folder, dest)
+    first = bytes_of(dest / "v001")
+    manifest = json.loads(first["manifest.json"])
+    hashes = {path: hashlib.sha256(data).hexdigest() for path, data in first.items()}
+    del hashes["manifest.json"]
+    assert manifest["files"] == hashes
+    assert not any(file.stat().st_mode & 0o222 for file in (dest / "v001").rglob("*.usd*"))
+    again = publish(folder, dest)
+    assert (again["version"], again["new"]) == ("v001", False)
+    edit(room, RED)
+    assert publish(folder, dest)["version"] == "v002"
+    assert room.asset.edits_layer.is_file()
+    # What the work folder says later is not what was published.
+    stage = Usd.Stage.Open(str(dest / "v001/room.usd"))
+    surface = stage.GetPrimAtPath("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface")
+    assert surface.GetAttribute("inputs:roughness").Get() == 0.5
+    with pytest.raises(OwnershipConflict, match=r"v001: this version is there.*publish\.version"):
+        publish(folder, dest, PublishOptions(version="v001"))
+    with pytest.raises(UsageError, match=r"publish\.version"):
+        publish(folder, dest, PublishOptions(version="1"))
+    assert bytes_of(dest / "v001") == first
+    assert versions_in(dest) == ["v001", "v002"]
+    assert publish(folder, dest, PublishOptions(version="v002"))["new"] is False
+
+
+def test_a_changed_file_is_named(room, tmp_path):
+    publish(room.asset.folder, tmp_path / "dest")
+    version = tmp_path / "dest/v001"
+    texture, extra = version / "textures/lamp.emission.exr", version / "notes.txt"
+    texture.chmod(0o644)
+    texture.write_bytes((version / "textures/wall.albedo.exr").read_bytes())
+    (version / "previews/lit.png").unlink()
+    extra.write_text("mine")
+    found = own_findings(Usd.Stage.Open(str(version / "room.usd")))
+    said = [f.message for f in found if f.rule == "usdbrdf.PublishedFile"]
+    assert len(said) == 3
+    for file, what in (
+        (version / "previews/lit.png", "is missing"), (texture, "was changed"),
+        (extra, "was added"),
+    ):  # fmt: skip
+        assert any(f"@{file}@ {what}" in message for message in said)
+    # A version that was damaged holds nothing any more that would make a new one needless.
+    assert publish(room.asset.folder, tmp_path / "dest")["version"] == "v002"
+    manifest = version / "manifest.json"
+    manifest.chmod(0o644)
+    manifest.write_text(manifest.read_text().replace("0", "1", 1))
+    found = own_findings(Usd.Stage.Open(str(version / "room.usd")))
+    assert any("not the manifest that was published" in f.message for f in found)
+
+
+def test_what_fails_half_way_leaves_nothing(room, tmp_path, monkeypatch):
+    dest = tmp_path / "a/b"
+    with monkeypatch.context() as patched:
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        patched.setattr("usdbrdf.delivery.publish.write_manifest", full)
+        with pytest.raises(Exception, match="No space left"):
+            publish(room.asset.folder, dest)
+    assert not (tmp_path / "a").exists()
+    # What a killed process leaves has no version's name, and goes with the next.
+    (dest / ".tmp-1-dead").mkdir(parents=True)
+    publish(room.asset.folder, dest)
+    assert sorted(os.listdir(dest)) == [".usdbrdf-publish", "v001"]
+
+
+def test_one_at_a_time(room, tmp_path):
+    dest = tmp_path / "dest"
+    (dest / ".usdbrdf-publish").mkdir(parents=True)
+    entered, done = threading.Event(), threading.Event()
+
+    def hold():
+        with folder_lock(dest / ".usdbrdf-publish"):
+            entered.set()
+            done.wait(60)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    entered.wait(60)
+    try:
+        with pytest.raises(FolderBusy, match=r"lock\.busy"):
+            publish(room.asset.folder, dest)
+    finally:
+        done.set()
+        holder.join()
+
+
+def test_what_lies_elsewhere_is_not_published(room, tmp_path):
+    edit(room, CHAIR_FILE.format("/etc/hostname"))
+    with pytest.raises(InputRefused, match=r"publish\.outside"):
+        publish(room.asset.folder, tmp_path / "dest")
+    edit(room, CHAIR_FILE.format("./gone.exr"))
+    with pytest.raises(InputRefused, match=r"gone\.exr.*publish\.missing"):
+        publish(room.asset.folder, tmp_path / "dest")
+    edit(room, "")
+    with pytest.raises(UsageError, match=r"publish\.destination"):
+        publish(room.asset.folder, room.asset.folder / "dest")
+    next((tmp_path / "capture/frames").iterdir()).unlink()
+    with pytest.raises(InputRefused, match=r"--no-photographs.*publish\.photograph"):
+        publish(room.asset.folder, tmp_path / "dest")
+    assert not (tmp_path / "dest").exists()
+    publish(room.asset.folder, tmp_path / "dest", PublishOptions(photographs=False))
+    stage = Usd.Stage.Open(str(tmp_path / "dest/v001/room.usd"))
+    assert not (tmp_path / "dest/v001/photographs").exists()
+    camera = stage.GetPrimAtPath("/room/cameras/capture")
+    named = ("usdBrdf:capture:image", "backPlate:")
+    assert not [n for n in camera.GetAuthoredPropertyNames() if n.startswith(named)]
+    assert camera.HasAPI("UsdBrdfCaptureAPI")
+
+
+def test_names_for_a_resolver(room, tmp_path):
+    uri = "ayon+entity://show/assets?product={name}&version={version}"
+    options = PublishOptions(uri=uri, encoding="binary")
+    told = publish(room.asset.folder, tmp_path / "dest", options)
+    assert told["identifier"] == "ayon+entity://show/assets?product=room&version=v001"
+    root = tmp_path / "dest/v001/room.usd"
+    assert root.read_bytes().startswith(b"PXR-USDC")
+    stage = Usd.Stage.Open(str(root))
+    info = stage.GetDefaultPrim().GetAssetInfo()
+    assert info["identifier"].path == told["identifier"]
+    for bad in ("room/{version}", "ayon+entity://{shot}", "ayon+entity://{", "a://{0}"):
+        with pytest.raises(UsageError, match=r"publish\.uri"):
+            publish(room.asset.folder, tmp_path / "dest", PublishOptions(uri=bad))
+
+
+def test_equal_assets_give_equal_bytes(room, tmp_path):
+    publish(room.asset.folder, tmp_path / "one")
+    for file in room.asset.folder.rglob("*.exr"):
+        os.utime(file, (1, 1))
+    publish(room.asset.folder, tmp_path / "two")
+    assert bytes_of(tmp_path / "one/v001") == bytes_of(tmp_path / "two/v001")
+
+
+def test_textures_have_their_smaller_copies_and_the_same_pixels(room, tmp_path):
+    oiio = pytest.importorskip("OpenImageIO")
+    publish(room.asset.folder, tmp_path / "dest")
+    name = "textures/Stuhl_No_1.base_color.exr"
+    there, here = tmp_path / "dest/v001" / name, room.asset.folder / name
+    image = oiio.ImageInput.open(str(there))
+    assert image.spec().tile_width == 64
+    sizes = []
+    while image.seek_subimage(0, len(sizes)):
+        sizes.append((image.spec().width, image.spec().height))
+    assert sizes == [(6, 8), (3, 4), (1, 2), (1, 1)]
+    assert np.array_equal(read_exr(there), read_exr(here))
+    image.seek_subimage(0, 1)
+    half = read_exr(here).reshape(4, 2, 3, 2, 3).mean(axis=(1, 3))
+    assert image.read_image(0, 1, 0, 3, "float") == pytest.approx(half, rel=2e-3)

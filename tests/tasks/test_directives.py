@@ -1,0 +1,87 @@
+"""What a person asks of objects: which steps follow it, and what the stage says of that."""
+
+from __future__ import annotations
+
+import pytest
+from pxr import UsdShade
+
+import usdbrdf
+from tests.scenes import edited, make_capture, poses_down_and_up
+from usdbrdf.asset.directives import directives_of
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.properties import OF_FIT
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.render_scene import render_scene_from_stage, time_code
+from usdbrdf.asset.readers.scene import read_fit, read_shading
+from usdbrdf.asset.review import Judgement, write_review
+from usdbrdf.errors import InputRefused
+from usdbrdf.validation.validate import has_errors, validate
+
+OPTIONS = usdbrdf.ConvertOptions(
+    texture=usdbrdf.TextureOptions(texel_size=0.3),
+    shade=usdbrdf.ShadeOptions(
+        sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64),
+        environment="none",
+        denoise="none",
+    ),
+    fit=usdbrdf.FitOptions(environment="none"),
+)
+
+
+def _say(asset: Asset, **words: str) -> None:
+    said = {f"/room/geo/{name}/{name}": Judgement(directive=word) for name, word in words.items()}
+    write_review(asset, said)
+
+
+def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
+    capture = make_capture(tmp_path / "scan", subdivisions=2, poses=poses_down_and_up(6, 4))
+    folder = tmp_path / "room"
+
+    def reran() -> list[str]:
+        return [k for k, v in usdbrdf.convert(capture.folder, folder, OPTIONS).items() if v.reran]
+
+    assert reran() == ["ingest", "texture", "shade", "fit"]
+    asset = Asset.made(folder)
+    scan = asset.layer("scan").read_bytes()
+    asked = {"floor": "metal", "ceiling": "refit", "walls": "glass", "box": "ignore"}
+    _say(asset, **asked)
+    assert reran() == ["fit"]
+    stage = open_measured(asset)
+    fits = {name: read_fit(stage, f"/room/geo/{name}/{name}") for name in capture.names}
+    words = {name: fit.directive for name, fit in fits.items()}
+    assert words == {
+        "floor": "metal",
+        "ceiling": "refit",
+        "walls": "glass",
+        "lamp": "",
+        "box": "ignore",
+    }
+    for name in ("box", "walls"):
+        assert (fits[name].num_pixels, fits[name].status) == (0, "prior")
+    assert [name for name, fit in fits.items() if fit.is_glass] == ["walls"]
+    surface = UsdShade.Shader.Get(stage, "/room/geo/walls/mtl/walls/PreviewSurface")
+    shown = {n: surface.GetInput(n).Get() for n in ("opacity", "roughness", "ior", "diffuseColor")}
+    assert shown == {"opacity": 0, "roughness": 0, "ior": 1.5, "diffuseColor": (0, 0, 0)}
+    rendered = render_scene_from_stage(stage, time_code(stage, None), lambda _: None)
+    assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls/walls"]
+    assert not has_errors(validate(asset.root_layer))
+    # The capture says of the lamp that it is none: only what it concerns is made again.
+    with edited(capture.folder / "objects.json") as document:
+        (lamp,) = [row for row in document["objects"] if row["name"] == "lamp"]
+        lamp["directive"] = "not-lamp"
+    assert reran() == ["ingest", "shade", "fit"]
+    assert asset.layer("scan").read_bytes() == scan
+    shading = read_shading(open_measured(asset), "/room/geo/lamp/lamp")
+    assert (shading.emitter, shading.directive) == (False, "not-lamp")
+    # What a person says afterwards counts before it.
+    _say(asset, lamp="lamp", box="lamp")
+    assert reran() == ["shade", "fit"]
+    stage = open_measured(asset)
+    found = {name: read_shading(stage, f"/room/geo/{name}/{name}") for name in ("lamp", "box")}
+    assert all(one.emitter and one.directive == "lamp" for one in found.values())
+
+
+def test_a_word_that_is_none_stops_the_step_that_reads_it(built):
+    _say(built.asset, Stuhl_No_1="gold")
+    with pytest.raises(InputRefused, match=r"'gold' is none of .*\[review.layer\]$"):
+        directives_of(built.asset, open_measured(built.asset), OF_FIT)

@@ -1,0 +1,80 @@
+"""A copy of an asset for others: complete in itself, all looks and lightings, its textures as
+renderers read them, in the colour space that is asked for.
+
+Textures get their smaller copies here and not when they are measured: the maps of the work folder,
+which later steps read, stay as they are, and converting takes no longer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from pxr import Sdf
+
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.readers.compose import open_edited
+from usdbrdf.delivery.collection import Collection, collected, refuse_incomplete, write_collection
+from usdbrdf.delivery.colours import ColourTextures, convert_layer, converted_texture
+from usdbrdf.files.colour import ACESCG, WORKING_SPACE
+from usdbrdf.files.images import needs_float, write_exr
+from usdbrdf.files.published_images import copy_without_metadata, write_texture
+
+SPACES = {"rec709": WORKING_SPACE, "acescg": ACESCG}
+# Attributes that name textures which renderers look up on surfaces, from near and from afar.
+_TEXTURES = re.compile(r"(inputs|usdBrdf:aov):(?!texture:).+")
+
+
+def write_copy(
+    asset: Asset,
+    folder: Path,
+    *,
+    root: str,
+    encoding: str,
+    space: str,
+    photographs: bool,
+    describe: Callable[[Sdf.Layer], None],
+    accept: Callable[[Path], object] = lambda file: None,
+) -> Collection:
+    """Write the copy into an empty folder; returns what the asset is made of, and where it went.
+
+    root         name of the root layer
+    encoding     "usda" or "usdc" for the root layer where its name does not say it, else ""
+    space        linear space of all colours but those that were measured
+    photographs  whether they are copied too, without EXIF, GPS and the like
+    describe     changes the root layer after all else
+    accept       raises for files that may not be copied
+
+    Raises InputRefused as ``collected`` and ``ColourTextures.look_at`` do.
+    """
+    textures = ColourTextures()
+    for one in asset.in_each_lighting:
+        stage = open_edited(one)
+        if space != WORKING_SPACE:
+            textures.look_at(stage, space)
+    found = collected(asset, root, photographs=photographs)
+    for file in found.named_by:
+        accept(file)
+
+    def edit(layer: Sdf.Layer, is_root: bool) -> bool:
+        changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
+        if layer.customLayerData.get("usdbrdf", {}).get("role") == "edits":
+            layer.documentation = "What the artist's layer said when this copy was made."
+            changed = True
+        if is_root:
+            describe(layer)
+        return changed
+
+    def write(file: Path, place: Path) -> None:
+        named = found.named_by[file]
+        converted = converted_texture(file, space) if file in textures.files else None
+        if file.suffix.lower() == ".exr" and any(_TEXTURES.fullmatch(name) for name in named):
+            write_texture(place, file, converted=converted, encoding=space)
+        elif converted is not None:
+            write_exr(place, converted, half=not needs_float(converted), encoding=space)
+        else:
+            copy_without_metadata(file, place)
+
+    write_collection(found, folder, edit=edit, write=write, encodings={root: encoding})
+    refuse_incomplete(folder / root)
+    return found

@@ -1,0 +1,136 @@
+"""Pictures as they are handed over: textures tiled and with their smaller copies, photographs
+without what cameras and programs wrote beside their pixels. Beside ``images`` the only importer of
+OpenImageIO.
+
+Pixels stay what they are, to the bit: each file is read back and compared.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.files.colour import chromaticities_of
+from usdbrdf.files.images import jpeg_without_metadata, open_image, pixels_of, write_image
+from usdbrdf.model.arrays import Float
+
+_TILE = 64
+_PINNED_DATE = "2000:01:01 00:00:00"
+# What a header says of how pixels are stored and what they mean; all else is about who took them,
+# where and with what.
+_ABOUT_PIXELS = re.compile(
+    r"compression|colorInteropID|chromaticities|adoptedNeutral|whiteLuminance|ICCProfile"
+    r"|oiio:(ColorSpace|Gamma|BitsPerSample|UnassociatedAlpha|RowsPerChunk|subimages|miplevels"
+    r"|AverageColor|ConstantColor|SHA-1)"
+    r"|openexr:\w+|PixelAspectRatio|screenWindow\w+|fovcot|textureformat|wrapmodes"
+    r"|planarconfig|tiff:(PhotometricInterpretation|PlanarConfiguration|Compression|RowsPerStrip)"
+    r"|(X|Y)Resolution|ResolutionUnit"
+)
+_HDR_LINES = re.compile(rb"FORMAT=|EXPOSURE=|COLORCORR=|PRIMARIES=|PIXASPECT=")
+_JPEG, _HDR = frozenset({".jpg", ".jpeg"}), frozenset({".hdr", ".pic"})
+CLEANED = _JPEG | _HDR | {".exr", ".tif", ".tiff", ".png"}
+
+
+def write_texture(
+    target: Path, source: Path, *, converted: Float | None = None, encoding: str = ""
+) -> None:
+    """A tiled EXR with all its smaller copies (mip maps, each the mean of what it covers), as
+    renderers read it in parts, of an EXR.
+
+    converted  (H, W, C) float32 to be stored in the place of the source's own pixels
+    encoding   the colour space that those are in
+    """
+    reader = open_image(source)
+    spec = reader.spec()
+    pixels = pixels_of(source, reader) if converted is None else converted
+    image = oiio.ImageBuf(_plain_spec(spec, "" if converted is None else encoding))
+    image.set_pixels(image.roi, np.ascontiguousarray(pixels))
+    wanted = oiio.ImageSpec()
+    wanted.tile_width = wanted.tile_height = _TILE
+    for name, value in (
+        ("maketx:filtername", "box"),
+        ("wrapmodes", "clamp,clamp"),
+        ("compression", "zip"),
+        ("DateTime", _PINNED_DATE),
+    ):
+        wanted.attribute(name, value)
+    with temporary_beside(target) as staged:
+        kind = oiio.MakeTxTexture
+        if not oiio.ImageBufAlgo.make_texture(kind, image, str(staged), wanted):
+            raise EnvironmentFailure(
+                f"{target}: cannot be written ({oiio.geterror()}). Free disk space or correct the "
+                "permission, then run the same command again. [image.write]"
+            )
+        stored = pixels.astype(np.float16) if str(spec.format) == "half" else pixels
+        _check_same(target, staged, stored.astype(np.float32))
+        publish(staged, target)
+
+
+def copy_without_metadata(source: Path, target: Path) -> None:
+    """A picture without EXIF, GPS, XMP, comments and names of people and devices; a file that has
+    none of these is copied as it is. Formats other than EXR, HDR, TIFF, PNG and JPEG are copied
+    too."""
+    kind = source.suffix.lower()
+    with temporary_beside(target) as staged:
+        if kind in _JPEG:
+            pixels = pixels_of(source, open_image(source))  # refuses what is cut short
+            staged.write_bytes(jpeg_without_metadata(source.read_bytes()))
+            _check_same(target, staged, pixels)
+        elif kind in _HDR:
+            staged.write_bytes(_hdr_without_metadata(source.read_bytes()))
+        elif kind in CLEANED and _tells_more(open_image(source).spec()):
+            reader = open_image(source)
+            spec = _plain_spec(reader.spec(), "")
+            pixels = pixels_of(source, reader)
+            write_image(target, staged, spec, pixels)
+            _check_same(target, staged, pixels)
+        else:
+            shutil.copyfile(source, staged)
+        publish(staged, target)
+
+
+def _tells_more(spec: Any) -> bool:
+    names = {item.name: item.value for item in spec.extra_attribs}
+    dated = names.pop("DateTime", _PINNED_DATE) != _PINNED_DATE
+    return dated or not all(_ABOUT_PIXELS.fullmatch(name) for name in names)
+
+
+def _plain_spec(spec: Any, encoding: str) -> Any:
+    """Size, windows, channels, numbers and colour space of an image, and nothing else."""
+    plain = oiio.ImageSpec(spec)
+    plain.channelformats = ()
+    for item in spec.extra_attribs:
+        if not _ABOUT_PIXELS.fullmatch(item.name):
+            plain.erase_attribute(item.name)
+    plain.attribute("DateTime", _PINNED_DATE)
+    plain.tile_width = plain.tile_height = plain.tile_depth = 0
+    if encoding:
+        plain.erase_attribute("colorInteropID")  # which comes before the name
+        plain.set_colorspace(encoding)
+        plain.attribute("chromaticities", "float[8]", chromaticities_of(encoding))
+    if str(spec.getattribute("compression") or "").startswith(("dwa", "b44", "pxr24")):
+        plain.attribute("compression", "zip")  # what loses nothing more
+    return plain
+
+
+def _hdr_without_metadata(content: bytes) -> bytes:
+    head, blank, rest = content.partition(b"\n\n")
+    first, *lines = head.split(b"\n")
+    return b"\n".join([first, *(line for line in lines if _HDR_LINES.match(line))]) + blank + rest
+
+
+def _check_same(target: Path, staged: Path, pixels: Float) -> None:
+    stored = pixels_of(staged, open_image(staged))
+    known = np.isfinite(pixels)  # smaller copies cannot be made around holes: they are filled
+    if stored.shape != pixels.shape or not np.array_equal(stored[known], pixels[known]):
+        raise EnvironmentFailure(
+            f"{target}: the file does not read back as it was written. Check the disk. "
+            "[image.write]"
+        )
