@@ -232,11 +232,11 @@ def _page_of_the_night(asset, by_day, by_night):
 
 def test_target_frames_are_counted_in_the_lighting_that_is_shown(asset, monkeypatch):
     maps = AssetMaps(open_measured(asset.in_lighting("night")))
-    fit = read_fit(maps.stage, "/room/geo/floor")
+    fit = read_fit(maps.stage, "/room/geo/floor/floor")
     for stored, shown in ((15, 3), (3, -1), (-1, -1)):
         changed = replace(fit, target_frame=stored)
         monkeypatch.setattr(report, "read_fit", lambda *_, changed=changed: changed)
-        assert report._in_own_frames(maps, "/room/geo/floor").target_frame == shown
+        assert report._in_own_frames(maps, "/room/geo/floor/floor").target_frame == shown
 
 
 def test_lightings_of_one_asset_are_compared(asset, tmp_path):
@@ -251,7 +251,7 @@ def test_lightings_of_one_asset_are_compared(asset, tmp_path):
 def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
     folder = tmp_path / "room"
     shutil.copytree(asset.folder, folder)
-    copy, name = Asset.made(folder), "/room/geo/floor.usdBrdf:shading:raysPerTexel"
+    copy, name = Asset.made(folder), "/room/geo/floor/floor.usdBrdf:shading:raysPerTexel"
     edited = copy.in_lighting("night").layer("shading")
     layer = Sdf.Layer.OpenAsAnonymous(str(edited))
     layer.GetAttributeAtPath(name).default = 7777.0

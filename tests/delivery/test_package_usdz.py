@@ -142,7 +142,7 @@ def test_data_is_not_taken_for_colour(room, tmp_path):
     write_exr(room.asset.folder / "rough.exr", values)
     edit(
         room,
-        """over "room" { over "mtl" { over "Stuhl_No_1" {
+        """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" { over "Stuhl_No_1" {
         over "PreviewSurface" {
             float inputs:roughness.connect = </room/geo/Stuhl_No_1/mtl/Stuhl_No_1/Rough.outputs:r>
         }
@@ -153,7 +153,7 @@ def test_data_is_not_taken_for_colour(room, tmp_path):
             float2 inputs:st.connect = </room/geo/Stuhl_No_1/mtl/Stuhl_No_1/StReader.outputs:result>
             float outputs:r
         }
-    } } }""",
+    } } } } }""",
     )
     stage = extracted(packed(room, tmp_path, textures="png"), tmp_path / "x")
     (use,) = (

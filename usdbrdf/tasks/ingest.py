@@ -89,14 +89,7 @@ def ingest(
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        place = run.output
-        into = ScanFiles(
-            scan=place(f"layers/{asset.layer('scan').name}"),
-            interface=place(f"layers/{asset.interface('scan').name}"),
-            photographs=place(f"layers/{asset.photographs_layer.name}"),
-            place=place,
-        )
-        write_scan_layer(into, scan, draft)
+        write_scan_layer(ScanFiles.of(asset, run.output), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         write_layers_to_come(run, asset, lightings, header)

@@ -146,6 +146,13 @@ class ScanFiles:
     photographs: Path
     place: Callable[[str], Path]
 
+    @staticmethod
+    def of(asset: Asset, place: Callable[[str], Path]) -> ScanFiles:
+        """All at ``place`` of their paths in the asset."""
+        layers = asset.layer("scan"), asset.interface("scan"), asset.photographs_layer
+        scan, interface, photographs = (place(f"layers/{layer.name}") for layer in layers)
+        return ScanFiles(scan=scan, interface=interface, photographs=photographs, place=place)
+
 
 def write_scan_layer(files: ScanFiles, scan: Scan, draft: Draft) -> None:
     """Write the capture as it came; objects without a face are left out."""
