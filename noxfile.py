@@ -102,6 +102,13 @@ def supply(session: nox.Session) -> None:
 
 
 @nox.session
+def docs(session: nox.Session) -> None:
+    """The documentation as a site, in out/site."""
+    install(session, "docs")
+    session.run("mkdocs", "build", "--strict", "-d", "out/site")
+
+
+@nox.session
 def wheel(session: nox.Session) -> None:
     """Build the wheel into dist/."""
     session.run("python", "-m", "pip", "wheel", "-q", "--no-deps", "-w", "dist", ".")

@@ -104,7 +104,7 @@ def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str,
     for i in range(len(frames)):
         pixels = read_frame(frames, i)
         surfaces = first_surfaces(rays, scene.face_object, frames.camera(i))
-        picture = Picture(np.nan_to_num(pixels.radiance), pixels.valid, pixels.clipped)
+        picture = Picture(np.nan_to_num(pixels.radiance), pixels.valid, pixels.clipped, pixels.dark)
         kind, radiance = samples_from_frame(
             texels, texels.object_index(), surfaces, picture, frames.camera(i)
         )

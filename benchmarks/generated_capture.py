@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.files.images import write_exr
 from usdbrdf.kernel import parallel_kernel
@@ -207,13 +206,15 @@ def photograph(
     # As a sensor's noise: what a coder cannot compress.
     image = rng.standard_normal((len(hits.face), 3), np.float32)
     lamp = scene.names.index("lamp")
-    shade(scene.points, scene.triangles, scene.owner, hits.face, hits.distance, directions,
-          camera.eye.copy(), LIGHT, lamp, image)  # fmt: skip
+    shade(len(hits.face), scene.points, scene.triangles, scene.owner, hits.face, hits.distance,
+          directions, camera.eye.copy(), LIGHT, lamp, image)  # fmt: skip
     return image.reshape(camera.height, camera.width, 3)
 
 
 @parallel_kernel
 def shade(
+    first: int,
+    last: int,
     points: np.ndarray,
     triangles: np.ndarray,
     owner: np.ndarray,
@@ -225,7 +226,7 @@ def shade(
     lamp: int,
     image: np.ndarray,
 ) -> None:
-    for r in prange(len(face)):
+    for r in range(first, last):
         f = face[r]
         if f < 0:
             image[r] = 0

@@ -165,7 +165,7 @@ def by_parts(
             texels,
             owner,
             surfaces,
-            Picture(pixels.radiance, pixels.valid, pixels.clipped),
+            Picture(pixels.radiance, pixels.valid, pixels.clipped, pixels.dark),
             camera,
         )
         taken = which[kind == SAMPLE], radiance[kind == SAMPLE]

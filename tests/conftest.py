@@ -73,6 +73,7 @@ SWEEPS = (
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
+    "job/test_first_run.py::test_what_a_run_needs_was_compiled",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",
     "material/test_view_model.py::test_the_samples_tell_how_large_their_errors_are",
@@ -80,6 +81,7 @@ NIGHTLY = (
     "physics/test_recovery.py::"
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
+    "test_docs.py::test_the_commands_of_tutorials_run",
 )
 
 

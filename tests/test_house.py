@@ -53,6 +53,8 @@ ARROWS: dict[str, set[str]] = {
     "asset": {"capture"},
     "tasks": SUBJECTS,
     "pipeline": {"tasks"},
+    # Run by name, in a child.
+    "warm_up": {"pipeline"},
     "delivery": {"asset"},
     "evaluation": {"asset"},
     # Shows what others measure and pack; the evidence is the method's own residual.
@@ -60,7 +62,9 @@ ARROWS: dict[str, set[str]] = {
     "relighting": {"asset"},
     "validation": {"asset"},
     "cli": {"commands", "command_parser"},
-    "commands": {"command_parser"},
+    "run_table": set(),
+    "doctor": {"asset", "relighting"},
+    "commands": {"command_parser", "doctor", "run_table"},
     "command_parser": {"pipeline", *READERS},
     "__main__": {"cli"},
     # The public face, which nothing inside may import.

@@ -31,6 +31,15 @@ found = probe(np.arange(3))
 kept = "compiled" if probe.stats.cache_misses else "loaded"
 print(kept, probe.stats.cache_path, found.sum())
 """
+_TOLD = """
+import numpy as np
+from usdbrdf.kernel import when_compiling
+from usdbrdf.transport.probe import probe
+told = []
+with when_compiling(lambda: told.append(1)):
+    probe(np.arange(3))
+print(len(told) > 0)
+"""
 _TASK = """
 import pathlib
 from usdbrdf.job.stamp import stamp_of, stamp_path, why_rerun, write_stamp
@@ -117,6 +126,11 @@ def test_an_edit_of_any_source_runs_the_tasks_again(copy, source):
     assert _run(copy, _TASK) == ["done"]
 
 
+def test_what_has_to_be_compiled_is_told(copy):
+    assert _run(copy, _TOLD) == ["True"]
+    assert _run(copy, _TOLD) == ["False"]
+
+
 def test_damaged_kernels_are_compiled_again(copy):
     first = _run(copy)
     for damage in ("cut", "flip", "empty", "garbage", "gone"):
@@ -141,6 +155,8 @@ def test_processes_that_compile_at_once_agree(copy):
     together = [_start(copy, _RUN) for _ in range(4)]
     found = [_output(process) for process in together]
     assert {words[2] for words, _ in found} == {_run(copy)[2]}
+    # Three waited for the one that had begun.
+    assert sorted(words[0] for words, _ in found) == ["compiled", *["loaded"] * 3]
     assert [err for _, err in found] == [""] * 4
     kernels = copy / "home/.cache/usdbrdf/kernels"
     assert {file.suffix for file in kernels.rglob("*") if file.is_file()} == {".nbc"}

@@ -58,11 +58,7 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             from cyclopts import App, CycloptsError
         app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
 
-        def bound() -> None: ...
-
-        signed: Any = bound
-        signed.__signature__ = inspect.Signature([_argument(item) for item in said])
-        app.default(signed)
+        app.default(_signed(said))
         try:
             given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
         except CycloptsError as error:
@@ -70,6 +66,28 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
     command: Command = _made(commands[name], given)
     return command
+
+
+def completion(shell: str, commands: Commands) -> str:
+    """A script that lets a shell ("bash", "zsh", "fish") complete command lines."""
+    from cyclopts import App
+
+    app = App(name="usdbrdf", help_flags=("--help", "-h"), version_flags=("--version",))
+    for name, owner in commands.items():
+        signed = _signed(_said(owner))
+        signed.__doc__ = owner.__doc__
+        app.command(signed, name=name)
+    return str(app.generate_completion(shell=shell))  # type: ignore[arg-type]
+
+
+def _signed(said: Sequence[_Said]) -> Any:
+    """A function that does nothing, with the signature that these options make."""
+
+    def bound() -> None: ...
+
+    signed: Any = bound
+    signed.__signature__ = inspect.Signature([_argument(item) for item in said])
+    return signed
 
 
 class _Said(NamedTuple):

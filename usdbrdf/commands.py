@@ -10,14 +10,16 @@ import os
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from usdbrdf import options
-from usdbrdf.command_parser import Command
+from usdbrdf.command_parser import Command, completion
+from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show, tell
 from usdbrdf.option import REQUIRED, option
 from usdbrdf.options import EditOptions, TalkOptions
+from usdbrdf.run_table import table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +66,8 @@ class _Run(_Locking, _Talking):
             name: {"reran": result.reran, "reason": result.reason, **result.summary}
             for name, result in results.items()
         }
-        lines = [f"{root}: {'written' if any(r.reran for r in results.values()) else 'up to date'}"]
+        done = "written" if any(r.reran for r in results.values()) else "up to date"
+        lines = [*table(steps, root), f"{root}: {done}"]
         if steps.get("ingest", {}).get("radiometric") is False:
             doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
             lines = [f"warning: {doubt}", *lines]
@@ -423,6 +426,35 @@ class Adapters(Command):
         return 0
 
 
+class Doctor(Command):
+    """Say what of the machine and the extras is there, and whether what every run needs works."""
+
+    json: bool = option("--json", False)
+    "print the findings as JSON to stdout, nothing else"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf import doctor
+        findings = doctor.examine()
+        if self.json:
+            told = {"works": not doctor.is_broken(findings), "findings": [*map(asdict, findings)]}
+            show(json.dumps(told, indent=2), whole=True)
+        else:
+            show("\n".join(map(printable, doctor.lines(findings))))
+        return EnvironmentFailure.exit_code if doctor.is_broken(findings) else 0
+
+
+class Completion(Command):
+    """Print what lets a shell complete command lines."""
+
+    shell: Literal["bash", "zsh", "fish"] = option("SHELL", REQUIRED)
+    "bash, zsh or fish; for bash: source <(usdbrdf completion bash)"
+
+    def run(self) -> int:
+        show(completion(self.shell, COMMANDS))
+        return 0
+
+
 class PluginPath(Command):
     """Print what to put into PXR_PLUGINPATH_NAME."""
 
@@ -452,6 +484,8 @@ _OTHERS = (
     Validate,
     Rules,
     Adapters,
+    Doctor,
+    Completion,
     PluginPath,
 )
 COMMANDS = {

@@ -11,6 +11,7 @@ kept."""
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import inspect
@@ -20,11 +21,12 @@ import pickle
 import shutil
 import sys
 import tempfile
-import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
 
 import llvmlite
 import numba
@@ -37,6 +39,8 @@ from usdbrdf.identity import PACKAGE, kernels_identity
 # So many states of a module's code keep their kernels: several checkouts, some edits of each.
 _STATES_KEPT = 16
 _SEAL = hashlib.sha256().digest_size
+# Seconds for which a kernel that another process compiles is waited for.
+_LONGEST_WAIT = 60.0
 
 
 class KernelCache(Cache):  # type: ignore[misc]
@@ -48,6 +52,7 @@ class KernelCache(Cache):  # type: ignore[misc]
         self._source = Path(inspect.getfile(function)).resolve()
         # Read now, while the module is imported: an edit made while the program runs is not in it.
         self._identity = kernels_identity(self._source)
+        self._turn: BinaryIO | None = None
         self.enable()
 
     @property
@@ -63,15 +68,17 @@ class KernelCache(Cache):  # type: ignore[misc]
         target_context.refresh()
         key = self._index_key(sig, target_context.codegen())
         file = self._file(key) if self._enabled else None
-        try:
-            sealed = file.read_bytes() if file else b""
-        except OSError:
+        found = _unsealed(file) if file else None
+        if file and found is None:
+            self._end_turn()
+            if _told is not None:
+                _told()
+            self._turn = _turn_to_compile(file)
+            found = _unsealed(file)  # another process may have compiled it meanwhile
+        if found is None or found[0] != key:
             return None
-        seal, content = sealed[:_SEAL], sealed[_SEAL:]
-        if hashlib.sha256(content).digest() != seal:
-            return None
-        stored, reduced = pickle.loads(content)
-        return CompileResult._rebuild(target_context, *reduced) if stored == key else None
+        self._end_turn()
+        return CompileResult._rebuild(target_context, *found[1])
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a specialisation for other processes, if there is a place."""
@@ -91,11 +98,74 @@ class KernelCache(Cache):  # type: ignore[misc]
             _say_once(f"compiled kernels are not kept ({error}), each run compiles them anew")
             with contextlib.suppress(OSError):
                 temporary.unlink()
+        finally:
+            self._end_turn()
 
     def _file(self, key: tuple[Any, ...]) -> Path | None:
         folder = _folder(self._source, self._identity)
         digest = hashlib.sha256(str(key).encode()).hexdigest()[:16]
         return folder / f"{self._py_func.__qualname__}-{digest}.nbc" if folder else None
+
+    def _end_turn(self) -> None:
+        if self._turn is not None:
+            with contextlib.suppress(OSError):
+                Path(self._turn.name).unlink()
+            self._turn.close()
+            self._turn = None
+
+
+def _unsealed(file: Path) -> Any:
+    """A file's key and reduced code, or None where it is not there or not whole."""
+    try:
+        sealed = file.read_bytes()
+    except OSError:
+        return None
+    seal, content = sealed[:_SEAL], sealed[_SEAL:]
+    return pickle.loads(content) if hashlib.sha256(content).digest() == seal else None
+
+
+def _turn_to_compile(file: Path) -> BinaryIO | None:
+    """A lock on what a file is to hold: two processes that start together share the work. Whoever
+    waits for too long, or has no locks, compiles it too."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock = file.with_suffix(".lock").open("wb")
+    except OSError:
+        return None
+    end = time.monotonic() + _LONGEST_WAIT
+    while time.monotonic() < end and not file.exists():
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return lock
+        except BlockingIOError:
+            time.sleep(0.02)
+        except OSError:
+            break
+    with contextlib.suppress(OSError):
+        Path(lock.name).unlink()
+    lock.close()
+    return None
+
+
+_told: Callable[[], object] | None = None
+
+
+@contextlib.contextmanager
+def when_compiling(told: Callable[[], object]) -> Iterator[None]:
+    """In here ``told`` is called whenever a kernel has to be compiled that could have been kept."""
+    global _told
+    before, _told = _told, told
+    try:
+        yield
+    finally:
+        _told = before
+
+
+def mark_of_compiled(identity: str) -> Path | None:
+    """The file that is there once all that the pipeline needs was compiled from one state of the
+    sources; None where nothing is kept."""
+    folder = None if numba.config.DISABLE_JIT else _folder(PACKAGE / "warm_up.py", identity)
+    return folder / "done" if folder else None
 
 
 @cache
@@ -160,10 +230,10 @@ def _say_once(sentence: str) -> None:
     logging.getLogger("usdbrdf").warning("usdbrdf: %s", sentence)
 
 
+P = ParamSpec("P")
 F = TypeVar("F", bound=Callable[..., Any])
-# One kernel at a time runs on all cores: numba's own pool of threads, which is all that some
-# machines have, ends the process when two threads of Python call it.
-_turn = threading.Lock()
+# Each thread gets so many parts, in turn: some take longer than others.
+_PARTS_PER_THREAD = 4
 
 
 def kernel(function: F) -> F:
@@ -171,18 +241,39 @@ def kernel(function: F) -> F:
     return _compiled(function)
 
 
-def parallel_kernel(function: F) -> F:
-    """Compile with ``prange`` over all cores. Every iteration writes to places of its own, so that
-    the result does not depend on the number of threads."""
-    compiled = _compiled(function, parallel=True)
+def parallel_kernel(
+    function: Callable[Concatenate[int, int, P], None],
+) -> Callable[Concatenate[int, P], None]:
+    """Compile as ``loop`` does what works on the rows ``first`` to ``last`` - 1, its first two
+    arguments; it is called with the number of all rows, of which threads take parts. Every row
+    writes to places of its own, so that the result does not depend on the number of threads.
+
+    numba's own ``parallel`` compiles several times as long, and its pool of threads, where it is
+    the only one on a machine, ends the process when two threads of Python call it."""
+    compiled: Any = loop(function)
 
     @functools.wraps(function)
-    def in_turn(*arguments: Any, **named: Any) -> Any:
-        with _turn:
-            return compiled(*arguments, **named)
+    def in_parts(count: int, /, *arguments: P.args, **named: P.kwargs) -> None:
+        parts = min(count, _PARTS_PER_THREAD * num_threads())
+        ends = [part * count // max(parts, 1) for part in range(parts + 1)]
 
-    result: Any = in_turn
-    return result  # type: ignore[no-any-return]
+        def work(part: int) -> None:
+            compiled(ends[part], ends[part + 1], *arguments, **named)
+
+        for _ in map(work, range(parts)) if parts < 2 else _pool().map(work, range(parts)):
+            pass
+
+    return in_parts
+
+
+def num_threads() -> int:
+    """Of those that kernels run in: the processor's cores, or ``NUMBA_NUM_THREADS``."""
+    return int(numba.config.NUMBA_NUM_THREADS)
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(num_threads(), thread_name_prefix="kernels")
 
 
 def loop(function: F) -> F:
@@ -192,7 +283,8 @@ def loop(function: F) -> F:
 
 
 def _compiled(function: F, **options: Any) -> F:
-    compiled: Any = numba.njit(**options)(function)
+    # No kernel is called through a pointer from C, and each such entry is code to compile.
+    compiled: Any = numba.njit(no_cfunc_wrapper=True, **options)(function)
     if not numba.config.DISABLE_JIT:
         compiled._cache = KernelCache(function)
     result: F = compiled

@@ -433,8 +433,8 @@ class PublishOptions(Options):
     version: str | None = option("--version vNNN", None, unset="the one after the latest")
     "its name"
     uri: str | None = option("--uri TEMPLATE", None, unset="./NAME.usd")
-    """identifier in assetInfo, for a studio's resolver: a URI with {name} and {version}, such as
-    'ayon+entity://show/assets?product={name}&version={version}'"""
+    """identifier in assetInfo, for a studio's resolver: a URI with {{name}} and {{version}}, such
+    as 'ayon+entity://show/assets?product={{name}}&version={{version}}'"""
     photographs: bool = option("--no-photographs", True)
     "leave the photographs out; else they are copied without EXIF, GPS and the like"
     texture_space: TextureSpace = _texture_space()

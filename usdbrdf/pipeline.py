@@ -29,6 +29,7 @@ from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.errors import OwnershipConflict
+from usdbrdf.job.first_run import compiling_beside
 from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
@@ -73,9 +74,8 @@ def convert(
     paths = [capture] if isinstance(capture, (str, Path)) else [*capture]
     if len(paths) > 1:
         refuse_one_frame(chosen.fit)
-    with working_on(
-        output, hand_edits=hand_edits, wait_s=wait_s, without_lock=without_lock
-    ) as asset:
+    working = working_on(output, hand_edits=hand_edits, wait_s=wait_s, without_lock=without_lock)
+    with working as asset, compiling_beside():
         return {
             "ingest": ingest([*map(Path, paths)], asset, chosen.ingest, adapter, plugins=plugins),
             "texture": texture(asset, chosen.texture),

@@ -44,6 +44,11 @@ def hang(arrays, parameters):
         os.rename(parameters["note"] + ".part", parameters["note"])
     time.sleep(600)
 
+def note(arrays, parameters):
+    with open(parameters["note"], "w") as file:
+        file.write(str(os.getpid()))
+    time.sleep(600)
+
 def leave(arrays, parameters):
     print("no memory for a thread", file=sys.stderr, flush=True)
     os._exit(1)
@@ -134,6 +139,25 @@ def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):
         child("hang", timeout_s=0.2, note=str(note))
     assert late.value.exit_code == 4
     assert all(_ended(int(pid)) for pid in note.read_text().split())
+
+
+def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
+    note = tmp_path / "note"
+    with module.child("toy_children:note", {}, {"note": str(note)}, 600, "beside"):
+        deadline = time.monotonic() + 30
+        while not (note.exists() and note.read_text()):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        number = int(note.read_text())
+        os.kill(number, 0)
+    with pytest.raises(ProcessLookupError):
+        os.kill(number, 0)
+
+
+def test_what_a_child_beside_cannot_do_is_nobodys_concern(child, capfd):
+    with module.child("toy_children:broken", {}, {}, 600, "beside"):
+        time.sleep(0.1)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_child_dies_with_its_parent_and_its_folder_is_swept(tmp_path, monkeypatch):

@@ -39,6 +39,16 @@ def test_bar_on_a_terminal(capsys, monkeypatch):
     assert captured.out == ""
 
 
+def test_the_lines_say_how_much_longer_it_takes(capsys, monkeypatch):
+    monkeypatch.setattr(module, "_SECONDS_BETWEEN_LINES", 0.0)
+    clock = iter([0.0, 20.0, 40.0, 60.0, 600.0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    assert len(list(progress(range(4), total=4, label="fit", unit="objects"))) == 4
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1:3] == ["fit: 1 of 4 objects", "fit: 2 of 4 objects, about 60 s left"]
+    assert lines[3] == "fit: 3 of 4 objects, about 3 min left"
+
+
 @pytest.mark.fault("S4")
 def test_names_cannot_command_the_terminal(capsys):
     say("chair \x1b[2J\u202e椅子")

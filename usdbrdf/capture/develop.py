@@ -18,7 +18,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
@@ -204,7 +203,7 @@ def resampled(source: Float, view: View, camera: Camera, saturation: float) -> F
     turn = float(source.shape[1]) if sphere else 0.0
     inset = _LOBES if sphere else 0
     limit = np.float32(CLIPPED_SHARE * saturation)
-    _resample(padded, places, inset, turn, limit, np.float32(saturation), image)
+    _resample(len(image), padded, places, inset, turn, limit, np.float32(saturation), image)
     return image
 
 
@@ -241,12 +240,12 @@ def _places(
 
 @parallel_kernel
 def _resample(
-    source: Float, places: Float, inset: int, turn: float, limit: np.float32,
-    saturation: np.float32, image: Float,
+    first: int, last: int, source: Float, places: Float, inset: int, turn: float,
+    limit: np.float32, saturation: np.float32, image: Float,
 ) -> None:  # fmt: skip
     """inset: pixels that ``source`` has been padded by; turn: pixels of a whole turn, or 0."""
-    height, width = places.shape[:2]
-    for j in prange(height):
+    width = places.shape[1]
+    for j in range(first, last):
         value, total, clipped = np.empty(3), np.empty(3), np.empty(3, np.bool_)
         weights = np.empty((2, 2 * _LOBES))
         for i in range(width):

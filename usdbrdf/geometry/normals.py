@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Double, Float, Int, Long
@@ -38,16 +37,19 @@ def corner_normals(points: Float, triangles: Int, crease_angle_deg: float) -> Fl
     # The small margin keeps a crease of exactly the limit smooth whatever the rounding.
     min_cosine = math.cos(math.radians(crease_angle_deg)) - 1e-6
     normals = np.zeros((3 * len(triangles), 3), np.float32)
-    _sum_over_neighbours(corners, starts, faces, angles.reshape(-1), min_cosine, normals)
+    _sum_over_neighbours(
+        len(starts) - 1, corners, starts, faces, angles.reshape(-1), min_cosine, normals
+    )
     return normals.reshape(-1, 3, 3)
 
 
 @parallel_kernel
 def _sum_over_neighbours(
-    corners: Long, starts: Long, faces: Double, angles: Double, min_cosine: float, normals: Float
-) -> None:
+    start: int, stop: int, corners: Long, starts: Long, faces: Double, angles: Double,
+    min_cosine: float, normals: Float,
+) -> None:  # fmt: skip
     """Each corner is written by one vertex alone and summed in file order: threads do not show."""
-    for vertex in prange(len(starts) - 1):
+    for vertex in range(start, stop):
         first, last = starts[vertex], starts[vertex + 1]
         alone = last - first > _MAX_CORNERS
         for i in range(first, last):

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
@@ -71,15 +70,15 @@ def visible_faces(rays: RayScene, camera: Camera) -> tuple[Int, Float]:
     boxes = np.flatnonzero(_boxes_in_view(rays.boxes, pinhole))
     faces = np.full((len(boxes), BOX_FACES), -1, np.int32)
     rows = np.zeros((len(boxes), BOX_FACES, 2), np.int32)
-    _faces_in_view(mesh, boxes, pinhole, faces, rows)
+    _faces_in_view(len(boxes), mesh, boxes, pinhole, faces, rows)
     kept = faces >= 0
     size = camera.height, camera.width
     picture = _Picture(
         np.full(size, -1, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32)
     )
-    _draw(mesh, faces[kept], rows[kept], pinhole, picture)
+    _draw(_BANDS, mesh, faces[kept], rows[kept], pinhole, picture)
     point = np.empty((*size, 3), np.float32)
-    _points(pinhole, picture.nearness, point)
+    _points(len(point), pinhole, picture.nearness, point)
     _trace_doubtful(rays, camera, picture, point)
     return picture.face, point
 
@@ -156,9 +155,11 @@ def _extent(a: Vector, b: Vector, c: Vector, camera: _Pinhole) -> tuple[int, int
 
 
 @parallel_kernel
-def _faces_in_view(mesh: _Mesh, boxes: Long, camera: _Pinhole, faces: Int, rows: Int) -> None:
+def _faces_in_view(
+    start: int, stop: int, mesh: _Mesh, boxes: Long, camera: _Pinhole, faces: Int, rows: Int
+) -> None:
     """Of each box the triangles that can cover a pixel's centre, and in which rows."""
-    for i in prange(len(boxes)):
+    for i in range(start, stop):
         first = boxes[i] * BOX_FACES
         for k in range(min(BOX_FACES, len(mesh.triangles) - first)):
             f = first + k
@@ -182,9 +183,11 @@ def _corners(mesh: _Mesh, f: int, camera: _Pinhole) -> tuple[Vector, Vector, Vec
 
 
 @parallel_kernel
-def _draw(mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole, picture: _Picture) -> None:
+def _draw(
+    first: int, last: int, mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole, picture: _Picture
+) -> None:
     height = camera.height
-    for i in prange(_BANDS):
+    for i in range(first, last):
         # Neighbouring bands, which are similarly full, go to different threads.
         band = i * 13 % _BANDS
         low = band * height // _BANDS
@@ -258,10 +261,10 @@ def _draw_face(
 
 
 @parallel_kernel
-def _points(camera: _Pinhole, nearness: Float, point: Float) -> None:
+def _points(first: int, last: int, camera: _Pinhole, nearness: Float, point: Float) -> None:
     """The world points at 1 / nearness ahead; zero where that is zero."""
     m = camera.rotation
-    for row in prange(len(nearness)):
+    for row in range(first, last):
         y = (row + 0.5 - camera.cy) / camera.fy
         for column in range(nearness.shape[1]):
             x = (column + 0.5 - camera.cx) / camera.fx

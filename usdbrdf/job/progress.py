@@ -103,12 +103,21 @@ def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Ite
             iterable, total=total, desc=printable(label), unit=f" {unit}", file=sys.stderr
         )
     else:
-        due = time.monotonic() + _SECONDS_BETWEEN_LINES
+        start = time.monotonic()
+        due = start + _SECONDS_BETWEEN_LINES
         for done, item in enumerate(iterable):
-            if time.monotonic() >= due:
-                say(f"{label}: {done} of {total} {unit}")
-                due = time.monotonic() + _SECONDS_BETWEEN_LINES
+            if (now := time.monotonic()) >= due:
+                say(f"{label}: {done} of {total} {unit}{_left(now - start, done, total)}")
+                due = now + _SECONDS_BETWEEN_LINES
             yield item
+
+
+def _left(seconds: float, done: int, total: int) -> str:
+    """How much longer it takes, if it goes on like this; the first items tell little."""
+    if done < 2:
+        return ""
+    left = seconds / done * (total - done)
+    return f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
 
 
 def printable(text: str) -> str:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 from scipy import ndimage
 
 from usdbrdf import calibration
@@ -38,7 +37,7 @@ def footprints(texels: Texels, which: Int, camera: Camera) -> Float:
     (M, 3), xx, xy, yy. Texels that the camera sees from the front."""
     found = np.zeros((len(which), 3), np.float32)
     steps = texels.step_x, texels.step_y
-    _footprints(which, texels.position, *steps, Projection.of(camera), found)
+    _footprints(len(which), which, texels.position, *steps, Projection.of(camera), found)
     return found
 
 
@@ -64,17 +63,19 @@ def blurred(texels: Texels, values: Float, covariance: Float) -> Float:
     owner, nearest = texels.object_index(), np.maximum(texels.nearest_texel, 0)
     blurry = np.zeros_like(values)
     _blur(
-        np.ascontiguousarray(values[nearest]), chart[texels.pixel[nearest]], texels.pixel,
-        texels.first_pixel[owner], texels.resolution[owner], covariance, RINGS, blurry,
+        len(blurry), np.ascontiguousarray(values[nearest]), chart[texels.pixel[nearest]],
+        texels.pixel, texels.first_pixel[owner], texels.resolution[owner], covariance, RINGS,
+        blurry,
     )  # fmt: skip
     return blurry
 
 
 @parallel_kernel
 def _footprints(
-    which: Int, position: Float, step_x: Float, step_y: Float, camera: Projection, out: Float
-) -> None:
-    for i in prange(len(which)):
+    first: int, last: int, which: Int, position: Float, step_x: Float, step_y: Float,
+    camera: Projection, out: Float,
+) -> None:  # fmt: skip
+    for i in range(first, last):
         t = which[i]
         p, sx, sy = position[t], step_x[t], step_y[t]
         u, v, _ = project(p, sx, sy, 0.0, 0.0, camera)
@@ -94,6 +95,8 @@ def _footprints(
 
 @parallel_kernel
 def _blur(
+    start: int,
+    stop: int,
     picture: Float,
     chart: Int,
     pixel: Long,
@@ -103,7 +106,7 @@ def _blur(
     offsets: Double,
     out: Float,
 ) -> None:
-    for t in prange(len(pixel)):
+    for t in range(start, stop):
         width, height = size[t, 0], size[t, 1]
         at = pixel[t] - first[t]
         row, column = at // width, at % width

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.files.frames import FramePixels
 from usdbrdf.geometry.unwrap import MAX_SIDE
@@ -64,7 +63,9 @@ class TexelBlocks(NamedTuple):
         planes /= np.linalg.norm(planes, axis=1, keepdims=True)
         normals = np.ascontiguousarray(planes @ camera.world_from_camera[:3, :3].T)
         eye = np.array(camera.eye, np.float64)
-        seen = np.flatnonzero(_in_view(self, normals, eye, float(np.arccos(min_cosine))))
+        in_view = np.zeros(len(self.centre), np.bool_)
+        _in_view(len(in_view), self, normals, eye, float(np.arccos(min_cosine)), in_view)
+        seen = np.flatnonzero(in_view)
         count = self.first[seen + 1] - self.first[seen]
         ends = np.cumsum(count)
         shift = np.repeat(self.first[seen] - (ends - count), count)
@@ -90,16 +91,16 @@ def blocks_of_texels(texels: Texels, part: slice) -> TexelBlocks:
     centre, axis = np.zeros((2, len(first), 3), np.float32)
     radius, spread = np.zeros((2, len(first)), np.float32)
     blocks = TexelBlocks(order, np.append(first, len(order)), centre, radius, axis, spread)
-    _bound(texels.position, texels.geometric_normal, *blocks)
+    _bound(len(first), texels.position, texels.geometric_normal, *blocks)
     return blocks
 
 
 @parallel_kernel
 def _bound(
-    position: Float, normal: Float, order: Int, first: Long, centre: Float, radius: Float,
-    axis: Float, spread: Float,
+    start: int, stop: int, position: Float, normal: Float, order: Int, first: Long, centre: Float,
+    radius: Float, axis: Float, spread: Float,
 ) -> None:  # fmt: skip
-    for b in prange(len(first) - 1):
+    for b in range(start, stop):
         low, high = position[order[first[b]]].copy(), position[order[first[b]]].copy()
         total = np.zeros(3)
         for t in order[first[b] : first[b + 1]]:
@@ -124,10 +125,17 @@ def _bound(
 
 
 @parallel_kernel
-def _in_view(blocks: TexelBlocks, planes: Double, eye: Double, widest: float) -> Bool:
+def _in_view(
+    start: int,
+    stop: int,
+    blocks: TexelBlocks,
+    planes: Double,
+    eye: Double,
+    widest: float,
+    seen: Bool,
+) -> None:
     _, _, centre, radius, axis, spread = blocks
-    seen = np.zeros(len(centre), np.bool_)
-    for b in prange(len(centre)):
+    for b in range(start, stop):
         x = eye[0] - centre[b, 0]
         y = eye[1] - centre[b, 1]
         z = eye[2] - centre[b, 2]
@@ -146,7 +154,6 @@ def _in_view(blocks: TexelBlocks, planes: Double, eye: Double, widest: float) ->
         cosine = (axis[b, 0] * x + axis[b, 1] * y + axis[b, 2] * z) / distance
         least = np.arccos(min(max(cosine, -1.0), 1.0)) - spread[b]
         seen[b] = least - np.arcsin(radius[b] / distance) <= widest
-    return seen
 
 
 _GOLDEN = (math.sqrt(5) - 1) / 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.files.frames import FramePixels
 from usdbrdf.geometry.visible_faces import visible_faces
@@ -72,17 +71,19 @@ def look_up(
     value = np.full(len(surface.point), np.nan, np.float32)
     slope = np.zeros((len(surface.point), 6), np.float32)
     smooth = np.empty_like(picture)
-    _smooth(picture, smooth)
+    _smooth(len(picture), picture, smooth)
     place = np.zeros(len(value), np.int32)
-    _look_up(*surface, Projection.of(camera), face, seen, smooth, patch, value, slope, place)
+    _look_up(
+        len(value), *surface, Projection.of(camera), face, seen, smooth, patch, value, slope, place
+    )
     shown = np.flatnonzero(np.isfinite(value)).astype(np.int32)
     return LookedUp(shown, value[shown], slope[shown], place[shown])
 
 
 @parallel_kernel
-def _smooth(picture: Float, out: Float) -> None:
+def _smooth(first: int, last: int, picture: Float, out: Float) -> None:
     height, width = picture.shape
-    for j in prange(height):
+    for j in range(first, last):
         for i in range(width):
             total, weight = 0.0, 0.0
             for b in range(max(j - 1, 0), min(j + 2, height)):
@@ -96,12 +97,12 @@ def _smooth(picture: Float, out: Float) -> None:
 
 @parallel_kernel
 def _look_up(
-    point: Double, normal: Double, camera: Projection, face: Int, seen: Float, picture: Float,
-    patch: int, value: Float, slope: Float, place: Int,
+    first: int, last: int, point: Double, normal: Double, camera: Projection, face: Int,
+    seen: Float, picture: Float, patch: int, value: Float, slope: Float, place: Int,
 ) -> None:  # fmt: skip
     height, width = picture.shape
     m, (fx, fy, cx, cy) = camera.camera_from_world, camera.intrinsics
-    for k in prange(len(point)):
+    for k in range(first, last):
         p, n = point[k], normal[k]
         wx, wy, wz = camera.eye[0] - p[0], camera.eye[1] - p[1], camera.eye[2] - p[2]
         distance = np.sqrt(wx * wx + wy * wy + wz * wz)

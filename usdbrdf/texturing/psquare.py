@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Float, Int
@@ -63,15 +62,16 @@ def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
     values  (M, 3) float32, finite
     p       the quantile, in (0, 1)
     """
-    _update(*state, texel, values, p)
+    _update(len(texel), *state, texel, values, p)
 
 
 @parallel_kernel
 def _update(
-    heights: Float, positions: Int, count: Int, mean: Float, texel: Int, values: Float, p: float
-) -> None:
+    first: int, last: int, heights: Float, positions: Int, count: Int, mean: Float, texel: Int,
+    values: Float, p: float,
+) -> None:  # fmt: skip
     fractions = np.array([p / 2, p, (1 + p) / 2])
-    for m in prange(len(texel)):
+    for m in range(first, last):
         t = texel[m]
         n = count[t]
         for c in range(3):

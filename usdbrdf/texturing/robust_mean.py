@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from usdbrdf import calibration
 from usdbrdf.kernel import kernel, parallel_kernel
@@ -85,15 +84,16 @@ def update(state: MeanState, texel: Int, values: Float, deviation: Float, footpr
     deviation  (M,) float32, standard deviation of their errors, between 1e-15 and 1e15
     footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
     """
-    _update(*state, texel, values, deviation, footprint)
+    _update(len(texel), *state, texel, values, deviation, footprint)
 
 
 @parallel_kernel
 def _update(
-    waiting: Float, samples: Int, mean: Float, weight: Float, scatter: Float, precision: Float,
-    covered: Float, texel: Int, values: Float, deviation: Float, footprint: Float,
+    first: int, last: int, waiting: Float, samples: Int, mean: Float, weight: Float,
+    scatter: Float, precision: Float, covered: Float, texel: Int, values: Float,
+    deviation: Float, footprint: Float,
 ) -> None:  # fmt: skip
-    for m in prange(len(texel)):
+    for m in range(first, last):
         t = texel[m]
         slot = samples[t] % _BATCH
         for c in range(3):
@@ -116,7 +116,7 @@ def robust_mean(state: MeanState) -> RobustMean:
     def means(part: slice) -> dict[str, Float]:
         some = MeanState._make(values[part] for values in state)
         mean, weight, scatter = some.mean.copy(), some.weight.copy(), some.scatter.copy()
-        _add_rest(some.waiting, some.samples, mean, weight, scatter)
+        _add_rest(len(some.samples), some.waiting, some.samples, mean, weight, scatter)
         # Variance of an M-estimate, sum psi^2 / (sum psi')^2; at least one lies within its error.
         pull, inlying = scatter.T.astype(np.float64) / 3
         count = np.maximum(some.samples, 1)
@@ -131,8 +131,10 @@ def robust_mean(state: MeanState) -> RobustMean:
 
 
 @parallel_kernel
-def _add_rest(waiting: Float, samples: Int, mean: Float, weight: Float, scatter: Float) -> None:
-    for t in prange(len(samples)):
+def _add_rest(
+    first: int, last: int, waiting: Float, samples: Int, mean: Float, weight: Float, scatter: Float
+) -> None:
+    for t in range(first, last):
         rest = samples[t] % _BATCH
         if rest:
             _add(waiting[t, :rest], mean[t], weight[t], scatter[t])

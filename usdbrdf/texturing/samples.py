@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from usdbrdf import calibration
 from usdbrdf.geometry.visible_faces import visible_faces
@@ -31,21 +30,22 @@ _REACH = calibration.count("glare.reach")
 def brightest_glare(radiance: Float, valid: Bool, clipped: Bool) -> Float:
     """(H, W) float32: the brightest glaring pixel nearby, in any channel; 0 where there is none."""
     level = np.empty(valid.shape, np.float32)
-    _levels(radiance, valid, clipped, level)
+    _levels(len(level), radiance, valid, clipped, level)
     brightest = np.zeros(valid.shape, np.float32)
     glares = np.zeros(len(level), np.bool_)
-    _keep_above(np.float32(_GLARING * _median(level, valid)), level, glares)
+    _keep_above(len(level), np.float32(_GLARING * _median(level, valid)), level, glares)
     if glares.any():
-        _spread(level, glares, brightest)
+        _spread(len(level), level, glares, brightest)
     return brightest
 
 
 @parallel_kernel
-def _levels(radiance: Float, valid: Bool, clipped: Bool, level: Float) -> None:
+def _levels(
+    first: int, last: int, radiance: Float, valid: Bool, clipped: Bool, level: Float
+) -> None:
     """The brightest channel; 0 where a pixel is neither valid nor clipped."""
-    height, width = valid.shape
-    for j in prange(height):
-        for i in range(width):
+    for j in range(first, last):
+        for i in range(valid.shape[1]):
             known = valid[j, i] or clipped[j, i]
             brightest = max(radiance[j, i, 0], radiance[j, i, 1], radiance[j, i, 2])
             level[j, i] = brightest if known else np.float32(0)
@@ -61,11 +61,10 @@ def _median(level: Float, valid: Bool) -> float:
 
 
 @parallel_kernel
-def _keep_above(limit: np.float32, level: Float, glares: Bool) -> None:
+def _keep_above(first: int, last: int, limit: np.float32, level: Float, glares: Bool) -> None:
     """Zero what glares not; ``glares`` (H,): rows where anything is left."""
-    height, width = level.shape
-    for j in prange(height):
-        for i in range(width):
+    for j in range(first, last):
+        for i in range(level.shape[1]):
             if level[j, i] > limit:
                 glares[j] = True
             else:
@@ -73,10 +72,10 @@ def _keep_above(limit: np.float32, level: Float, glares: Bool) -> None:
 
 
 @parallel_kernel
-def _spread(level: Float, glares: Bool, brightest: Float) -> None:
+def _spread(first: int, last: int, level: Float, glares: Bool, brightest: Float) -> None:
     """The largest level within _REACH pixels to all sides."""
     height, width = level.shape
-    for j in prange(height):
+    for j in range(first, last):
         for k in range(max(0, j - _REACH), min(height, j + _REACH + 1)):
             if not glares[k]:
                 continue
@@ -180,7 +179,7 @@ def samples_from_frame(
         texels.position, texels.geometric_normal, texels.step_x, texels.step_y, texel_object
     )
     kind, values = np.zeros(len(which), np.int8), np.zeros((len(which), 3), np.float32)
-    _sample(which, surface, image, Projection.of(camera), kind, values)
+    _sample(len(which), which, surface, image, Projection.of(camera), kind, values)
     return kind, values
 
 
@@ -203,6 +202,8 @@ def project(
 
 @parallel_kernel
 def _sample(
+    first: int,
+    last: int,
     which: Int,
     surface: _Surface,
     image: _Image,
@@ -210,7 +211,7 @@ def _sample(
     kind: npt.NDArray[np.int8],
     values: Float,
 ) -> None:
-    for m in prange(len(which)):
+    for m in range(first, last):
         kind[m] = _sample_of(which[m], surface, image, camera, values[m])
 
 

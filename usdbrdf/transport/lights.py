@@ -218,7 +218,7 @@ def weighed_groups(
     guide = np.empty((tiles, _STEPS * count), np.int16)
     ratio = np.empty((tiles, count), np.float32)
     own, weight = np.empty(count, np.float32), np.empty(count, np.float32)
-    power = np.diff(start).astype(np.float32)
+    power = (start[1:] - start[:-1]).astype(np.float32)
     for q in range(tiles):
         weight[:] = 0
         first, points = first_point[q], first_point[q + 1] - first_point[q]

@@ -14,7 +14,6 @@ from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.kernel import kernel, loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
@@ -111,14 +110,13 @@ class LobeSamples(NamedTuple):
     cos_out: Float
 
 
-# Inside a ``prange`` numba drops what is stored in an array of a tuple, so that the work on a point
-# is a call.
 @parallel_kernel
 def draw_directions(
-    aimed: Aimed, origin: Float, draws: GroupDraws, mixture: Mixture, groups: LightGroups
-) -> None:
+    first: int, last: int, aimed: Aimed, origin: Float, draws: GroupDraws, mixture: Mixture,
+    groups: LightGroups,
+) -> None:  # fmt: skip
     """Directions of every technique in turn, and what they are sent to, into ``aimed``."""
-    for r in prange(len(origin)):
+    for r in range(first, last):
         _draw_point(aimed, r, origin[r], draws, mixture, groups)
 
 
@@ -200,6 +198,8 @@ def _aim(
 
 @parallel_kernel
 def weigh(
+    first: int,
+    last: int,
     aimed: Aimed,
     hits: Hits,
     mixture: Mixture,
@@ -209,7 +209,7 @@ def weigh(
 ) -> None:
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
     first surfaces along the (R, K) directions."""
-    for r in prange(len(samples.cos_out)):
+    for r in range(first, last):
         _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
 
 
@@ -257,11 +257,13 @@ def _weigh_point(
 
 
 @parallel_kernel
-def integrate(samples: LobeSamples, phis: Float, kind: int, base: Float, slope: Float) -> None:
+def integrate(
+    first: int, last: int, samples: LobeSamples, phis: Float, kind: int, base: Float, slope: Float
+) -> None:
     """base, slope (G, 3, Q) += light times G D F of psi = 0, and of what psi adds, summed over
     samples, means of each group of consecutive points, with the group's roughnesses phis (G, Q)."""
     group = len(samples.cos_out) // len(phis)
-    for g in prange(len(phis)):
+    for g in range(first, last):
         for r in range(g * group, (g + 1) * group):
             if samples.cos_out[r] > 0:
                 _add_point(samples, r, phis[g], kind, 1.0 / group, base[g], slope[g])
@@ -323,7 +325,7 @@ def trace_lobe_samples(
     mixture = mixture._replace(sun=int(sun.shines))
     count = len(points.face)
     if alphas is None:
-        alphas = np.broadcast_to(LOBE_ALPHAS, (count, len(LOBE_ALPHAS)))
+        alphas = np.tile(LOBE_ALPHAS, (count, 1))  # a view would be another type to compile for
     total = mixture.per_lobe * alphas.shape[1] + mixture.lights + mixture.cosine + mixture.sun
     origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
     draws = GroupDraws(
@@ -336,7 +338,7 @@ def trace_lobe_samples(
         points.normal, points.to_camera, alphas, directions.reshape(count, total, 3),
         np.full((count, total), -1, np.int32),
     )  # fmt: skip
-    draw_directions(aimed, origin, draws, mixture, groups)
+    draw_directions(count, aimed, origin, draws, mixture, groups)
     if mixture.sun:
         numbers = np.repeat(draws.number, group) * group + np.arange(count) % group
         aimed.direction[:, -1] = towards_sun(sun, shifts_of(numbers, 2, seed ^ _SUN_SEED))
@@ -346,7 +348,7 @@ def trace_lobe_samples(
     cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)
     samples = LobeSamples(cos_in, sin2_half, cos_half, arriving, cos_out)
     hits = Hits._make(values.reshape(count, total) for values in hits)
-    weigh(aimed, hits, mixture, groups, lit.environment, samples)
+    weigh(count, aimed, hits, mixture, groups, lit.environment, samples)
     return samples
 
 
@@ -382,7 +384,7 @@ def non_diffuse(samples: LobeSamples, phis: Float, kind: int = PAPER) -> tuple[F
     points, for its roughnesses phis (G, Q), with lobes of a kind."""
     base = np.zeros((len(phis), 3, phis.shape[1]), np.float32)
     slope = np.zeros_like(base)
-    integrate(samples, phis, kind, base, slope)
+    integrate(len(phis), samples, phis, kind, base, slope)
     return base, slope
 
 

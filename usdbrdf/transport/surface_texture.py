@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import prange, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
@@ -44,7 +44,9 @@ class SurfaceTexture(NamedTuple):
 
     def at(self, face: Int, u: Float, v: Float) -> Float:
         """Bilinear values (R, 3) at barycentric (u, v) of the faces; 0 where face is -1."""
-        return _lookup(self, face, u, v)
+        out = np.zeros((len(face), 3), np.float32)
+        _lookup((len(face) + AHEAD - 1) // AHEAD, self, face, u, v, out)
+        return out
 
 
 class Looks(NamedTuple):
@@ -217,9 +219,10 @@ def add_looked_at(
 
 
 @parallel_kernel
-def _lookup(texture: SurfaceTexture, face: Int, u: Float, v: Float) -> Float:
-    out = np.zeros((len(face), 3), np.float32)
-    for part in prange((len(face) + AHEAD - 1) // AHEAD):
+def _lookup(
+    start: int, stop: int, texture: SurfaceTexture, face: Int, u: Float, v: Float, out: Float
+) -> None:
+    for part in range(start, stop):
         looks, first = empty_looks(), part * AHEAD
         count = min(AHEAD, len(face) - first)
         for i in range(count):
@@ -232,4 +235,3 @@ def _lookup(texture: SurfaceTexture, face: Int, u: Float, v: Float) -> Float:
                 place, width = looks.place[i], looks.width[i]
                 red, green, blue = packed_colour(texture, place, width, looks.x[i], looks.y[i])
                 out[first + i, 0], out[first + i, 1], out[first + i, 2] = red, green, blue
-    return out

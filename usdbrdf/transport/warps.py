@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import prange
 
 from usdbrdf.kernel import kernel, loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Long
@@ -140,21 +139,25 @@ def in_triangle(u: Float, v: Float) -> None:
         u[k], v[k] = (half if low else u[k] - half), (v[k] - half if low else half)
 
 
-@parallel_kernel
 def cosine_rays(normal: Float, identity: Long, seed: int, samples: int) -> Float:
     """Directions (samples * N, 3) about the normals (N, 3): those of sample s are s * N to
     (s + 1) * N. A point's random numbers follow from its ``identity`` (N,) and the seed."""
-    count = len(normal)
-    directions = np.zeros((count * samples, 3), np.float32)
-    for k in prange(count):
+    directions = np.zeros((samples, len(normal), 3), np.float32)
+    _cosine_rays(len(normal), normal, identity, seed, directions)
+    return directions.reshape(-1, 3)
+
+
+@parallel_kernel
+def _cosine_rays(
+    first: int, last: int, normal: Float, identity: Long, seed: int, directions: Float
+) -> None:
+    for k in range(first, last):
         tx, ty, tz, bx, by, bz = tangent_frame(normal[k])
         n = normal[k]
-        for sample in range(samples):
+        for sample in range(len(directions)):
             u1 = hashed_uniform(seed, identity[k], sample * 2)
             u2 = hashed_uniform(seed, identity[k], sample * 2 + 1)
             x, y, z = cosine_direction(u1, u2)
-            r = sample * count + k
-            directions[r, 0] = x * tx + y * bx + z * n[0]
-            directions[r, 1] = x * ty + y * by + z * n[1]
-            directions[r, 2] = x * tz + y * bz + z * n[2]
-    return directions
+            directions[sample, k, 0] = x * tx + y * bx + z * n[0]
+            directions[sample, k, 1] = x * ty + y * by + z * n[1]
+            directions[sample, k, 2] = x * tz + y * bz + z * n[2]

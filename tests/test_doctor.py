@@ -1,0 +1,84 @@
+"""What doctor says of this machine is so, and what is broken is told with the right status."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from email.message import Message
+from importlib import metadata
+
+import numpy as np
+import psutil
+import pytest
+
+from usdbrdf import doctor
+from usdbrdf.cli import main
+from usdbrdf.transport.rays import Hits
+
+
+@pytest.fixture
+def told(capsys):
+    def ask() -> tuple[int, dict[str, dict[str, str]]]:
+        status = main(["doctor", "--json"])
+        document = json.loads(capsys.readouterr().out)
+        assert document["works"] is (status == 0)
+        return status, {found["name"]: found for found in document["findings"]}
+
+    return ask
+
+
+def test_this_machine_works(told, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    status, found = told()
+    assert status == 0
+    assert all(one["state"] == "ok" for one in found.values() if one["needed"])
+    assert found["cores"]["text"].startswith(f"{len(os.sched_getaffinity(0))};")
+    most = psutil.virtual_memory().total / 2**30
+    assert 0 < float(found["memory"]["text"].split()[0]) <= most + 0.05
+    free = shutil.disk_usage(tmp_path).free / 2**30
+    assert float(found["disk"]["text"].split()[0]) == pytest.approx(free, abs=1)
+    assert f"numpy {metadata.version('numpy')}" in found["libraries"]["text"]
+    assert {"render", "denoise", "colmap", "report"} <= found.keys()
+    assert not {"test", "dev", "docs"} & found.keys()
+
+
+def test_lines_for_people(capsys):
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.startswith(("ok ", "-- ", "BROKEN ")) for line in lines)
+
+
+def test_an_extra_that_is_not_there_breaks_nothing(told, monkeypatch):
+    known = Message()
+    known["Provides-Extra"] = "raw"
+    known["Requires-Dist"] = "numpy>=2"
+    known["Requires-Dist"] = "numba>=0.61"
+    known["Requires-Dist"] = "nowhere-to-be-had>=1; extra == 'raw'"
+    known["Requires-Dist"] = "gone>=1; python_version < '3.2' and extra == 'raw'"
+    monkeypatch.setattr(doctor, "_metadata_of_all", lambda: known)
+    status, found = told()
+    assert status == 0
+    assert found["raw"]["state"] == "missing"
+    cure = "nowhere-to-be-had not installed: pip install 'usdbrdf[raw]'"
+    assert found["raw"]["text"] == cure
+
+
+def test_rays_that_meet_the_wrong_thing_are_broken(told, monkeypatch):
+    nothing = np.zeros(2, np.float32)
+    wrong = Hits(np.array([-1, -1], np.int32), nothing, nothing, nothing)
+    monkeypatch.setattr(doctor.RayScene, "closest", lambda *_: wrong)
+    status, found = told()
+    assert status == 4
+    assert found["rays"]["state"] == "broken"
+    assert "[-1, -1]" in found["rays"]["text"]
+
+
+def test_a_library_that_is_missing_is_broken(told, monkeypatch):
+    def without(package: str) -> str | None:
+        return None if package == "xatlas" else "1"
+
+    monkeypatch.setattr(doctor, "_version", without)
+    status, found = told()
+    assert status == 4
+    assert found["libraries"]["text"].startswith("xatlas: not installed.")
