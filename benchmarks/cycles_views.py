@@ -82,7 +82,7 @@ def with_mapping(asset: Asset, atlas: AssetMaps, mapping: str, path: Path) -> Pa
         fit = read_fit(atlas.stage, obj.prim_path)
         if fit is None or not math.isfinite(fit.phi) or not math.isfinite(fit.psi):
             continue
-        material = Scopes.of(asset).path("materials", obj.identifier)
+        material = Scopes.of(asset).material(obj.identifier)
         shown = preview_surface_from_fit(fit.phi, fit.psi, mapping)
         lobe(layer, material, shown.roughness, shown.ior)
         for texture in ("AlbedoTexture", "BaseColorTexture"):

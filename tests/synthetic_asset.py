@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader
+from usdbrdf.asset.layers.interface import write_contents, write_interface, write_root
+from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
 from usdbrdf.asset.layers.scan_layer import (
+    ScanFiles,
     write_edits,
     write_pending_layer,
-    write_root,
     write_scan_layer,
 )
 from usdbrdf.asset.layers.task_layers import (
-    Lamp,
-    world_from_root,
-    write_lights_layer,
     write_material_layer,
     write_shading_layer,
     write_texturing_layer,
@@ -196,11 +195,19 @@ class Built:
 
     def write_layer(self, role, path=None):
         """Write (again) the layer of one stage from the kept values."""
-        path = path or self.asset.layer(role)
+        asset = self.asset
+        path = path or asset.layer(role)
         draft = self.draft(role)
         if role == "scan":
-            write_scan_layer(path, self.scan, draft)
-        elif role == "texturing":
+            files = ScanFiles(
+                scan=path,
+                interface=asset.interface("scan"),
+                photographs=asset.photographs_layer,
+                place=self.place,
+            )
+            write_scan_layer(files, self.scan, draft)
+            return
+        if role == "texturing":
             scanned = open_weaker(self.asset, "texturing")
             write_uv_layer(self.asset.uv_layer, draft, self.textured, scanned)
             write_texturing_layer(path, draft, self.textured)
@@ -209,6 +216,13 @@ class Built:
             self.write_lights()
         else:
             write_material_layer(path, draft, self.fitted)
+        lights = [asset.lights_layer] if role == "shading" else []
+        write_interface(asset.interface(role), path, *lights)
+
+    def place(self, relative):
+        path = self.asset.folder / relative
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
 
 def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
@@ -218,7 +232,7 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
     (folder / "previews").mkdir()
     write_preview_png(folder / "previews" / "lit.png", np.full((3, 4, 3), 128, np.uint8))
     header = StageHeader.of_scan(asset.name, scan)
-    prims = prims or tuple(f"/{asset.name}/geo/{o.identifier}" for o in scan.objects)
+    prims = prims or tuple(f"/{asset.name}/geo/{o.identifier}/{o.identifier}" for o in scan.objects)
     built = Built(asset, header, scan, prims)
     identifiers = [o.identifier for o in scan.objects]
     faces = [np.flatnonzero(scan.mesh.face_object == i) for i in range(len(identifiers))]
@@ -285,7 +299,9 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
         if role in done:
             built.write_layer(role)
         else:
-            write_pending_layer(asset.layer(role), role, header)
+            for layer in (asset.layer(role), asset.interface(role)):
+                write_pending_layer(layer, role, header)
+    write_contents(asset.contents_layer, asset, header)
     write_edits(asset.edits_layer, asset, header)
     write_root(asset.root_layer, asset, header)
     return built

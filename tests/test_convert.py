@@ -17,7 +17,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 import usdbrdf
 from tests.scenes import MadeCapture, edited, make_capture, poses_down_and_up, write_ply
 from usdbrdf.asset.layers.looks import VARIANT_SET
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
 from usdbrdf.asset.readers.scene import (
     frames_from_stage,
@@ -103,7 +103,7 @@ def copy(base, asset, request):
 
 
 def prim_of(stage: Usd.Stage, name: str) -> Usd.Prim:
-    return stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{name}")
+    return stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{name}/{name}")
 
 
 def surface_of(prim: Usd.Prim) -> UsdShade.Shader:
@@ -162,7 +162,8 @@ def test_all_layers_and_textures_are_there(capture, asset):
     layers = {path.name for path in (asset.folder / "layers").iterdir()}
     assert layers == {
         "scan.usdc", "texturing.usda", "texturing_uv.usdc", "shading.usda", "lights.usda",
-        "material.usda",
+        "material.usda", "contents.usda", "photographs.usdc",
+        *(f"{role}.interface.usda" for role in ROLES),
     }  # fmt: skip
     textures = {path.name for path in (asset.folder / "textures").iterdir()}
     names = [*capture.names, "hidden"]

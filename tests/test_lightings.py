@@ -16,7 +16,7 @@ from pxr import Sdf, Usd, UsdShade
 import usdbrdf
 from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.asset.adopt import adopt
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_edited, open_measured
 from usdbrdf.asset.readers.scene import aov_path, read_fit, read_shading
@@ -71,7 +71,7 @@ def asset(base, captures) -> Asset:
 
 def _colour(stage: Usd.Stage, name: str) -> list[str]:
     """The prims that the diffuse and the emissive colour of an object's material come from."""
-    prim = stage.GetPrimAtPath(f"/room/geo/{name}")
+    prim = stage.GetPrimAtPath(f"/room/geo/{name}/{name}")
     surface = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
     inputs = [surface.GetInput(f"{kind}Color") for kind in ("diffuse", "emissive")]
     return [str(own.GetValueProducingAttributes()[0].GetPrim().GetName()) for own in inputs]
@@ -83,10 +83,27 @@ def test_each_lighting_has_layers_and_maps_of_its_own(asset):
     each = {f"{role}.{name}.usda" for name in LIGHTINGS
             for role in ("texturing", "shading", "lights", "material")}  # fmt: skip
     shared = {"scan.usdc", "texturing_uv.usdc", "texturing.usda", "shading.usda", "material.usda"}
-    assert layers == each | shared
+    shared |= {"contents.usda", "photographs.usdc"}
+    steps = {name for name in each | {f"{role}.usda" for role in ROLES} if "lights." not in name}
+    interfaces = {name.replace(".usda", ".interface.usda") for name in steps}
+    assert layers == each | shared | interfaces
+    light = Usd.Stage.Open(str(asset.root_layer), Usd.Stage.LoadNone)
+    full = Usd.Stage.Open(str(asset.root_layer))
+    for name in LIGHTINGS:
+        chosen = []
+        for stage in (light, full):
+            stage.SetEditTarget(stage.GetSessionLayer())
+            sets = stage.GetDefaultPrim().GetVariantSets()
+            assert list(sets.GetVariantSet("lighting").GetVariantNames()) == sorted(LIGHTINGS)
+            sets.SetSelection("lighting", name)
+            known = {each: sets.GetVariantSet(each) for each in ("look", "lights")}
+            chosen.append(
+                {k: (v.GetVariantNames(), v.GetVariantSelection()) for k, v in known.items()}
+            )
+        assert chosen[0] == chosen[1], name
     for name, wall in zip(LIGHTINGS, (0.25, 0.25), strict=True):
         stage = open_edited(asset.in_lighting(name))
-        file = aov_path(stage, "/room/geo/floor", "lit")
+        file = aov_path(stage, "/room/geo/floor/floor", "lit")
         assert file == asset.folder / "textures" / name / "floor.lit.exr"
         shown = read_exr(file)[..., 0]
         assert np.median(shown) == pytest.approx(wall, rel=0.02)
@@ -98,18 +115,18 @@ def test_the_root_layer_opens_in_the_first_and_others_can_be_chosen(asset):
     choice = stage.GetDefaultPrim().GetVariantSet("lighting")
     assert choice.GetVariantNames() == [*LIGHTINGS]
     assert choice.GetVariantSelection() == "day"
-    assert read_shading(stage, "/room/geo/lamp").radiance[0] == pytest.approx(8, rel=0.01)
+    assert read_shading(stage, "/room/geo/lamp/lamp").radiance[0] == pytest.approx(8, rel=0.01)
     choice.SetVariantSelection("night")
-    assert read_shading(stage, "/room/geo/box").radiance[0] == pytest.approx(6, rel=0.01)
-    assert not read_shading(stage, "/room/geo/lamp").emitter
+    assert read_shading(stage, "/room/geo/box/box").radiance[0] == pytest.approx(6, rel=0.01)
+    assert not read_shading(stage, "/room/geo/lamp/lamp").emitter
 
 
 def test_all_lightings_show_one_base_colour_and_one_lobe(asset):
     found = []
     for name in LIGHTINGS:
         stage = open_edited(asset.in_lighting(name))
-        files = [aov_path(stage, f"/room/geo/{o}", "base_color") for o in ("floor", "lamp")]
-        lobes = [stage.GetAttributeAtPath(f"/room/geo/floor.usdBrdf:fit:{n}").Get()
+        files = [aov_path(stage, f"/room/geo/{o}/{o}", "base_color") for o in ("floor", "lamp")]
+        lobes = [stage.GetAttributeAtPath(f"/room/geo/floor/floor.usdBrdf:fit:{n}").Get()
                  for n in ("phi", "psi")]  # fmt: skip
         found.append((files, lobes))
         assert _colour(stage, "floor") == ["BaseColorTexture", "PreviewSurface"]
@@ -215,11 +232,11 @@ def _page_of_the_night(asset, by_day, by_night):
 
 def test_target_frames_are_counted_in_the_lighting_that_is_shown(asset, monkeypatch):
     maps = AssetMaps(open_measured(asset.in_lighting("night")))
-    fit = read_fit(maps.stage, "/room/geo/floor")
+    fit = read_fit(maps.stage, "/room/geo/floor/floor")
     for stored, shown in ((15, 3), (3, -1), (-1, -1)):
         changed = replace(fit, target_frame=stored)
         monkeypatch.setattr(report, "read_fit", lambda *_, changed=changed: changed)
-        assert report._in_own_frames(maps, "/room/geo/floor").target_frame == shown
+        assert report._in_own_frames(maps, "/room/geo/floor/floor").target_frame == shown
 
 
 def test_lightings_of_one_asset_are_compared(asset, tmp_path):
@@ -234,7 +251,7 @@ def test_lightings_of_one_asset_are_compared(asset, tmp_path):
 def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
     folder = tmp_path / "room"
     shutil.copytree(asset.folder, folder)
-    copy, name = Asset.made(folder), "/room/geo/floor.usdBrdf:shading:raysPerTexel"
+    copy, name = Asset.made(folder), "/room/geo/floor/floor.usdBrdf:shading:raysPerTexel"
     edited = copy.in_lighting("night").layer("shading")
     layer = Sdf.Layer.OpenAsAnonymous(str(edited))
     layer.GetAttributeAtPath(name).default = 7777.0

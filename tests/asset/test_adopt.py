@@ -16,7 +16,7 @@ def edit(path, change):
 
 
 def set_roughness(layer):
-    path = "/room/mtl/Stuhl_No_1/PreviewSurface.inputs:roughness"
+    path = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface.inputs:roughness"
     layer.GetAttributeAtPath(path).default = 0.75
 
 
@@ -32,7 +32,7 @@ def test_an_edited_layer_wins_once_the_artist_adds_it(built):
     edit(built.asset.edits_layer, lambda layer: layer.subLayerPaths.append(f"./{adopted.name}"))
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     stage.Reload()
-    surface = UsdShade.Shader.Get(stage, "/room/mtl/Stuhl_No_1/PreviewSurface")
+    surface = UsdShade.Shader.Get(stage, "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface")
     assert surface.GetInput("roughness").Get() == 0.75
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.layers.scan_layer import write_root
+from usdbrdf.asset.layers.interface import write_root
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
@@ -173,8 +173,8 @@ def test_every_look_reaches_every_mesh_and_subset(dressed):
     for look in looks.GetVariantNames():
         looks.SetVariantSelection(look)
         for prim_path, label in zip(dressed.prims, dressed.scan.objects, strict=True):
-            scope = "/room/usdbrdf_mtl" if look == "shaded" else f"/room/looks/{look}"
-            expected = f"{scope}/{label.identifier}"
+            name = f"mtl/{label.identifier}" if look == "shaded" else f"looks/{look}"
+            expected = f"/room/geo/{label.identifier}/{name}"
             prims = [stage.GetPrimAtPath(prim_path)]
             for prim in prims + prims[0].GetChildren():
                 api = UsdShade.MaterialBindingAPI(prim)
@@ -185,7 +185,7 @@ def test_every_look_reaches_every_mesh_and_subset(dressed):
 def test_our_materials_do_not_merge_with_the_inputs(dressed):
     """Ours for the mesh ``box`` would otherwise meet the input's material of the same path."""
     stage = Usd.Stage.Open(str(dressed.asset.root_layer))
-    ours = stage.GetPrimAtPath("/room/usdbrdf_mtl/box")
+    ours = stage.GetPrimAtPath("/room/geo/box/mtl/box")
     assert ours.GetChild("PreviewSurface")
     assert not stage.GetPrimAtPath("/room/mtl/box/PreviewSurface")
 
@@ -257,7 +257,9 @@ def test_it_is_flattened_with_its_meshes_and_without_its_materials(dressed):
         pose = before.GetLocalToWorldTransform(mesh)
         assert after.GetLocalToWorldTransform(flat_mesh) == pose
     materials = {str(p.GetPath()) for p in flat.TraverseAll() if p.IsA(UsdShade.Material)}
-    assert materials == {f"/room/usdbrdf_mtl/{o.identifier}" for o in dressed.scan.objects}
+    assert materials == {
+        f"/room/geo/{o.identifier}/mtl/{o.identifier}" for o in dressed.scan.objects
+    }
 
 
 def test_a_default_prim_that_is_the_mesh_itself(tmp_path, synthetic):
@@ -279,6 +281,6 @@ def Mesh "haus"
     assert [o.prim_path for o in scene.objects] == ["/room"]
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     material, _ = UsdShade.MaterialBindingAPI(stage.GetDefaultPrim()).ComputeBoundMaterial()
-    assert material.GetPath() == "/room/mtl/haus"
+    assert material.GetPath() == "/room/geo/haus/mtl/haus"
     assert len(frames_from_stage(stage)) == 3
     assert validate(built.asset.root_layer) == []

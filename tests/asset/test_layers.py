@@ -76,16 +76,30 @@ def test_no_file_names_a_place_on_this_machine(built, tmp_path):
         assert "@/" not in text
 
 
-def test_the_root_holds_sublayers_only_and_reads_in_order(built):
+def test_the_root_holds_layers_only_and_reads_in_order(built):
     root = Sdf.Layer.FindOrOpen(str(built.asset.root_layer))
     assert list(root.subLayerPaths) == [
         "./edits.usda",
-        "./layers/material.usda",
-        "./layers/shading.usda",
-        "./layers/texturing.usda",
-        "./layers/scan.usdc",
+        "./layers/material.interface.usda",
+        "./layers/shading.interface.usda",
+        "./layers/texturing.interface.usda",
+        "./layers/scan.interface.usda",
     ]
-    assert not root.rootPrims
+    (prim,) = root.rootPrims
+    assert prim.path == "/room"
+    assert not prim.nameChildren
+    assert not prim.properties
+    (payload,) = prim.payloadList.prependedItems
+    contents = Sdf.Layer.FindRelativeToLayer(root, payload.assetPath) or Sdf.Layer.FindOrOpen(
+        root.ComputeAbsolutePath(payload.assetPath)
+    )
+    assert list(contents.subLayerPaths) == [
+        "./material.usda",
+        "./shading.usda",
+        "./texturing.usda",
+        "./scan.usdc",
+        "./scan.interface.usda",
+    ]
 
 
 def test_a_capture_in_other_units_needs_another_folder(built):

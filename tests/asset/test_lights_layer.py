@@ -7,7 +7,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from tests.synthetic_asset import SUN_DIRECTION, SUN_IRRADIANCE, sky_of
-from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS, USDLUX, Lamp, write_lights_layer
+from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS, USDLUX, Lamp, write_lights_layer
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_stage, sky_of_picture
@@ -114,24 +114,24 @@ def test_the_looks_switch_in_either_variant(built, look):
         stage = opened(built, variant)
         stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection(look)
         (chair,) = (
-            stage.GetPrimAtPath("/room/geo/Stuhl_No_1")
+            stage.GetPrimAtPath("/room/geo/Stuhl_No_1/Stuhl_No_1")
             .GetRelationship("material:binding")
             .GetTargets()
         )
-        expected = "/room/mtl" if look == "shaded" else f"/room/looks/{look}"
-        assert chair == f"{expected}/Stuhl_No_1"
+        expected = "mtl/Stuhl_No_1" if look == "shaded" else f"looks/{look}"
+        assert chair == f"/room/geo/Stuhl_No_1/{expected}"
         # A map of the lamp is a map still: only the lamp's own material is switched off.
         emits = [
             s.name
             for s in render_scene_from_stage(stage, TIME, lambda _: None).surfaces
             if s.material.emits
         ]
-        assert ("/room/geo/lamp" in emits) == (look != "shaded" or variant == EMISSIVE)
+        assert ("/room/geo/lamp/lamp" in emits) == (look != "shaded" or variant == EMISSIVE)
 
 
 def test_a_muted_layer_leaves_the_lamps_on(built):
     stage = opened(built, USDLUX)
-    layers = [layer for layer in stage.GetLayerStack() if layer.GetDisplayName() == "lights.usda"]
+    layers = [layer for layer in stage.GetUsedLayers() if layer.GetDisplayName() == "lights.usda"]
     stage.MuteLayer(layers[0].identifier)
     found = render_scene_from_stage(stage, TIME, pytest.fail)
     assert not found.lights
@@ -191,10 +191,10 @@ def test_a_ball_is_hidden_inside_its_light(built):
     stage = opened(built, USDLUX)
     (light,) = (p for p in stage.TraverseAll() if p.HasAPI(UsdLux.LightAPI))
     assert light.GetTypeName() == "SphereLight"
-    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp"))
+    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp/lamp"))
     assert imageable.ComputeVisibility() == UsdGeom.Tokens.invisible
     stage = opened(built, EMISSIVE)
-    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp"))
+    imageable = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/lamp/lamp"))
     assert imageable.ComputeVisibility() == UsdGeom.Tokens.inherited
 
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from pxr import Sdf, Usd, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.errors import UsdBrdfError
@@ -61,11 +61,11 @@ def test_every_object_is_bound_in_every_look(built, look):
         material = bound(stage, prim_path)
         assert material, f"<{prim_path}> has no material in the look {look}"
         if look == "shaded":
-            expected = f"/room/mtl/{identifier}"
+            expected = f"/room/geo/{identifier}/mtl/{identifier}"
         elif material.GetPath().name == "no_data":
-            expected = "/room/looks/no_data"
+            expected = f"/room/geo/{identifier}/looks/no_data"
         else:
-            expected = f"/room/looks/{look}/{identifier}"
+            expected = f"/room/geo/{identifier}/looks/{look}"
         assert material.GetPath() == expected
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             api = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath(prim_path))
@@ -96,7 +96,7 @@ def test_a_map_is_shown_unlit_and_raw(built, look):
 def test_what_is_not_known_is_not_black(built, look):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     select(stage, look)
-    shader = surface_of(bound(stage, "/room/geo/wall"))
+    shader = surface_of(bound(stage, "/room/geo/wall/wall"))
     assert source_of(shader, "emissiveColor") is None
     assert shader.GetInput("emissiveColor").Get() == (0.5, 0, 0.5)
 
@@ -124,6 +124,21 @@ def test_the_shaded_material_of_a_reflector(built):
     assert not shader.GetInput("specularColor")
 
 
+def test_without_materials_objects_show_their_mean_colour(built):
+    """The wall has no refined colour of its own here, and the lamp has its hue."""
+    built.fitted = (
+        built.fitted[0],
+        replace(built.fitted[1], mean_color=(0, 0, 0)),
+        built.fitted[2],
+    )
+    built.write_layer("material")
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    shown = [UsdGeom.Gprim.Get(stage, path).GetDisplayColorPrimvar() for path in built.prims]
+    assert {primvar.GetInterpolation() for primvar in shown} == {"constant"}
+    expected = [(0.25, 0.125, 0.0625), (0.5, 0.25, 0.125), (1, 0.875, 0.75)]
+    assert [tuple(primvar.Get()[0]) for primvar in shown] == expected
+
+
 def test_without_a_refined_colour_the_material_reads_the_albedo(built):
     built.fitted = tuple(replace(item, aovs=()) for item in built.fitted)
     built.write_layer("material")
@@ -135,7 +150,7 @@ def test_without_a_refined_colour_the_material_reads_the_albedo(built):
 
 def test_the_shaded_material_of_an_emitter(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
-    shader = surface_of(bound(stage, "/room/geo/lamp"))
+    shader = surface_of(bound(stage, "/room/geo/lamp/lamp"))
     assert shader.GetInput("diffuseColor").Get() == (0, 0, 0)
     assert source_of(shader, "diffuseColor") is None
     emission = source_of(shader, "emissiveColor")
@@ -164,7 +179,7 @@ def test_a_map_that_is_missing_is_our_own_mistake(built):
 def test_without_a_fit_there_is_no_lobe(built):
     """The wall was not seen: its material stays diffuse, as the shading layer wrote it."""
     stage = Usd.Stage.Open(str(built.asset.root_layer))
-    shader = surface_of(bound(stage, "/room/geo/wall"))
+    shader = surface_of(bound(stage, "/room/geo/wall/wall"))
     assert shader.GetInput("ior").Get() == 1
     assert shader.GetInput("roughness").Get() == 1
 
@@ -189,10 +204,10 @@ def test_what_the_artist_overrides_survives_all_stages_run_again(built):
     edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     stage.SetEditTarget(edits)
-    surface = UsdShade.Shader.Get(stage, "/room/mtl/Stuhl_No_1/PreviewSurface")
+    surface = UsdShade.Shader.Get(stage, "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface")
     surface.GetInput("roughness").Set(0.125)
     own = UsdShade.Material.Define(stage, "/room/mtl/mine")
-    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/room/geo/wall")).Bind(own)
+    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/room/geo/wall/wall")).Bind(own)
     stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection("albedo")
     edits.Save()
     before = built.asset.edits_layer.read_bytes()
@@ -204,7 +219,7 @@ def test_what_the_artist_overrides_survives_all_stages_run_again(built):
     fresh = Usd.Stage.Open(str(built.asset.root_layer))
     fresh.Reload()
     assert fresh.GetDefaultPrim().GetVariantSet("look").GetVariantSelection() == "albedo"
-    assert bound(fresh, "/room/geo/wall").GetPath() == "/room/mtl/mine"
+    assert bound(fresh, "/room/geo/wall/wall").GetPath() == "/room/mtl/mine"
     select(fresh, "shaded")
     shader = surface_of(bound(fresh, built.prims[0]))
     assert shader.GetInput("roughness").Get() == 0.125

@@ -8,8 +8,8 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdMedia
 
 from usdbrdf.asset.layers.scan_layer import is_edited
-from usdbrdf.asset.layout import relative_path
-from usdbrdf.asset.readers.compose import open_weaker
+from usdbrdf.asset.layout import Asset, relative_path
+from usdbrdf.asset.readers.compose import open_edited, open_weaker
 from usdbrdf.asset.readers.scene import capture_camera, frames_from_stage, scene_from_stage
 from usdbrdf.errors import InputRefused
 
@@ -22,7 +22,7 @@ def stage_of(built):
 
 def test_every_object_is_one_mesh_with_its_own_points(built):
     stage = stage_of(built)
-    mesh = UsdGeom.Mesh.Get(stage, "/room/geo/Stuhl_No_1")
+    mesh = UsdGeom.Mesh.Get(stage, "/room/geo/Stuhl_No_1/Stuhl_No_1")
     points = np.array(mesh.GetPointsAttr().Get())
     assert len(points) == 8
     assert len(mesh.GetFaceVertexCountsAttr().Get()) == 12
@@ -31,7 +31,7 @@ def test_every_object_is_one_mesh_with_its_own_points(built):
     )
     assert mesh.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.none
     assert mesh.GetNormalsInterpolation() == UsdGeom.Tokens.faceVarying
-    assert mesh.GetDoubleSidedAttr().Get()
+    assert not mesh.GetDoubleSidedAttr().Get(), "it is closed"
     valid, reason = UsdGeom.Mesh.ValidateTopology(
         mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), len(points)
     )
@@ -54,9 +54,26 @@ def test_copies_of_a_point_are_merged_and_the_surface_stays(tmp_path, synthetic)
     )
 
 
+def test_only_what_encloses_nothing_has_two_sides(tmp_path, synthetic):
+    """The chair loses a triangle: it has an edge now, through which one sees its back."""
+    scan = synthetic.make_scan(tmp_path / "capture")
+    own = np.flatnonzero(scan.mesh.face_object == 0)
+    kept = np.delete(np.arange(len(scan.mesh.triangles)), own[3])
+    mesh = replace(
+        scan.mesh,
+        triangles=scan.mesh.triangles[kept],
+        corner_normals=scan.mesh.corner_normals[kept],
+        face_object=scan.mesh.face_object[kept],
+    )
+    built = synthetic.build(tmp_path / "room", replace(scan, mesh=mesh), upto="scan")
+    stage = stage_of(built)
+    two_sided = [UsdGeom.Mesh.Get(stage, p).GetDoubleSidedAttr().Get() for p in built.prims]
+    assert two_sided == [True, False, False]
+
+
 def test_names_classes_and_kinds(built):
     stage = stage_of(built)
-    prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1")
+    prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1/Stuhl_No_1")
     assert prim.GetDisplayName() == "Stuhl Nº 1"
     assert prim.GetAttribute("usdBrdf:label").Get() == "Stuhl Nº 1"
     assert prim.GetAttribute("usdBrdf:class").Get() == "chair"
@@ -69,7 +86,7 @@ def test_names_classes_and_kinds(built):
     ]
     assert kinds == ["assembly", "group", "component"]
     # An unknown class is not written as an empty label.
-    assert not stage.GetPrimAtPath("/room/geo/lamp").HasAPI("SemanticsLabelsAPI")
+    assert not stage.GetPrimAtPath("/room/geo/lamp/lamp").HasAPI("SemanticsLabelsAPI")
 
 
 def test_an_object_without_faces_is_left_out(tmp_path, synthetic):
@@ -149,7 +166,7 @@ def test_photographs_that_are_not_radiometric_are_marked(tmp_path, synthetic):
 
 def test_a_photograph_that_is_gone_keeps_its_path(built):
     built.scan.frames.image_paths[1].unlink()
-    frames = frames_from_stage(stage_of(built))
+    frames = frames_from_stage(open_edited(built.asset))
     assert frames.image_paths == built.scan.frames.image_paths
 
 
@@ -157,8 +174,10 @@ def test_the_asset_finds_its_photographs_after_both_moved_together(tmp_path, syn
     scan = synthetic.make_scan(tmp_path / "a" / "capture")
     built = synthetic.build(tmp_path / "a" / "out" / "room", scan, upto="scan")
     (tmp_path / "a").rename(tmp_path / "b")
-    stage = Usd.Stage.Open(str(tmp_path / "b" / "out" / "room" / built.asset.root_layer.name))
-    assert all(path.is_file() for path in frames_from_stage(stage).image_paths)
+    moved = Asset(tmp_path / "b" / "out" / "room", built.asset.name)
+    frames = frames_from_stage(open_weaker(moved, "texturing"))
+    assert len(frames.image_paths) == 3
+    assert all(path.is_file() for path in frames.image_paths)
 
 
 def test_paths_pass_through_links_to_folders(tmp_path):
@@ -197,6 +216,9 @@ def test_render_settings_show_the_capture(built):
 
 
 def test_the_photographs_are_muted_plates_of_the_camera(built):
+    edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
+    edits.subLayerPaths = [f"./layers/{built.asset.photographs_layer.name}"]
+    edits.Save()
     stage = stage_of(built)
     camera = capture_camera(stage).GetPrim()
     assert "BackPlateAPI:photograph" in camera.GetMetadata("apiSchemas").GetAppliedItems()

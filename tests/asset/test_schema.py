@@ -195,7 +195,7 @@ import json, sys
 from pxr import Usd
 stage = Usd.Stage.Open(sys.argv[1])
 assert not stage.GetCompositionErrors()
-prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1")
+prim = stage.GetPrimAtPath("/room/geo/Stuhl_No_1/Stuhl_No_1")
 phi = prim.GetAttribute("usdBrdf:fit:phi")
 print(json.dumps({
     "phi": phi.Get(),

@@ -38,6 +38,22 @@ WRITTEN = {
 }
 
 
+def picture_of(stage, folder):
+    """(WIDTH, WIDTH, 3) radiance under one light; the stage's root layer is a file, which is
+    saved."""
+    light = UsdLux.DistantLight.Define(stage, "/light")
+    light.CreateIntensityAttr(20_000.0)
+    light.AddRotateXYZOp().Set(Gf.Vec3f(80, 0, 10))
+    camera = UsdGeom.Camera.Define(stage, "/camera")
+    camera.AddTranslateOp().Set(Gf.Vec3d(*EYE.tolist()))
+    camera.AddRotateXOp().Set(90.0)
+    camera.CreateFocalLengthAttr(FOCAL)
+    camera.CreateHorizontalApertureAttr(1.0)
+    camera.CreateVerticalApertureAttr(1.0)
+    stage.GetRootLayer().Save()
+    return storm(stage.GetRootLayer().realPath, "/camera", [1], folder, width=WIDTH)[0]
+
+
 def pixels(asset, folder, *, look="shaded", instead=()):
     """Radiance (3,) of each object under one light, the look as it is or other materials instead
     of its own: {object: Shown}."""
@@ -54,19 +70,9 @@ def pixels(asset, folder, *, look="shaded", instead=()):
         shader = surface(layer, f"/instead/{name}", roughness=shown.roughness, ior=shown.ior)
         shader.attributes["inputs:diffuseColor"].default = Gf.Vec3f(shown.diffuse)
         shader.attributes["inputs:emissiveColor"].default = Gf.Vec3f(shown.emission)
-        binding = UsdShade.MaterialBindingAPI.Apply(root.GetPrimAtPath(f"geo/{name}"))
+        binding = UsdShade.MaterialBindingAPI.Apply(root.GetPrimAtPath(f"geo/{name}/{name}"))
         binding.Bind(UsdShade.Material.Get(stage, f"/instead/{name}"))
-    light = UsdLux.DistantLight.Define(stage, "/light")
-    light.CreateIntensityAttr(20_000.0)
-    light.AddRotateXYZOp().Set(Gf.Vec3f(80, 0, 10))
-    camera = UsdGeom.Camera.Define(stage, "/camera")
-    camera.AddTranslateOp().Set(Gf.Vec3d(*EYE.tolist()))
-    camera.AddRotateXOp().Set(90.0)
-    camera.CreateFocalLengthAttr(FOCAL)
-    camera.CreateHorizontalApertureAttr(1.0)
-    camera.CreateVerticalApertureAttr(1.0)
-    layer.Save()
-    picture = storm(layer.realPath, "/camera", [1], folder, width=WIDTH)[0]
+    picture = picture_of(stage, folder)
     found = {}
     for name, point in SEEN.items():
         x, depth, z = point - EYE
@@ -117,3 +123,28 @@ def test_a_look_of_a_moved_asset_shows_its_maps(moved, tmp_path, look):
     for name, radiance in found.items():
         expected = unseen if name == "wall" else (0.25,) * 3
         assert radiance == pytest.approx(expected, abs=1e-3), name
+
+
+def test_a_component_alone_looks_as_in_the_room(moved, tmp_path):
+    """By its own file, put where it stands in the room."""
+    for name in SEEN:
+        pictures = []
+        for where in ("room", "alone"):
+            folder = tmp_path / f"{name} {where}"
+            folder.mkdir()
+            stage = Usd.Stage.CreateNew(str(folder / "shot.usda"))
+            UsdGeom.SetStageUpAxis(stage, "Z")
+            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+            prim = stage.DefinePrim("/shown")
+            if where == "room":
+                prim.GetReferences().AddReference(str(moved.root_layer))
+                for other in SEEN.keys() - {name}:
+                    stage.GetPrimAtPath(f"/shown/geo/{other}").SetActive(False)
+                placed = UsdGeom.Xformable(stage.GetPrimAtPath(f"/shown/geo/{name}"))
+                pose = placed.GetLocalTransformation()
+            else:
+                prim.GetReferences().AddReference(str(moved.folder / moved.component(name)))
+                UsdGeom.Xformable(prim).AddTransformOp().Set(pose)
+            pictures.append(picture_of(stage, folder))
+        assert (pictures[0] > 0.05).any()
+        assert np.array_equal(*pictures), name

@@ -12,9 +12,10 @@ from usdbrdf.delivery.package import package
 from usdbrdf.options import PackageOptions
 
 TIME = Usd.TimeCode.EarliestTime()
-CHAIR_FILE = """over "room" {{ over "mtl" {{ over "Stuhl_No_1" {{ over "BaseColorTexture" {{
+CHAIR_FILE = """over "room" {{ over "geo" {{ over "Stuhl_No_1" {{ over "mtl" {{
+over "Stuhl_No_1" {{ over "BaseColorTexture" {{
     asset inputs:file = @{}@
-}} }} }} }}"""
+}} }} }} }} }} }}"""
 
 
 def packed(room, tmp_path, name="room.usdz", **options):

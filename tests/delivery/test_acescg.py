@@ -58,9 +58,9 @@ def version(room, tmp_path):
         room,
         """over "room" {
         def Sphere "ball" { color3f[] primvars:displayColor = [(0.8, 0.4, 0.1)] }
-        over "mtl" { over "wall" {
+        over "geo" { over "wall" { over "mtl" { over "wall" {
             over "PreviewSurface" {
-                float inputs:roughness.connect = </room/mtl/wall/Rough.outputs:r>
+                float inputs:roughness.connect = </room/geo/wall/mtl/wall/Rough.outputs:r>
             }
             def Shader "Rough" {
                 uniform token info:id = "UsdUVTexture"
@@ -69,7 +69,7 @@ def version(room, tmp_path):
                 float4 inputs:fallback = (0.5, 0.25, 0.1, 1)
                 float outputs:r
             }
-        } } }""",
+        } } } } }""",
     )
     options = PublishOptions(texture_space="acescg", photographs=False)
     publish(folder, tmp_path / "dest", options)
@@ -79,7 +79,9 @@ def version(room, tmp_path):
 def test_all_colours_are_in_acescg_and_nothing_else_is(room, version):
     here = Usd.Stage.Open(str(room.asset.root_layer))
     there = Usd.Stage.Open(str(version / "room.usd"))
-    space = Usd.ColorSpaceAPI.ComputeColorSpaceName(there.GetPrimAtPath("/room/mtl/wall"), None)
+    space = Usd.ColorSpaceAPI.ComputeColorSpaceName(
+        there.GetPrimAtPath("/room/geo/wall/mtl/wall"), None
+    )
     assert space == "lin_ap1_scene"
     # Textures of colours, their headers and their tags in the stage.
     for name in ("Stuhl_No_1.base_color", "lamp.emission", "lamp.lit"):
@@ -88,19 +90,19 @@ def test_all_colours_are_in_acescg_and_nothing_else_is(room, version):
         assert colour_tag(file)[1] == pytest.approx([*sum(AP1[0], ()), *AP1[1]])
         expected = converted(read_exr(room.asset.folder / f"textures/{name}.exr"))
         assert read_exr(file) == pytest.approx(expected, rel=2e-3, abs=1e-4)
-    node = there.GetPrimAtPath("/room/mtl/Stuhl_No_1/BaseColorTexture")
+    node = there.GetPrimAtPath("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture")
     assert node.GetAttribute("inputs:file").GetColorSpace() == "lin_ap1_scene"
     assert node.GetAttribute("inputs:sourceColorSpace").Get() == "raw"
     # Constants: fallbacks, display colours, lights.
     for path, name in (
-        ("/room/mtl/Stuhl_No_1/BaseColorTexture", "inputs:fallback"),
+        ("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture", "inputs:fallback"),
         ("/room/ball", "primvars:displayColor"),
     ):
         before, after = (s.GetPrimAtPath(path).GetAttribute(name).Get() for s in (here, there))
         rows = [np.atleast_2d(np.array(value, float))[:, :3] for value in (before, after)]
         assert rows[1] == pytest.approx(converted(rows[0]), abs=1e-5)
     # Data, and what was measured, stay.
-    rough = there.GetPrimAtPath("/room/mtl/wall/Rough")
+    rough = there.GetPrimAtPath("/room/geo/wall/mtl/wall/Rough")
     assert rough.GetAttribute("inputs:fallback").Get() == pytest.approx((0.5, 0.25, 0.1, 1))
     assert np.array_equal(
         read_exr(version / "rough.exr"), read_exr(room.asset.folder / "rough.exr")
@@ -131,9 +133,10 @@ def test_a_package_in_acescg(room, tmp_path):
 def test_factors_that_differ_by_channel_are_refused(room, tmp_path):
     edit(
         room,
-        """over "room" { over "mtl" { over "Stuhl_No_1" { over "BaseColorTexture" {
+        """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
+        over "Stuhl_No_1" { over "BaseColorTexture" {
         float4 inputs:scale = (1, 0.5, 0.5, 1)
-        } } } }""",
+        } } } } } }""",
     )
     with pytest.raises(InputRefused, match=r"colour\.scale"):
         publish(room.asset.folder, tmp_path / "d", PublishOptions(texture_space="acescg"))

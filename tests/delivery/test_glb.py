@@ -96,7 +96,9 @@ def test_a_material_is_what_other_renderers_are_told(room, tmp_path, mapping):
     package(room.asset.folder, tmp_path / "room.glb")
     materials = {m["name"]: m for m in document(tmp_path / "room.glb")["materials"]}
     stage = stage_in_look(room.asset, "shaded")
-    told = stage.GetPrimAtPath("/room/mtl/Stuhl_No_1/PreviewSurface").GetAttribute("inputs:ior")
+    told = stage.GetPrimAtPath("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface").GetAttribute(
+        "inputs:ior"
+    )
     found = materials["Stuhl_No_1"]["extensions"]["KHR_materials_ior"]["ior"]
     assert found == pytest.approx(told.Get(), rel=1e-4)
     assert (abs(found - 1.5) < 1e-4) == (mapping == "measured")

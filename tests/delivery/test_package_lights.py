@@ -16,14 +16,14 @@ def test_lights_that_the_artist_selected_travel(room, tmp_path):
     edit(room, LIGHTS_SELECTED)
     stage = extracted(packed(room, tmp_path), tmp_path / "x")
     assert len(lights_of(stage)) == 6
-    assert not surfaces_of(stage)["/room/geo/lamp"].material.emits
+    assert not surfaces_of(stage)["/room/geo/lamp/lamp"].material.emits
 
 
 def test_lamps_glow_where_the_package_holds_no_lights(room, tmp_path, capsys):
-    here = surfaces_of(stage_in_look(room.asset))["/room/geo/lamp"].material.emission
+    here = surfaces_of(stage_in_look(room.asset))["/room/geo/lamp/lamp"].material.emission
     edit(room, LIGHTS_SELECTED)
     stage = extracted(packed(room, tmp_path, profile="arkit"), tmp_path / "x")
-    there = surfaces_of(stage)["/room/geo/lamp"].material.emission
+    there = surfaces_of(stage)["/room/geo/lamp/lamp"].material.emission
     assert there.max() == pytest.approx(8, rel=1e-3)
     assert there == pytest.approx(here, abs=0.05)
     assert lights_of(stage) == []

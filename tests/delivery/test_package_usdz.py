@@ -54,7 +54,7 @@ def test_eight_bits_keep_colours_and_high_emission(room, tmp_path):
     output = packed(room, tmp_path, textures="png")
     here = surfaces_of(stage_in_look(room.asset, "shaded"))
     there = surfaces_of(extracted(output, tmp_path / "x"))
-    chair, lamp = "/room/geo/Stuhl_No_1", "/room/geo/lamp"
+    chair, lamp = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/lamp/lamp"
     diffuse = here[chair].material.diffuse
     # Half a step of sRGB, at its steepest: 1 / (2 * 255) * 2.3 at the white end.
     assert there[chair].material.diffuse == pytest.approx(diffuse, abs=5e-3)
@@ -71,7 +71,7 @@ def test_one_look_and_its_textures_only(room, tmp_path):
     }  # fmt: skip
     stage = Usd.Stage.Open(str(output))
     assert not stage.GetDefaultPrim().HasVariantSets()
-    assert not stage.GetPrimAtPath("/room/mtl")
+    assert not stage.GetPrimAtPath("/room/geo/Stuhl_No_1/mtl")
     assert not stage.GetPrimAtPath("/room/render")
     thumbnail = UsdMedia.AssetPreviewsAPI(stage.GetDefaultPrim()).GetDefaultThumbnails()
     assert thumbnail.defaultImage.path == "./previews/lit.png"
@@ -123,8 +123,10 @@ def test_textures_are_reduced(room, tmp_path, textures):
     extracted(packed(room, tmp_path, textures=textures, max_size=4), tmp_path / "x")
     width, height, _ = image_size(tmp_path / f"x/textures/Stuhl_No_1.base_color.{textures}")
     assert (width, height) == (3, 4)
-    here = surfaces_of(stage_in_look(room.asset, "shaded"))["/room/geo/Stuhl_No_1"]
-    there = surfaces_of(Usd.Stage.Open(str(tmp_path / "x/room.usdc")))["/room/geo/Stuhl_No_1"]
+    here = surfaces_of(stage_in_look(room.asset, "shaded"))["/room/geo/Stuhl_No_1/Stuhl_No_1"]
+    there = surfaces_of(Usd.Stage.Open(str(tmp_path / "x/room.usdc")))[
+        "/room/geo/Stuhl_No_1/Stuhl_No_1"
+    ]
     expected = here.material.diffuse.reshape(4, 2, 3, 2, 3).mean(axis=(1, 3))
     assert there.material.diffuse == pytest.approx(expected, abs=5e-3)
 
@@ -140,18 +142,18 @@ def test_data_is_not_taken_for_colour(room, tmp_path):
     write_exr(room.asset.folder / "rough.exr", values)
     edit(
         room,
-        """over "room" { over "mtl" { over "Stuhl_No_1" {
+        """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" { over "Stuhl_No_1" {
         over "PreviewSurface" {
-            float inputs:roughness.connect = </room/mtl/Stuhl_No_1/Rough.outputs:r>
+            float inputs:roughness.connect = </room/geo/Stuhl_No_1/mtl/Stuhl_No_1/Rough.outputs:r>
         }
         def Shader "Rough" {
             uniform token info:id = "UsdUVTexture"
             asset inputs:file = @./rough.exr@
             token inputs:sourceColorSpace = "raw"
-            float2 inputs:st.connect = </room/mtl/Stuhl_No_1/StReader.outputs:result>
+            float2 inputs:st.connect = </room/geo/Stuhl_No_1/mtl/Stuhl_No_1/StReader.outputs:result>
             float outputs:r
         }
-    } } }""",
+    } } } } }""",
     )
     stage = extracted(packed(room, tmp_path, textures="png"), tmp_path / "x")
     (use,) = (
@@ -159,7 +161,7 @@ def test_data_is_not_taken_for_colour(room, tmp_path):
         if u.prim_path.endswith("Rough")
     )  # fmt: skip
     assert (use.space, use.colour) == ("raw", False)
-    found = surfaces_of(stage)["/room/geo/Stuhl_No_1"].material.roughness[..., 0]
+    found = surfaces_of(stage)["/room/geo/Stuhl_No_1/Stuhl_No_1"].material.roughness[..., 0]
     assert found == pytest.approx(values, abs=3e-3)
 
 
@@ -183,7 +185,7 @@ def test_arkit_stands_upright(room, tmp_path):
     assert not any(prim.IsA(UsdGeom.Camera) for prim in stage.TraverseAll())
     assert stage.GetRootLayer().GetFileFormat().formatId == "usdz"
     bounds = UsdGeom.BBoxCache(TIME, ["default"]).ComputeWorldBound(
-        stage.GetPrimAtPath("/room/geo/wall")
+        stage.GetPrimAtPath("/room/geo/wall/wall")
     )
     box = bounds.ComputeAlignedRange()
     # The wall's middle was at y 3 and z 1 with z up.

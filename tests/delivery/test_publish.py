@@ -21,9 +21,10 @@ from usdbrdf.job.ownership import folder_lock
 from usdbrdf.options import PublishOptions
 from usdbrdf.validation.validate import own_findings
 
-RED = """over "room" { over "mtl" { over "Stuhl_No_1" { over "PreviewSurface" {
+RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
+over "Stuhl_No_1" { over "PreviewSurface" {
     float inputs:roughness = 0.125
-} } } }"""
+} } } } } }"""
 
 
 def bytes_of(folder):
@@ -80,7 +81,7 @@ def test_versions_follow_each_other_and_never_change(room, tmp_path):
     assert room.asset.edits_layer.is_file()
     # What the work folder says later is not what was published.
     stage = Usd.Stage.Open(str(dest / "v001/room.usd"))
-    surface = stage.GetPrimAtPath("/room/mtl/Stuhl_No_1/PreviewSurface")
+    surface = stage.GetPrimAtPath("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface")
     assert surface.GetAttribute("inputs:roughness").Get() == 0.5
     with pytest.raises(OwnershipConflict, match=r"v001: this version is there.*publish\.version"):
         publish(folder, dest, PublishOptions(version="v001"))

@@ -358,7 +358,7 @@ def test_the_lamp_keeps_its_radiance(room: Room, fitted: Asset):
 def _diffuse_color(asset: Asset, label: str) -> str:
     """The file that a renderer reads an object's colour from."""
     stage = Usd.Stage.Open(str(asset.root_layer))
-    prim = stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{label}")
+    prim = stage.GetPrimAtPath(f"{stage.GetDefaultPrim().GetPath()}/geo/{label}/{label}")
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0]
     sources, _ = shader.GetInput("diffuseColor").GetConnectedSources()

@@ -19,7 +19,7 @@ EXPECTED: dict[str, Any] = {
     "binding beside the looks, shaded": MINE,
     "binding beside the looks, albedo": MINE,
     "binding in a look, shaded": MINE,
-    "binding in a look, albedo": "/room/looks/albedo/ceiling",
+    "binding in a look, albedo": "/room/geo/ceiling/looks/albedo",
     "moved": (0.5, 0.25, 1.0),
     "deactivated": False,
     "hidden": "invisible",
@@ -61,10 +61,10 @@ def edit(asset: Asset) -> None:
     UsdGeom.Xformable(prim_of(stage, "box")).AddTranslateOp().Set(Gf.Vec3d(0.5, 0.25, 1.0))
     prim_of(stage, "north").SetActive(False)
     UsdGeom.Imageable(prim_of(stage, "lamp")).MakeInvisible()
-    texture = UsdShade.Shader.Get(stage, "/room/mtl/west/BaseColorTexture")
+    texture = UsdShade.Shader.Get(stage, "/room/geo/west/mtl/west/BaseColorTexture")
     texture.GetInput("file").Set(Sdf.AssetPath("./mine/west.exr"))
     prim_of(stage, "floor").SetDisplayName("Parkett")
-    plant = UsdGeom.Mesh.Define(stage, "/room/geo/plant")
+    plant = UsdGeom.Mesh.Define(stage, "/room/geo/plant/plant")
     plant.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
     plant.CreateFaceVertexCountsAttr([3])
     plant.CreateFaceVertexIndicesAttr([0, 1, 2])
@@ -87,10 +87,14 @@ def read(stage: Usd.Stage) -> dict[str, Any]:
     attributes = UsdShade.Utils.GetValueProducingAttributes(
         surface_of(stage, "floor").GetInput("diffuseColor")
     )
-    texture = UsdShade.Shader.Get(stage, "/room/mtl/west/BaseColorTexture").GetInput("file").Get()
+    texture = (
+        UsdShade.Shader.Get(stage, "/room/geo/west/mtl/west/BaseColorTexture")
+        .GetInput("file")
+        .Get()
+    )
     plant, key = prim_of(stage, "plant"), stage.GetPrimAtPath("/room/key")
     note = prim_of(stage, "ceiling").GetAttribute("userProperties:note")
-    place = UsdGeom.Xformable(prim_of(stage, "box")).ComputeLocalToWorldTransform(0)
+    place = UsdGeom.Xformable(prim_of(stage, "box")).GetLocalTransformation()
     return {
         "roughness": surface_of(stage, "box").GetInput("roughness").Get(),
         "ior": surface_of(stage, "box").GetInput("ior").Get(),
@@ -116,8 +120,8 @@ def in_shot(asset: Asset) -> tuple[Any, ...]:
     """What a shot says about the asset that it references, as it composes there."""
     stage = Usd.Stage.Open(str(asset.folder / "mine" / "shot.usda"))
     assert not stage.GetCompositionErrors()
-    shader = UsdShade.Shader.Get(stage, "/shot/set/mtl/box/PreviewSurface")
-    box = stage.GetPrimAtPath("/shot/set/geo/box")
+    shader = UsdShade.Shader.Get(stage, "/shot/set/geo/box/mtl/box/PreviewSurface")
+    box = stage.GetPrimAtPath("/shot/set/geo/box/box")
     renamed = stage.GetPrimAtPath("/shot/set/geo/east_wall")
     return (
         shader.GetInput("roughness").Get(),
@@ -125,19 +129,19 @@ def in_shot(asset: Asset) -> tuple[Any, ...]:
         stage.GetPrimAtPath("/shot/set").GetVariantSet("look").GetVariantSelection(),
         bool(stage.GetPrimAtPath("/shot/set/geo/east")),
         renamed.GetTypeName(),
-        UsdShade.MaterialBindingAPI(renamed).ComputeBoundMaterial()[0].GetPath(),
+        UsdShade.MaterialBindingAPI(renamed.GetChild("east")).ComputeBoundMaterial()[0].GetPath(),
     )
 
 
-IN_SHOT = (0.75, "invisible", "lit", False, "Mesh", "/shot/set/looks/lit/east")
+IN_SHOT = (0.75, "invisible", "lit", False, "Xform", "/shot/set/geo/east_wall/looks/lit")
 
 
 def prim_of(stage: Usd.Stage, name: str) -> Usd.Prim:
-    return stage.GetPrimAtPath(f"/room/geo/{name}")
+    return stage.GetPrimAtPath(f"/room/geo/{name}/{name}")
 
 
 def surface_of(stage: Usd.Stage, name: str) -> UsdShade.Shader:
-    return UsdShade.Shader.Get(stage, f"/room/mtl/{name}/PreviewSurface")
+    return UsdShade.Shader.Get(stage, f"/room/geo/{name}/mtl/{name}/PreviewSurface")
 
 
 def bound(stage: Usd.Stage, name: str) -> str:
@@ -150,7 +154,7 @@ _TOKEN = Sdf.ValueTypeNames.Token
 
 def _own_layer(asset: Asset) -> None:
     layer = Sdf.Layer.CreateNew(str(asset.folder / "mine" / "more.usda"))
-    prim = Sdf.CreatePrimInLayer(layer, "/room/geo/ceiling")
+    prim = Sdf.CreatePrimInLayer(layer, "/room/geo/ceiling/ceiling")
     note = Sdf.AttributeSpec(prim, "userProperties:note", Sdf.ValueTypeNames.String)
     note.default = "keep"
     layer.Save()
@@ -161,8 +165,10 @@ def _shot(asset: Asset) -> None:
     shown = stage.DefinePrim("/shot/set", "Xform")
     shown.GetReferences().AddReference(f"../{asset.root_layer.name}")
     shown.GetVariantSet("look").SetVariantSelection("lit")
-    UsdShade.Shader.Get(stage, "/shot/set/mtl/box/PreviewSurface").GetInput("roughness").Set(0.75)
-    UsdGeom.Imageable(stage.GetPrimAtPath("/shot/set/geo/box")).MakeInvisible()
+    UsdShade.Shader.Get(stage, "/shot/set/geo/box/mtl/box/PreviewSurface").GetInput(
+        "roughness"
+    ).Set(0.75)
+    UsdGeom.Imageable(stage.GetPrimAtPath("/shot/set/geo/box/box")).MakeInvisible()
     # Within one stack of layers nothing can be renamed; what is referenced can.
     stage.GetRootLayer().relocates = [("/shot/set/geo/east", "/shot/set/geo/east_wall")]
     stage.Save()

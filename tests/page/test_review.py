@@ -20,7 +20,7 @@ from usdbrdf.asset.review import (
 )
 from usdbrdf.errors import InputRefused
 
-CHAIR, WALL = "/room/geo/Stuhl_No_1", "/room/geo/wall"
+CHAIR, WALL = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/wall/wall"
 
 
 def fit(**numbers):

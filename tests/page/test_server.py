@@ -15,7 +15,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.page import server as server_module
 from usdbrdf.page.server import PageServer
 
-CHAIR = "/room/geo/Stuhl_No_1"
+CHAIR = "/room/geo/Stuhl_No_1/Stuhl_No_1"
 
 
 @pytest.fixture

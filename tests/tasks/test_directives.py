@@ -29,7 +29,7 @@ OPTIONS = usdbrdf.ConvertOptions(
 
 
 def _say(asset: Asset, **words: str) -> None:
-    said = {f"/room/geo/{name}": Judgement(directive=word) for name, word in words.items()}
+    said = {f"/room/geo/{name}/{name}": Judgement(directive=word) for name, word in words.items()}
     write_review(asset, said)
 
 
@@ -47,7 +47,7 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
     _say(asset, **asked)
     assert reran() == ["fit"]
     stage = open_measured(asset)
-    fits = {name: read_fit(stage, f"/room/geo/{name}") for name in capture.names}
+    fits = {name: read_fit(stage, f"/room/geo/{name}/{name}") for name in capture.names}
     words = {name: fit.directive for name, fit in fits.items()}
     assert words == {
         "floor": "metal",
@@ -59,11 +59,11 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
     for name in ("box", "walls"):
         assert (fits[name].num_pixels, fits[name].status) == (0, "prior")
     assert [name for name, fit in fits.items() if fit.is_glass] == ["walls"]
-    surface = UsdShade.Shader.Get(stage, "/room/mtl/walls/PreviewSurface")
+    surface = UsdShade.Shader.Get(stage, "/room/geo/walls/mtl/walls/PreviewSurface")
     shown = {n: surface.GetInput(n).Get() for n in ("opacity", "roughness", "ior", "diffuseColor")}
     assert shown == {"opacity": 0, "roughness": 0, "ior": 1.5, "diffuseColor": (0, 0, 0)}
     rendered = render_scene_from_stage(stage, time_code(stage, None), lambda _: None)
-    assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls"]
+    assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls/walls"]
     assert not has_errors(validate(asset.root_layer))
     # The capture says of the lamp that it is none: only what it concerns is made again.
     with edited(capture.folder / "objects.json") as document:
@@ -71,13 +71,13 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
         lamp["directive"] = "not-lamp"
     assert reran() == ["ingest", "shade", "fit"]
     assert asset.layer("scan").read_bytes() == scan
-    shading = read_shading(open_measured(asset), "/room/geo/lamp")
+    shading = read_shading(open_measured(asset), "/room/geo/lamp/lamp")
     assert (shading.emitter, shading.directive) == (False, "not-lamp")
     # What a person says afterwards counts before it.
     _say(asset, lamp="lamp", box="lamp")
     assert reran() == ["shade", "fit"]
     stage = open_measured(asset)
-    found = {name: read_shading(stage, f"/room/geo/{name}") for name in ("lamp", "box")}
+    found = {name: read_shading(stage, f"/room/geo/{name}/{name}") for name in ("lamp", "box")}
     assert all(one.emitter and one.directive == "lamp" for one in found.values())
 
 

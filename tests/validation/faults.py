@@ -13,10 +13,10 @@ from usdbrdf.files.images import write_exr
 from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 
 Types = Sdf.ValueTypeNames
-CHAIR, WALL, LAMP = (f"/room/geo/{name}" for name in ("Stuhl_No_1", "wall", "lamp"))
+CHAIR, WALL, LAMP = (f"/room/geo/{name}/{name}" for name in ("Stuhl_No_1", "wall", "lamp"))
 CAMERA = "/room/cameras/capture"
-COLOUR_TEXTURE = "/room/mtl/Stuhl_No_1/BaseColorTexture"
-SURFACE = "/room/mtl/Stuhl_No_1/PreviewSurface"
+COLOUR_TEXTURE = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture"
+SURFACE = "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/PreviewSurface"
 
 
 @contextlib.contextmanager
@@ -152,12 +152,12 @@ def record_edited_instead_of_material(built):
 
 
 def emitter_that_reflects(built):
-    surface = "/room/mtl/lamp/PreviewSurface"
+    surface = "/room/geo/lamp/mtl/lamp/PreviewSurface"
     opinion(built, surface, "inputs:diffuseColor", Types.Color3f, Gf.Vec3f(0.5))
 
 
 def look_that_reflects(built):
-    opinion(built, "/room/looks/lit/lamp/PreviewSurface", "inputs:ior", Types.Float, 1.5)
+    opinion(built, "/room/geo/lamp/looks/lit/PreviewSurface", "inputs:ior", Types.Float, 1.5)
 
 
 def binding_beside_the_looks(built):
@@ -165,12 +165,12 @@ def binding_beside_the_looks(built):
         binding = Sdf.RelationshipSpec(
             Sdf.CreatePrimInLayer(layer, CHAIR), "material:binding", custom=False
         )
-        binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+        binding.targetPathList.explicitItems = [Sdf.Path("/room/geo/wall/mtl/wall")]
 
 
 def look_without_an_object(built):
     with edited(built.asset.layer("texturing")) as layer:
-        prim = layer.GetPrimAtPath("/room{look=coverage}geo/wall")
+        prim = layer.GetPrimAtPath("/room{look=coverage}geo/wall/wall")
         prim.RemoveProperty(prim.relationships["material:binding"])
 
 
@@ -187,7 +187,13 @@ def lights_that_are_not_there(built):
 def lamp_that_glows_beside_its_lights(built):
     with edited(built.asset.edits_layer) as layer:
         layer.GetPrimAtPath("/room").variantSelections["lights"] = "usdlux"
-    opinion(built, "/room/mtl/lamp/EmissionTexture", "inputs:scale", Types.Float4, Gf.Vec4f(0.5))
+    opinion(
+        built,
+        "/room/geo/lamp/mtl/lamp/EmissionTexture",
+        "inputs:scale",
+        Types.Float4,
+        Gf.Vec4f(0.5),
+    )
 
 
 def said_in_a_review(built, **said):

@@ -54,7 +54,7 @@ def test_a_record_that_was_edited_is_as_measured_again(built):
     built.write_layer("material")
     asset = built.asset
     numbers = [f"{SURFACE}.inputs:{name}" for name in ("roughness", "ior")]
-    numbers.append("/room/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale")
+    numbers.append("/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale")
     record = [f"{CHAIR}.usdBrdf:fit:{name}" for name in ("phi", "psi", "mapping")]
     sound = _values(asset, *numbers, *record)
     FAULTS["LobeMatchesFit"](built)

@@ -77,11 +77,11 @@ def test_what_an_artist_may_say_is_no_fault(built):
     opinion(built, f"{SURFACE}", "inputs:useSpecularWorkflow", Types.Int, 1)
     opinion(built, SURFACE, "inputs:specularColor", Types.Color3f, (0.1, 0.1, 0.1))
     with edited(built.asset.edits_layer) as layer:
-        path = "/room{look=mine}geo/lamp"
+        path = "/room{look=mine}geo/lamp/lamp"
         binding = Sdf.RelationshipSpec(
             Sdf.CreatePrimInLayer(layer, path), "material:binding", custom=False
         )
-        binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+        binding.targetPathList.explicitItems = [Sdf.Path("/room/geo/wall/mtl/wall")]
         layer.GetPrimAtPath("/room").variantSelections["look"] = "mine"
     assert own(built) == []
 
@@ -94,7 +94,9 @@ def test_a_lobe_that_was_matched_is_judged_as_such(built, attribute):
     with edited(built.asset.layer("material")) as layer:
         spec = layer.GetAttributeAtPath(f"{SURFACE}.inputs:ior")
         if attribute == "scale":
-            spec = layer.GetAttributeAtPath("/room/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale")
+            spec = layer.GetAttributeAtPath(
+                "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1/BaseColorTexture.inputs:scale"
+            )
         spec.default = spec.default * 1.01
     (finding,) = own(built)
     assert finding.rule == "usdbrdf.LobeMatchesFit"
@@ -111,7 +113,7 @@ def test_a_lamp_counts_once_with_its_lights_alone_or_its_glow_alone(built):
     with edited(built.asset.edits_layer) as layer:
         layer.GetPrimAtPath("/room").variantSelections["lights"] = "usdlux"
     assert own(built) == []
-    surface = "/room/mtl/lamp/PreviewSurface"
+    surface = "/room/geo/lamp/mtl/lamp/PreviewSurface"
     with edited(built.asset.edits_layer) as layer:
         prim = Sdf.CreatePrimInLayer(layer, surface)
         glow = Sdf.AttributeSpec(prim, "inputs:emissiveColor", Types.Color3f)
@@ -180,7 +182,7 @@ def test_records_are_checked_wherever_the_asset_is_referenced(built, tmp_path):
     shot.DefinePrim("/shot").GetReferences().AddReference(str(built.asset.root_layer))
     found = own_findings(shot)
     assert [(f.site, f.rule) for f in found] == [
-        ("</shot/geo/Stuhl_No_1.usdBrdf:fit:phi>", "usdbrdf.FitRange")
+        ("</shot/geo/Stuhl_No_1/Stuhl_No_1.usdBrdf:fit:phi>", "usdbrdf.FitRange")
     ]
 
 

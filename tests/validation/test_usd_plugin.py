@@ -55,7 +55,7 @@ def test_a_fixer_writes_into_the_layer_that_the_user_names(built):
     stage = Usd.Stage.Open(str(built.asset.root_layer))
     (error,) = errors_of(stage)
     (fixer,) = error.GetFixers()
-    layers = {layer.identifier: layer for layer in stage.GetLayerStack(includeSessionLayers=False)}
+    layers = {x.identifier: x for x in stage.GetUsedLayers() if x != stage.GetSessionLayer()}
     before = {name: layer.ExportToString() for name, layer in layers.items()}
     ours = [built.asset.root_layer, *(built.asset.layer(role) for role in ("scan", "material"))]
     for layer in ours:

@@ -28,12 +28,17 @@ def test_a_missing_texture_and_photograph_are_named(built):
 
 def test_usds_own_validators_are_asked(built):
     edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
-    prim = Sdf.CreatePrimInLayer(edits, "/room/geo/wall")
+    prim = Sdf.CreatePrimInLayer(edits, "/room/geo/wall/wall")
     binding = Sdf.RelationshipSpec(prim, "material:binding:mine", custom=False)
-    binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall"), Sdf.Path("/room/mtl/lamp")]
+    binding.targetPathList.explicitItems = [
+        Sdf.Path("/room/geo/wall/mtl/wall"),
+        Sdf.Path("/room/geo/lamp/mtl/lamp"),
+    ]
     edits.Save()
     findings = validate(built.asset.root_layer)
-    assert any("</room/geo/wall" in f.site and "usdShadeValidators:" in f.rule for f in findings)
+    assert any(
+        "</room/geo/wall/wall" in f.site and "usdShadeValidators:" in f.rule for f in findings
+    )
 
 
 def test_a_missing_sublayer_is_a_finding(built):
@@ -119,7 +124,7 @@ def test_rules_are_listed_once_each_with_a_description():
 
 @pytest.mark.parametrize(("identifier", "known"), [("ND_image_color3", True), ("nonsense", False)])
 def test_nodes_of_materialx_count_as_known(built, identifier, known):
-    shader = "/room/mtl/wall/Node"
+    shader = "/room/geo/wall/mtl/wall/Node"
     opinion(built, shader, "info:id", Sdf.ValueTypeNames.Token, identifier)
     with edited(built.asset.edits_layer) as layer:
         prim = layer.GetPrimAtPath(shader)

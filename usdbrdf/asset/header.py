@@ -15,9 +15,11 @@ from pxr import Sdf, UsdGeom, Vt
 from usdbrdf.asset.layout import Asset, open_metadata
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.schemas import verify
+from usdbrdf.errors import OwnershipConflict
 from usdbrdf.model.capture import Scan
 
 TIME_CODES_PER_SECOND = 24.0
+LAYOUT = "2"  # of the asset's folder; its layers outlive the version of the tool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +87,18 @@ def read_provenance(layer: Path) -> dict[str, Any]:
     return dict(open_metadata(layer).customLayerData.get("usdbrdf", {}))
 
 
+def refuse_old_layout(asset: Asset) -> None:
+    """OwnershipConflict where a version made the asset that had other files and other prims. The
+    root layer is never written again, and edits.usda is about the prims that were there."""
+    if read_provenance(asset.root_layer).get("version") == "1":
+        raise OwnershipConflict(
+            f"{asset.root_layer}: the asset was made by an earlier usdbrdf, whose objects were no "
+            "components. Convert the capture into a new folder, and take your edits.usda over with "
+            "the mesh </NAME/geo/chair> as </NAME/geo/chair/chair> and the material "
+            "</NAME/mtl/chair> as </NAME/geo/chair/mtl/chair>. [ownership.layout]"
+        )
+
+
 def _stored(value: Any) -> Any:
     """A value as USD's dictionaries hold it: without None, and no mixed lists."""
     if isinstance(value, Mapping):
@@ -103,17 +117,15 @@ def _stored(value: Any) -> Any:
     return Vt.StringArray([str(held) for held in value])
 
 
-_SCOPES = {
-    "geometry": "geo",
-    "materials": "mtl",
-    **{name: name for name in ("looks", "cameras", "lights", "render")},
-}
+_SCOPES = {"geometry": "geo", **{name: name for name in ("cameras", "lights", "render")}}
+# What lies beside the mesh of an object.
+_MATERIALS, _LOOKS = "mtl", "looks"
 
 
 @dataclass(frozen=True)
 class Scopes:
     """Names of the scopes that hold our prims; ``root`` is the default prim's path. If the geometry
-    came as USD, its default prim may have children of these names already (``mtl`` is the usual
+    came as USD, its default prim may have children of these names already (``geo`` is the usual
     one): ours then begin with ``usdbrdf_``, since prims of one path would merge."""
 
     root: str
@@ -137,8 +149,26 @@ class Scopes:
         return Scopes(f"/{asset.name}", {**_SCOPES, **lights, **recorded})
 
     def path(self, scope: str, *names: str) -> str:
-        """Path of a prim in a scope: ``path("materials", "chair")`` is /NAME/mtl/chair."""
+        """Path of a prim in a scope: ``path("cameras", "capture")`` is /NAME/cameras/capture."""
         return "/".join((self.root, self.names[scope], *names))
+
+    def component(self, identifier: str) -> str:
+        """The prim that has all that belongs to an object, so that it can be referenced alone; but
+        for the mesh of an input file, which stays where the file has it."""
+        return self.path("geometry", identifier)
+
+    def mesh(self, identifier: str) -> str:
+        """The object's mesh, named as the object: applications list meshes by their names."""
+        taken = identifier in (_MATERIALS, _LOOKS)
+        return self.path("geometry", identifier, f"{identifier}_mesh" if taken else identifier)
+
+    def material(self, identifier: str, *nodes: str) -> str:
+        """The measured material of an object, or a node of it."""
+        return self.path("geometry", identifier, _MATERIALS, identifier, *nodes)
+
+    def look(self, identifier: str, name: str) -> str:
+        """What an object wears in a look that shows a map."""
+        return self.path("geometry", identifier, _LOOKS, name)
 
 
 @dataclass(frozen=True, kw_only=True)

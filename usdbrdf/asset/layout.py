@@ -120,6 +120,25 @@ class Asset:
         return self.folder / ("layers/edits.usda" if self.is_published else "edits.usda")
 
     @property
+    def contents_layer(self) -> Path:
+        """What the root layer loads as its payload: all that the tasks wrote."""
+        return self.folder / "layers" / "contents.usda"
+
+    @property
+    def photographs_layer(self) -> Path:
+        """Where the photographs lie. No layer names it, so that the asset is whole without them;
+        whoever wants to see them adds it as a sublayer."""
+        return self.folder / "layers" / "photographs.usdc"
+
+    def interface(self, role: str) -> Path:
+        """What applications see of a task's layer before they load the payload."""
+        return self.folder / "layers" / f"{self.layer(role).stem}.interface.usda"
+
+    def component(self, identifier: str) -> str:
+        """Path of an object's own file, relative to the asset folder."""
+        return f"objects/{identifier}/{identifier}.usda"
+
+    @property
     def uv_layer(self) -> Path:
         """Texture coordinates: too big for text, hence a binary sublayer of texturing.usda."""
         return self.folder / "layers" / "texturing_uv.usdc"

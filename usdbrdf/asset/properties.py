@@ -99,7 +99,7 @@ class Fact:
 # fmt: off
 OBJECT = Schema("Object", "usdBrdf", "Mesh", "label", """One object of the capture's segmentation. A
     mesh without it is not one of ours.""")
-CAPTURE = Schema("Capture", "usdBrdf:capture", "Camera", "image", """The photographs that a camera
+CAPTURE = Schema("Capture", "usdBrdf:capture", "Camera", "pinhole", """The photographs that a camera
     took, one per integer time code. Values between time codes mean nothing.""")
 AOV = Schema("Aov", f"usdBrdf:aov:{INSTANCE}", "Mesh", "file", """One map over the texture space
     (primvars:st) of an object, for review and for the next task.""")
@@ -144,7 +144,8 @@ class Photographs:
     """What the capture camera says of its photographs: sequences have a value for each."""
 
     image: Annotated[Sequence[str], Fact(CAPTURE, "image", "asset", "", """The photograph at this
-        time code, a path relative to the layer.""", samples="every")]
+        time code, a path relative to the layer. Said by photographs.usdc, which an asset may go
+        without.""", samples="every")]
     exposure_time: Annotated[Sequence[float], Fact(CAPTURE, "exposureTime", "double", 1.0,
         """Exposure time of the photograph in seconds; 1 where it is not known. The pixel values
         are radiance already: do not apply it again.""", samples="every")]

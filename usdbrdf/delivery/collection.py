@@ -62,9 +62,13 @@ def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
     found = Collection(asset=asset)
     top, edits = canonical(asset.root_layer), canonical(asset.edits_layer)
     ours = [one.layer(role) for one in (asset, *asset.in_each_lighting) for role in ROLES]
+    # No layer names the one that says where the photographs are.
+    taken = [asset.photographs_layer] if photographs else []
+    beside = [canonical(file) for file in taken if file.is_file()]
     # Layers of ours may name what lies elsewhere; what only the artist's layers reach may not.
-    measured = _reached([canonical(file) for file in ours if file.is_file()], {top, edits})
-    layers = _reached([top], set())
+    own = [canonical(file) for file in ours if file.is_file()]
+    measured = _reached([*own, *beside], {top, edits})
+    layers = _reached([top, *beside], set())
     found.places = {top: root, edits: "layers/edits.usda"}
     for file, layer in layers.items():
         if not photographs and forget_photographs(layer):

@@ -21,8 +21,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
+from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
-from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
@@ -125,7 +125,6 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
                 prim.GetVariantSet(LIGHTS).SetVariantSelection(EMISSIVE)
     layer = stage.Flatten(addSourceFileComment=False)
     flat = Usd.Stage.Open(layer)
-    root = flat.GetDefaultPrim()
     layer.documentation = ""
     layer.customLayerData = {
         "usdbrdf": {"role": "package", "version": code_version(), "look": look_of(stage)}
@@ -133,9 +132,11 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
     if layer.pseudoRoot.HasInfo("renderSettingsPrimPath"):
         layer.pseudoRoot.ClearInfo("renderSettingsPrimPath")
     flat.RemovePrim(Scopes.of(asset).path("render"))
-    info = dict(root.GetAssetInfo())
-    info.pop("identifier", None)  # of the asset in its folder
-    root.SetMetadata("assetInfo", info)
+    for prim in flat.TraverseAll():
+        info = dict(prim.GetAssetInfo())
+        for name in ("identifier", "payloadAssetDependencies"):  # of the asset in its folder
+            info.pop(name, None)
+        prim.SetMetadata("assetInfo", info) if info else prim.ClearMetadata("assetInfo")
     _keep_bound_materials(flat)
     for prim in flat.TraverseAll():
         for name in [*prim.GetAuthoredPropertyNames()]:

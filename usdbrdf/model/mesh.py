@@ -175,6 +175,15 @@ def welded(mesh: ScanMesh) -> ScanMesh:
     return replace(mesh, triangles=first[number].astype(np.int32)[mesh.triangles])
 
 
+def is_closed(triangles: Int) -> bool:
+    """Whether triangles (F, 3) without copies of points enclose something: each edge belongs to two
+    of them, which run along it in opposite directions."""
+    start, end = triangles.reshape(-1).astype(np.int64), np.roll(triangles, -1, axis=1).reshape(-1)
+    span = int(triangles.max(initial=0)) + 1
+    there, back = np.sort(start * span + end), np.sort(end * span + start)
+    return bool(np.array_equal(there, back) and (np.diff(there) > 0).all())
+
+
 _AT_A_TIME = 1 << 18  # triangles
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from usdbrdf.asset.directives import by_number, directives_of
 from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
@@ -101,6 +102,7 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         layer = run.output(f"layers/{asset.layer('material').name}")
         networks = run.output(f"layers/{asset.materialx_layer.name}") if options.materialx else None
         write_material_layer(layer, task.draft, objects, materialx=networks)
+        write_interface(run.output(f"layers/{asset.interface('material').name}"), layer)
         return {"objects": {item.identifier: item.summary for item in objects}}
 
     return task.run(work)

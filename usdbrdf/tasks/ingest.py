@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.header import Draft, StageHeader
+from usdbrdf.asset.layers.interface import write_root
 from usdbrdf.asset.layers.scan_layer import (
+    ScanFiles,
     check_lightings,
     check_root,
     write_edits,
-    write_root,
     write_scan_layer,
 )
 from usdbrdf.asset.layout import Asset
@@ -88,7 +89,7 @@ def ingest(
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        write_scan_layer(run.output(f"layers/{asset.layer('scan').name}"), scan, draft)
+        write_scan_layer(ScanFiles.of(asset, run.output), scan, draft)
         write_root(run.output_once(asset.root_layer.name), asset, header)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         write_layers_to_come(run, asset, lightings, header)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_refined_layer
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.preview_lobe import MICROFACET
@@ -101,12 +102,9 @@ def refined_objects(
             )
             for i, item in enumerate(objects)
         ]
-        write_refined_layer(
-            run.output(f"layers/{one.layer('material').name}"),
-            replace(task.draft, asset=one),
-            in_light,
-            with_maps,
-        )
+        layer = run.output(f"layers/{one.layer('material').name}")
+        write_refined_layer(layer, replace(task.draft, asset=one), in_light, with_maps)
+        write_interface(run.output(f"layers/{one.interface('material').name}"), layer)
     view = overview(scene, lit[0].rays, maps[0].all_frames)
     view.write(run.output(task.asset.preview("base_color")), texels, base_color, exposure=1)
     return with_maps

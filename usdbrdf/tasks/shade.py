@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.directives import by_number, directives_of
-from usdbrdf.asset.layers.task_layers import (
-    Lamp,
-    world_from_root,
-    write_lights_layer,
-    write_shading_layer,
-)
+from usdbrdf.asset.layers.interface import write_interface
+from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_lights_layer
+from usdbrdf.asset.layers.task_layers import write_shading_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import LAMP, OF_SHADE, ShadedObject, colour
@@ -67,6 +64,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         ]
         lights = run.output(f"layers/{asset.lights_layer.name}")
         write_lights_layer(lights, task.draft, lamps, published, world_from_root(maps.stage))
+        write_interface(run.output(f"layers/{asset.interface('shading').name}"), layer, lights)
         view = overview(maps.scene, maps.surface.rays, maps.frames)
         view.write(run.output(asset.preview("albedo")), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output(asset.preview("irradiance")), maps.texels, shaded.irradiance)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header
+from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import code_version, name_in_lighting
@@ -83,5 +83,6 @@ class Task:
 
     @property
     def draft(self) -> Draft:
-        """What the task's layers begin with."""
+        """What the task's layers begin with; OwnershipConflict in an asset of an old layout."""
+        refuse_old_layout(self.asset)
         return Draft(asset=self.asset, header=self.header, provenance=self.provenance)

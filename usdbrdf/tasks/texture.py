@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_texturing_layer, write_uv_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
@@ -65,6 +66,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
             write_uv_layer(uv, task.draft, objects, maps.stage)
         layer = run.output(f"layers/{asset.layer('texturing').name}")
         write_texturing_layer(layer, task.draft, objects)
+        write_interface(run.output(f"layers/{asset.interface('texturing').name}"), layer)
         view = overview(scene, rays, frames)
         view.write(run.output(asset.preview("lit")), surface.texels, found.lit)
         return {

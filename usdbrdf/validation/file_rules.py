@@ -14,6 +14,7 @@ from pxr import Ar, Sdf, Usd
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
+from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.scene import asset_file
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.ownership import edited_files
@@ -27,44 +28,52 @@ _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 
 @rule(Severity.ERROR)
 def layer_missing(scene: AssetStage) -> Iterator[Fault]:
-    """The root layer names edits.usda and the layers of all tasks, and they are there. USD passes
-    over a missing sublayer with a message that is easily lost.
+    """The root layer names edits.usda and what the tasks let be chosen, contents.usda the layers of
+    all tasks, and they are there. USD passes over a missing sublayer with a message that is easily
+    lost.
 
     Run usdbrdf convert again, which makes what is missing; or restore the sublayers of the root
     layer."""
-    named, expected = _sublayers(scene)
-    for layer in expected:
-        if layer not in named:
-            yield Fault(scene.asset_root, f"@{layer}@ is not among its sublayers.")
-        elif not layer.is_file():
-            yield Fault(scene.asset_root, f"its sublayer @{layer}@ is not there.")
+    for holder, named, expected in _sublayers(scene):
+        for layer in expected:
+            if layer not in named:
+                yield Fault(holder, f"@{layer}@ is not among its sublayers.")
+            elif not layer.is_file():
+                yield Fault(holder, f"its sublayer @{layer}@ is not there.")
 
 
 @rule(Severity.ERROR)
 def layer_order(scene: AssetStage) -> Iterator[Fault]:
-    """Strongest first the sublayers are edits.usda, material, shading, texturing, scan. In another
-    order the lobe of a material is hidden by the task before it, or the artist's edits by a
-    measurement. Other layers may stand between them. lights, texturing_uv and materialx are no
-    sublayers of the root, but of the layers that own them.
+    """Strongest first the sublayers of contents.usda are material, shading, texturing, scan; the
+    root layer has edits.usda before the interfaces of these. In another order the lobe of a
+    material is hidden by the task before it, or the artist's edits by a measurement. Other layers
+    may stand between them. lights, texturing_uv and materialx are sublayers of the layers that own
+    them.
 
     Restore the order in the root layer; mute a layer instead of moving it."""
-    named, expected = _sublayers(scene)
-    found = [layer for layer in named if layer in expected]
-    if found != [layer for layer in expected if layer in found]:
-        yield Fault(
-            scene.asset_root,
-            f"the sublayers are in the order {', '.join(p.name for p in found)}; "
-            f"strongest first it is {', '.join(p.name for p in expected)}.",
-        )
+    for holder, named, expected in _sublayers(scene):
+        found = [layer for layer in named if layer in expected]
+        if found != [layer for layer in expected if layer in found]:
+            yield Fault(
+                holder,
+                f"the sublayers are in the order {', '.join(p.name for p in found)}; "
+                f"strongest first it is {', '.join(p.name for p in expected)}.",
+            )
 
 
-def _sublayers(scene: AssetStage) -> tuple[list[Path], list[Path]]:
-    """Those that the root layer names, and those that it should, strongest first."""
+def _sublayers(scene: AssetStage) -> Iterator[tuple[Sdf.Layer, list[Path], list[Path]]]:
+    """The root layer and contents.usda: the sublayers that they name, and those that they should,
+    strongest first."""
     root, asset = scene.asset_root, scene.asset
     if not root or not asset:
-        return [], []
-    named = [located(root, path) for path in root.subLayerPaths]
-    return named, [asset.edits_layer, *(asset.layer(role) for role in reversed(ROLES))]
+        return
+    roles = [*reversed(ROLES)]
+    interfaces = [asset.interface(role) for role in roles]
+    expected = {asset.root_layer: [asset.edits_layer, *interfaces]}
+    expected[asset.contents_layer] = [*(asset.layer(role) for role in roles), interfaces[-1]]
+    for layer in scene.layers:
+        if wanted := expected.get(Path(layer.realPath)):
+            yield layer, [located(layer, path) for path in layer.subLayerPaths], wanted
 
 
 @rule(Severity.ERROR)
@@ -141,16 +150,17 @@ def _site(stage: Usd.Stage, layer: Sdf.Layer, path: Sdf.Path) -> Site:
 
 @rule(Severity.WARNING)
 def path_outside(scene: AssetStage) -> Iterator[Fault]:
-    """What the layers name lies in the asset's folder, apart from the photographs and from geometry
-    that came as USD. An asset that is copied or packed leaves the rest behind.
+    """What the layers name lies in the asset's folder, apart from geometry that came as USD. An
+    asset that is copied or packed leaves the rest behind.
 
     Bring the file into the asset's folder."""
     if not scene.asset:
         return
-    folder, scan = Path(os.path.realpath(scene.asset.folder)), scene.asset.layer("scan")
+    folder = Path(os.path.realpath(scene.asset.folder))
+    scan = [scene.asset.layer("scan"), scene.asset.interface("scan")]
     for layer, path, value in scene.asset_paths:
-        # The photographs, and geometry that came as USD, stay where the capture has them.
-        if value.startswith(("./", "../")) and Path(layer.realPath) != scan:
+        # Geometry that came as USD stays where the capture has it.
+        if value.startswith(("./", "../")) and Path(layer.realPath) not in scan:
             file = Path(os.path.realpath(located(layer, value)))
             if not file.is_relative_to(folder):
                 problem = f"@{value}@ in @{layer.realPath}@ leads out of the asset's folder."
@@ -164,33 +174,33 @@ def missing_texture(scene: AssetStage) -> Iterator[Fault]:
     texture that does not.
 
     Run usdbrdf convert again, which makes missing textures anew; or restore the file."""
-    for file, sites, cameras in _missing(scene):
-        if not cameras:
-            more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
-            yield Fault(sites[0], f"@{file}@ does not exist.{more}")
+    for file, sites in _missing(scene):
+        more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
+        yield Fault(sites[0], f"@{file}@ does not exist.{more}")
 
 
 @rule(Severity.WARNING)
 def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
-    """The photographs that the capture camera names exist. They are not needed to render the asset,
+    """The photographs that photographs.usdc names exist. They are not needed to render the asset,
     but to evaluate it and to measure anything anew.
 
     Put the capture back where it was; ignore it where the asset is only shown."""
-    # Each file once, and one fault for all files that an attribute is the first to name.
-    gone: dict[Site, list[Path]] = defaultdict(list)
-    for file, _, cameras in _missing(scene):
-        if cameras:
-            gone[cameras[0]].append(file)
-    for site, files in gone.items():
-        more = f" Nor do {len(files) - 1} more of its photographs." if len(files) > 1 else ""
-        yield Fault(site, f"@{files[0]}@ does not exist.{more}")
+    file = scene.asset.photographs_layer if scene.asset else None
+    if file is None or not file.is_file():
+        return
+    layer = Sdf.Layer.FindOrOpen(str(file))
+    named = sorted({located(layer, path) for path in named_files(layer)})
+    if gone := [path for path in named if not _is_there(path)]:
+        more = f" Nor do {len(gone) - 1} more of its photographs." if len(gone) > 1 else ""
+        yield Fault(layer, f"@{gone[0]}@ does not exist.{more}")
 
 
-def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site], list[Site]]]:
-    """Files that are not there, where the composed stage, or a variant, names them, and which of
-    these places are attributes of a capture camera."""
+def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site]]]:
+    """Files that are not there, where the composed stage, or a variant, names them; but for the
+    photographs of a capture's camera."""
     missing: dict[Path, list[Site]] = defaultdict(list)
-    for prim in scene.stage.Traverse() if scene.asset else ():
+    prims = scene.stage.Traverse() if scene.asset else ()
+    for prim in (prim for prim in prims if prim not in scene.cameras):
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset:
                 times = [Usd.TimeCode.Default(), *attribute.GetTimeSamples()]
@@ -204,9 +214,7 @@ def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site], list[Site]]]
         uncomposed = path.isEmpty or path.ContainsPrimVariantSelection()
         if uncomposed and not _URI.match(value) and file not in missing and not _is_there(file):
             missing[file].append(layer)
-    for file, sites in sorted(missing.items()):
-        named = [site for site in sites if isinstance(site, Usd.Attribute)]
-        yield file, sites, [site for site in named if site.GetPrim() in scene.cameras]
+    yield from sorted(missing.items())
 
 
 def _is_there(file: Path) -> bool:

@@ -49,7 +49,7 @@ def texture_color_space(scene: AssetStage) -> Iterator[Fault]:
 
 
 def _shaders(scene: AssetStage, identifier: str) -> Iterator[UsdShade.Shader]:
-    return chain.from_iterable(scene.shaders(scope, identifier) for scope in ("materials", "looks"))
+    return chain.from_iterable(scene.shaders(identifier, of_looks=x) for x in (False, True))
 
 
 @cure("block inputs:specularColor")
@@ -194,7 +194,7 @@ def look_material(scene: AssetStage) -> Iterator[Fault]:
     mixes the light of the scene into the map that is looked at.
 
     Remove the opinions on the materials below the scope of the looks."""
-    for shader in scene.shaders("looks", "UsdPreviewSurface"):
+    for shader in scene.shaders("UsdPreviewSurface", of_looks=True):
         ior = shader.GetInput("ior")
         shiny = not ior or ior.Get() is None or abs(float(ior.Get()) - 1.0) > _TOLERANCE
         if shiny or not _is_black(shader):

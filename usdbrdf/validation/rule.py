@@ -4,7 +4,7 @@ no framework that runs them."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -32,8 +32,15 @@ class AssetStage:
 
     @cached_property
     def layers(self) -> tuple[Sdf.Layer, ...]:
-        """The root layer and its sublayers, strongest first."""
-        return tuple(self.stage.GetLayerStack(includeSessionLayers=False))
+        """The root layer and its sublayers, strongest first; then those of the asset's contents,
+        which it has as payload."""
+        stack = list(self.stage.GetLayerStack(includeSessionLayers=False))
+        loaded = {layer.realPath: layer for layer in self.stage.GetUsedLayers()}
+        roots = [layer for layer in stack if record_of(layer).get("role") == "root"]
+        for root in roots:
+            contents = located(root, "layers/contents.usda")
+            stack += _with_sublayers(loaded.get(str(contents)), loaded)
+        return tuple(dict.fromkeys(stack))
 
     @cached_property
     def own_layers(self) -> tuple[Sdf.Layer, ...]:
@@ -89,7 +96,8 @@ class AssetStage:
     @cached_property
     def cameras(self) -> tuple[Usd.Prim, ...]:
         """The cameras with photographs."""
-        return tuple(p for p in self.recorded if p.GetAttribute("usdBrdf:capture:image"))
+        name = "usdBrdf:capture:pinhole"
+        return tuple(p for p in self.recorded if authored(p, name) is not None)
 
     @cached_property
     def asset_paths(self) -> tuple[tuple[Sdf.Layer, Sdf.Path, str], ...]:
@@ -102,6 +110,7 @@ class AssetStage:
             for layer in self.stage.GetUsedLayers()
             if self.asset
             and layer not in stack
+            and layer not in self.layers
             and not layer.GetFileFormat().IsPackage()
             and not Ar.IsPackageRelativePath(layer.identifier)
             and Path(layer.realPath).is_relative_to(self.asset.folder)
@@ -110,10 +119,16 @@ class AssetStage:
         layers = (*self.layers, *reached)
         return tuple((layer, *found) for layer in layers for found in _asset_paths(layer))
 
-    def shaders(self, scope: str, identifier: str) -> Iterator[UsdShade.Shader]:
-        """The shaders with an ``info:id`` below a scope of ours ("materials" or "looks")."""
-        prim = self.stage.GetPrimAtPath(self.scopes.path(scope)) if self.scopes else None
-        for below in Usd.PrimRange(prim) if prim else ():
+    def shaders(self, identifier: str, *, of_looks: bool) -> Iterator[UsdShade.Shader]:
+        """The shaders with an ``info:id`` of the objects' materials, or of what they wear in the
+        looks that show maps."""
+        prims = []
+        for item in self.objects if self.scopes else ():
+            name = str(authored(item, "usdBrdf:identifier") or "")
+            if self.scopes and Sdf.Path.IsValidIdentifier(name):
+                one = self.scopes.look(name, "x") if of_looks else self.scopes.material(name)
+                prims.append(self.stage.GetPrimAtPath(Sdf.Path(one).GetParentPath()))
+        for below in (each for prim in prims if prim for each in Usd.PrimRange(prim)):
             shader = UsdShade.Shader(below)
             if shader and shader.GetShaderId() == identifier:
                 yield shader
@@ -123,7 +138,7 @@ class AssetStage:
         identifier = str(authored(item, "usdBrdf:identifier") or "")
         if not self.scopes or not Sdf.Path.IsValidIdentifier(identifier):
             return None
-        path = self.scopes.path("materials", identifier)
+        path = self.scopes.material(identifier)
         material = UsdShade.Material(self.stage.GetPrimAtPath(path))
         shader = material.ComputeSurfaceSource()[0] if material else None
         return shader if shader and shader.GetShaderId() == "UsdPreviewSurface" else None
@@ -140,6 +155,14 @@ class AssetStage:
         specs = [layer.GetPrimAtPath(root.GetPath()) for layer in self.own_layers] if root else []
         sets = [spec.variantSets.get(name) for spec in specs if spec]
         return set[str]().union(*(found.variants.keys() for found in sets if found))
+
+
+def _with_sublayers(layer: Sdf.Layer | None, loaded: Mapping[str, Sdf.Layer]) -> list[Sdf.Layer]:
+    """A layer that a stage has, and those below it, strongest first; none where it has it not."""
+    if layer is None:
+        return []
+    below = (loaded.get(str(located(layer, path))) for path in layer.subLayerPaths)
+    return [layer, *(each for sub in below for each in _with_sublayers(sub, loaded))]
 
 
 def record_of(layer: Sdf.Layer) -> dict[str, Any]:

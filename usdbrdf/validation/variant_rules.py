@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from usdbrdf.asset.layers.input_usd import BINDING
+from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.layers.looks import LIT, SHADED
 from usdbrdf.asset.layers.looks import VARIANT_SET as LOOKS
-from usdbrdf.asset.layers.task_layers import EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.readers.scene import authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 

@@ -5,7 +5,7 @@ from pxr import Usd, UsdGeom
 STATUS = "usdBrdf:fit:status"
 METHOD = "usdBrdf:fit:method"
 TARGET_FRAME = "usdBrdf:fit:targetFrame"
-_IMAGE = "usdBrdf:capture:image"
+_PINHOLE = "usdBrdf:capture:pinhole"
 
 
 def fitted_prim(prim):
@@ -32,7 +32,7 @@ def facts_of(prim):
 def capture_camera(stage):
     """The camera that holds the photographs, one per time code; None where there is none."""
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Camera) and _authored(prim, _IMAGE):
+        if prim.IsA(UsdGeom.Camera) and _authored(prim, _PINHOLE):
             return prim
     return None
 

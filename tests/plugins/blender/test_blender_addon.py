@@ -133,9 +133,11 @@ def test_a_package_brings_what_was_measured(session, room, tmp_path):
 def test_looks(told_of_looks):
     told = told_of_looks
     names = {"Stuhl_No_1", "wall", "lamp"}
-    assert {n: s["prim"] for n, s in told["shaded"].items()} == {n: f"/room/mtl/{n}" for n in names}
+    assert {n: s["prim"] for n, s in told["shaded"].items()} == {
+        n: f"/room/geo/{n}/mtl/{n}" for n in names
+    }
     lit = told["lit"]["Stuhl_No_1"]
-    assert lit["prim"] == "/room/looks/lit/Stuhl_No_1"
+    assert lit["prim"] == "/room/geo/Stuhl_No_1/looks/lit"
     assert (lit["image"], lit["colorspace"]) == ("Stuhl_No_1.lit.exr", "Non-Color")
     assert (lit["emission_linked"], lit["emission_strength"]) == (True, 1)
     # Unlit: it reflects nothing.
@@ -143,7 +145,7 @@ def test_looks(told_of_looks):
     # The map's factor from stored to shown value.
     assert told["samples"]["Stuhl_No_1"]["factor"] == 0.5
     wall = told["lit"]["wall"]
-    assert wall["prim"] == "/room/looks/no_data"
+    assert wall["prim"] == "/room/geo/wall/looks/no_data"
     assert wall["emission_color"] == [0.5, 0, 0.5]
     assert told["back"] == told["shaded"]
     assert told["imported_lit"] == told["lit"]
@@ -153,7 +155,7 @@ def test_looks(told_of_looks):
 def test_a_part_of_an_object_keeps_its_own_material(session, synthetic, tmp_path):
     asset = synthetic.build(tmp_path / "room", synthetic.make_scan(tmp_path / "capture")).asset
     layer = Sdf.Layer.FindOrOpen(str(asset.edits_layer))
-    part = Sdf.CreatePrimInLayer(layer, "/room/geo/Stuhl_No_1/seat")
+    part = Sdf.CreatePrimInLayer(layer, "/room/geo/Stuhl_No_1/Stuhl_No_1/seat")
     part.specifier, part.typeName = Sdf.SpecifierDef, "GeomSubset"
     for name, kind, value in (
         ("elementType", Sdf.ValueTypeNames.Token, "face"),
@@ -163,14 +165,14 @@ def test_a_part_of_an_object_keeps_its_own_material(session, synthetic, tmp_path
         Sdf.AttributeSpec(part, name, kind).default = value
     part.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=["MaterialBindingAPI"]))
     binding = Sdf.RelationshipSpec(part, "material:binding", custom=False)
-    binding.targetPathList.explicitItems = [Sdf.Path("/room/mtl/wall")]
+    binding.targetPathList.explicitItems = [Sdf.Path("/room/geo/wall/mtl/wall")]
     layer.Save()
     told = session("slots", asset.root_layer, "lit")
     materials, faces = told["Stuhl_No_1"]
-    assert materials == ["/room/looks/lit/Stuhl_No_1", "/room/mtl/wall"]
+    assert materials == ["/room/geo/Stuhl_No_1/looks/lit", "/room/geo/wall/mtl/wall"]
     assert [i for i, slot in enumerate(faces) if slot == 1] == [2, 3, 7]
     assert set(faces) == {0, 1}
-    assert told["lamp"] == [["/room/looks/lit/lamp"], [0] * 12]
+    assert told["lamp"] == [["/room/geo/lamp/looks/lit"], [0] * 12]
 
 
 @needs_blender

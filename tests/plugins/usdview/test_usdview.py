@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from pxr import Usd, UsdShade
+from pxr import Usd, UsdGeom, UsdShade
 
 from tests.plugins.usdview import fake_usdview
 
@@ -80,10 +80,10 @@ def test_libplug_finds_it(plugins, built):
 def test_a_look_goes_into_the_session_layer(viewer):
     stage, folder = viewer.api.stage, viewer.built.asset.folder
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    chair = "/room/geo/Stuhl_No_1"
-    assert bound_material(stage, chair) == "/room/mtl/Stuhl_No_1"
+    chair = "/room/geo/Stuhl_No_1/Stuhl_No_1"
+    assert bound_material(stage, chair) == "/room/geo/Stuhl_No_1/mtl/Stuhl_No_1"
     viewer.looks["lit"].trigger()
-    assert bound_material(stage, chair) == "/room/looks/lit/Stuhl_No_1"
+    assert bound_material(stage, chair) == "/room/geo/Stuhl_No_1/looks/lit"
     session = stage.GetSessionLayer().GetPrimAtPath("/room")
     assert dict(session.variantSelections) == {"look": "lit"}
     assert [layer for layer in stage.GetLayerStack() if layer.dirty] == [stage.GetSessionLayer()]
@@ -119,14 +119,14 @@ def test_a_shot_has_the_looks_of_the_asset_that_is_selected(viewer, instanceable
     assert not any(entry.visible for entry in viewer.looks.values())
     viewer.looks["lit"].trigger()
     assert viewer.api.said == ["Select an asset that has the look lit."]
-    chairs = [f"/shot/{name}/geo/Stuhl_No_1" for name in ("left", "right")]
+    chairs = [f"/shot/{name}/geo/Stuhl_No_1/Stuhl_No_1" for name in ("left", "right")]
     viewer.select(chairs[1])
     assert viewer.looks["lit"].visible
     viewer.looks["lit"].trigger()
     assert viewer.api.said[-1] == "right, look: lit"
     assert [bound_material(shot, path) for path in chairs] == [
-        "/shot/left/mtl/Stuhl_No_1",
-        "/shot/right/looks/lit/Stuhl_No_1",
+        "/shot/left/geo/Stuhl_No_1/mtl/Stuhl_No_1",
+        "/shot/right/geo/Stuhl_No_1/looks/lit",
     ]
     viewer.select("/shot")
     assert not any(entry.visible for entry in viewer.looks.values())
@@ -136,12 +136,12 @@ def test_a_shot_has_the_looks_of_the_asset_that_is_selected(viewer, instanceable
 
 
 def test_the_fit_is_told(viewer):
-    viewer.select("/room/geo/Stuhl_No_1")
+    viewer.select("/room/geo/Stuhl_No_1/Stuhl_No_1")
     viewer.menu.actions[INSPECT].trigger()
     [(title, text)] = fake_usdview.QMessageBox.shown
     assert title == "usdbrdf"
     assert text.splitlines() == [
-        "/room/geo/Stuhl_No_1",
+        "/room/geo/Stuhl_No_1/Stuhl_No_1",
         "Object: Stuhl Nº 1 (chair)",
         "Status: MEASURED in the photographs",
         "Roughness phi: 0.25 ± 0.031 (confidence high)",
@@ -154,7 +154,7 @@ def test_the_fit_is_told(viewer):
 
 
 def test_what_was_not_measured_says_so(viewer):
-    viewer.select("/room/geo/wall")
+    viewer.select("/room/geo/wall/wall")
     viewer.menu.actions[INSPECT].trigger()
     [(_, text)] = fake_usdview.QMessageBox.shown
     assert "Status: UNSEEN, not measured" in text
@@ -164,7 +164,7 @@ def test_what_was_not_measured_says_so(viewer):
 
 
 def test_an_estimated_lamp(viewer):
-    viewer.select("/room/geo/lamp")
+    viewer.select("/room/geo/lamp/lamp")
     viewer.menu.actions[INSPECT].trigger()
     [(_, text)] = fake_usdview.QMessageBox.shown
     assert "Emits: (8, 7, 6) ± 12%, estimated from the light that it casts" in text
@@ -185,18 +185,19 @@ def test_nothing_fitted_is_selected(viewer):
 
 
 def test_the_target_frame_is_shown(viewer):
-    viewer.select("/room/geo/Stuhl_No_1")
+    viewer.select("/room/geo/Stuhl_No_1/Stuhl_No_1")
     viewer.menu.actions[JUMP].trigger()
     api = viewer.api
     assert str(api.cameraPrim.GetPath()) == "/room/cameras/capture"
-    # The photograph at that time code is the one that the fit names.
-    image = api.cameraPrim.GetAttribute("usdBrdf:capture:image").Get(api.frame)
-    assert Path(image.path).name == viewer.built.scan.frames.image_paths[2].name
+    # The pose at that time code is that of the photograph that the fit names.
+    pose = UsdGeom.Camera(api.cameraPrim).ComputeLocalToWorldTransform(api.frame)
+    expected = viewer.built.scan.frames.world_from_camera[2, :3, 3]
+    assert tuple(pose.ExtractTranslation()) == pytest.approx(expected)
     assert api.drawn == 1
 
 
 def test_no_target_frame(viewer):
-    viewer.select("/room/geo/wall")
+    viewer.select("/room/geo/wall/wall")
     viewer.menu.actions[JUMP].trigger()
     assert viewer.api.cameraPrim is None
     assert viewer.api.said == ["wall: its fit (views) names no target frame."]

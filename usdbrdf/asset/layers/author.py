@@ -159,9 +159,9 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
 
         UsdUtils.ModifyAssetPaths(stored, absolute)
         # Each layer is checked when it is written; what lies there now may be damaged, about to be
-        # replaced, or the artist's.
+        # replaced, or the artist's. So for payloads.
         stored.subLayerPaths = []
-        stage = Usd.Stage.Open(stored, Usd.Stage.LoadAll)
+        stage = Usd.Stage.Open(stored, Usd.Stage.LoadNone)
         problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
         if problems:
             raise UsdBrdfError(

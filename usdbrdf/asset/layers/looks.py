@@ -37,6 +37,8 @@ Bindings = Mapping[str, str]
 # What a look shows of an object: a map, one linear colour, or nothing because nothing is known.
 Shown = Aov | Colour | None
 SURFACE = "PreviewSurface"
+# Texture nodes of the materials; that of the emission has no scale of its own.
+ALBEDO_TEXTURE, EMISSION_TEXTURE = "AlbedoTexture", "EmissionTexture"
 
 
 def surface(
@@ -138,14 +140,13 @@ def author_look_materials(
 ) -> dict[str, str]:
     """Materials for one look that glow and reflect nothing, so that any viewer shows what they are
     about: one per object, which has its place in ``shown``; and how they are bound. A map of one
-    channel shows as grey: applications repeat it over red, green and blue. Objects of which there
-    is nothing to show share one material that says so."""
-    define(layer, scopes.path("looks"), "Scope")
-    define(layer, scopes.path("looks", look), "Scope")
+    channel shows as grey: applications repeat it over red, green and blue. An object of which there
+    is nothing to show has one material that says so in all looks."""
     bindings = {}
     for item, glow in zip(objects, shown, strict=True):
-        own, nothing = scopes.path("looks", look, item.identifier), scopes.path("looks", NO_DATA)
-        material = bindings[item.prim_path] = nothing if glow is None else own
+        name = NO_DATA if glow is None else look
+        material = bindings[item.prim_path] = scopes.look(item.identifier, name)
+        define(layer, str(Sdf.Path(material).GetParentPath()), "Scope")
         shader = surface(layer, material)
         if isinstance(glow, Aov):
             texture = ("emissiveColor", "AovTexture", glow.file)

@@ -1,20 +1,28 @@
 """What ingest writes: the weakest layer, the capture as it came, with its meshes, camera and
-photographs; and layers without any measurement: root, the artist's edits, those still to come."""
+photographs; and layers without any measurement: the artist's edits, those still to come."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pxr import Gf, Sdf, UsdGeom
 
-from usdbrdf.asset.header import Draft, Provenance, Scopes, StageHeader, new_layer, read_header
+from usdbrdf.asset.header import (
+    LAYOUT,
+    Draft,
+    Provenance,
+    Scopes,
+    StageHeader,
+    new_layer,
+    read_header,
+    refuse_old_layout,
+)
 from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
     apply_schema,
@@ -27,43 +35,33 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
-from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path, storable_path
+from usdbrdf.asset.layers.interface import (
+    Component,
+    components_of,
+    write_components,
+    write_scan_interface,
+)
+from usdbrdf.asset.layout import LIGHTING, Asset, relative_path, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Scan
-from usdbrdf.model.mesh import ObjectLabel, ScanMesh, welded
+from usdbrdf.model.mesh import ObjectLabel, is_closed
 
 Types = Sdf.ValueTypeNames
 APERTURE_MM = 36.0
 NEAR_M, FAR_M = 0.01, 1000.0
-_VERSION = "1"  # of the folder's layout; these layers outlive the version of the tool
-
-
-def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
-    """NAME.usda: the sublayers, strongest first, and metadata. Written once, never again."""
-    layer = new_layer(header, Provenance(role="root", version=_VERSION))
-    layer.documentation = (
-        "Captured scene with measured materials. Put your own opinions into edits.usda, the "
-        "strongest layer: no tool writes it again. The files in layers/ are regenerated."
-    )
-    layer.subLayerPaths = [
-        f"./{asset.edits_layer.name}",
-        *(f"./layers/{asset.layer(role).name}" for role in reversed(ROLES)),
-    ]
-    # Only a root layer can say this. The scan layer may still be waiting beside it, unpublished.
-    staged = Asset(path.parent, asset.name)
-    scopes = Scopes.of(staged if staged.layer("scan").is_file() else asset)
-    layer.pseudoRoot.SetInfo("renderSettingsPrimPath", scopes.path("render", "capture"))
-    export(layer, path, folder=asset.folder)
+# Facts of the photographs that name files.
+_PLACES = ("image", "photograph", "mask")
 
 
 def check_root(asset: Asset, header: StageHeader) -> None:
     """Raise if the asset has a root layer that says otherwise about units or the up axis. USD
     believes the root, which is never written again: a capture in other units would come out in the
     wrong size, beneath edits that were made for the old one."""
+    refuse_old_layout(asset)
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
@@ -82,7 +80,7 @@ def write_edits(path: Path, asset: Asset, header: StageHeader) -> None:
 
 
 def _no_edits(header: StageHeader) -> Sdf.Layer:
-    layer = new_layer(header, Provenance(role="edits", version=_VERSION))
+    layer = new_layer(header, Provenance(role="edits", version=LAYOUT))
     layer.documentation = "Yours: stronger than everything that was measured, never overwritten."
     over(layer, f"/{header.name}")
     return layer
@@ -99,7 +97,7 @@ def is_edited(asset: Asset) -> bool:
 
 def write_pending_layer(path: Path, role: str, header: StageHeader) -> None:
     """A layer without opinions, so that the root composes before the task of its role has run."""
-    layer = new_layer(header, Provenance(role=role, version=_VERSION), state="pending")
+    layer = new_layer(header, Provenance(role=role, version=LAYOUT), state="pending")
     over(layer, f"/{header.name}")
     export(layer, path, folder=path.parent)
 
@@ -126,7 +124,7 @@ def write_choice_of_lighting(
     the one that is selected, of the variant set ``lighting``; first the first. Beside ``path`` lie
     these layers, or empty ones. What all lightings have in common is a sublayer of texturing.usda.
     """
-    layer = new_layer(header, Provenance(role=role, version=_VERSION))
+    layer = new_layer(header, Provenance(role=role, version=LAYOUT))
     root = Sdf.Path(f"/{header.name}")
     for name in lightings:
         variant = over(layer, str(root.AppendVariantSelection(LIGHTING, name)))
@@ -138,9 +136,27 @@ def write_choice_of_lighting(
     export(layer, path, folder=path.parent)
 
 
-def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
-    """Write scan.usdc to ``path``; objects without a face are left out."""
-    asset, folder, frames = draft.asset, draft.asset.layer("scan").parent, scan.frames
+@dataclass(frozen=True, kw_only=True)
+class ScanFiles:
+    """Where to write what ingest knows: scan.usdc, its interface, the photographs, and the objects'
+    own files, by their paths in the asset."""
+
+    scan: Path
+    interface: Path
+    photographs: Path
+    place: Callable[[str], Path]
+
+    @staticmethod
+    def of(asset: Asset, place: Callable[[str], Path]) -> ScanFiles:
+        """All at ``place`` of their paths in the asset."""
+        layers = asset.layer("scan"), asset.interface("scan"), asset.photographs_layer
+        scan, interface, photographs = (place(f"layers/{layer.name}") for layer in layers)
+        return ScanFiles(scan=scan, interface=interface, photographs=photographs, place=place)
+
+
+def write_scan_layer(files: ScanFiles, scan: Scan, draft: Draft) -> None:
+    """Write the capture as it came; objects without a face are left out."""
+    folder, frames = draft.asset.layer("scan").parent, scan.frames
     stage = input_usd.open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
     taken = [child.GetName() for child in source.GetAllChildren()] if source else []
@@ -157,14 +173,7 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
         scopes=scopes.names,
         competing_bindings=competing or None,
     )
-    # A typed root would hide the input's own type.
-    root = define(layer, scopes.root, "" if source and source.GetTypeName() else "Xform")
-    if not (source and source.HasAuthoredMetadata("kind")):
-        root.SetInfo("kind", "assembly")
-    identifier = Sdf.AssetPath(f"../{asset.root_layer.name}")
-    root.SetInfo("assetInfo", {"identifier": identifier, "name": asset.name})
-    apply_schema(root, "ColorSpaceAPI")
-    attribute(root, "colorSpace:name", Types.Token, "lin_rec709_scene", uniform=True)
+    components, root = components_of(scan), layer.GetPrimAtPath(scopes.root)
     if source and scan.usd_geometry:
         reference = Sdf.Reference(relative_path(scan.usd_geometry, folder))
         root.referenceList.prependedItems = [reference]
@@ -176,12 +185,14 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
             own = face_object == i
             input_usd.author_overrides(layer, at, mesh, normals[own], turned[own])
             _author_label(over(layer, at), scan.objects[i], scan.label_source)
-    else:
-        _author_meshes(layer, scopes, scan)
+    for item in components:
+        prim = define(layer, scopes.mesh(item.label.identifier), "Mesh")
+        _author_mesh(prim, item)
+        _author_label(prim, item.label, scan.label_source)
     define(layer, scopes.path("cameras"), "Scope")
     camera = define(layer, scopes.path("cameras", "capture"), "Camera")
     _author_pose_and_lens(camera, scan, reset_transform=input_usd.has_transform(source))
-    _author_capture(camera, frames, folder)
+    _author_capture(camera, frames)
     # Settings that render the capture's own view; the shading layer adds the products.
     define(layer, scopes.path("render"), "Scope")
     settings = define(layer, scopes.path("render", "capture"), "RenderSettings")
@@ -189,7 +200,10 @@ def write_scan_layer(path: Path, scan: Scan, draft: Draft) -> None:
     attribute(settings, "resolution", Types.Int2, resolution, uniform=True)
     relationship(settings, "camera", scopes.path("cameras", "capture"))
     attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
-    export(layer, path, folder=folder)
+    export(layer, files.scan, folder=folder)
+    _write_photographs(files.photographs, frames, draft, scopes)
+    write_scan_interface(files.interface, scan, draft, scopes, components, source)
+    write_components(files.place, draft, scopes, components)
 
 
 def _author_label(prim: Sdf.PrimSpec, found: ObjectLabel, source: str) -> None:
@@ -207,36 +221,18 @@ def _author_label(prim: Sdf.PrimSpec, found: ObjectLabel, source: str) -> None:
         attribute(prim, "semantics:labels:class", Types.TokenArray, [class_name])
 
 
-def _author_meshes(layer: Sdf.Layer, scopes: Scopes, scan: Scan) -> None:
-    # Files split vertices at seams; ours has its normals per corner and needs no copies.
-    mesh = welded(scan.mesh)
-    geometry = define(layer, scopes.path("geometry"), "Scope")
-    geometry.SetInfo("kind", "group")
-    order = np.argsort(mesh.face_object, kind="stable")
-    bounds = np.searchsorted(mesh.face_object[order], np.arange(len(scan.objects) + 1))
-    for i, label in enumerate(scan.objects):
-        faces = order[bounds[i] : bounds[i + 1]]
-        if len(faces):
-            prim = define(layer, scopes.path("geometry", label.identifier), "Mesh")
-            prim.SetInfo("kind", "component")
-            _author_mesh(prim, mesh, faces)
-            _author_label(prim, label, scan.label_source)
-
-
-def _author_mesh(prim: Sdf.PrimSpec, mesh: ScanMesh, faces: npt.NDArray[np.intp]) -> None:
-    """The triangles ``faces`` with only the points that they use."""
-    used, corners = np.unique(mesh.triangles[faces], return_inverse=True)
-    points = mesh.points[used].astype(np.float32)
-    normals = mesh.corner_normals[faces].astype(np.float32).reshape(-1, 3)
-    extent = np.stack([points.min(axis=0), points.max(axis=0)])
-    attribute(prim, "points", Types.Point3fArray, points)
-    attribute(prim, "faceVertexCounts", Types.IntArray, np.full(len(faces), 3, np.int32))
-    attribute(prim, "faceVertexIndices", Types.IntArray, corners.reshape(-1).astype(np.int32))
+def _author_mesh(prim: Sdf.PrimSpec, item: Component) -> None:
+    counts = np.full(len(item.triangles), 3, np.int32)
+    normals = item.corner_normals.reshape(-1, 3)
+    attribute(prim, "points", Types.Point3fArray, item.points)
+    attribute(prim, "faceVertexCounts", Types.IntArray, counts)
+    attribute(prim, "faceVertexIndices", Types.IntArray, item.triangles.reshape(-1))
     attribute(prim, "normals", Types.Normal3fArray, normals, interpolation="faceVarying")
-    attribute(prim, "extent", Types.Float3Array, extent)
+    attribute(prim, "extent", Types.Float3Array, item.extent)
     attribute(prim, "subdivisionScheme", Types.Token, UsdGeom.Tokens.none, uniform=True)
-    # A scan has holes, and cameras look through them at the backs of things.
-    attribute(prim, "doubleSided", Types.Bool, True, uniform=True)
+    # What is closed has an inside, which nobody sees; a sheet has no thickness, and a scan has
+    # holes, through which cameras look at the backs of things.
+    attribute(prim, "doubleSided", Types.Bool, not is_closed(item.triangles), uniform=True)
 
 
 def lens_from_pinhole(
@@ -282,10 +278,9 @@ def _author_pose_and_lens(prim: Sdf.PrimSpec, scan: Scan, *, reset_transform: bo
     attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(near, far))
 
 
-def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
-    """Exposure attributes whose product is 1, as the frames are radiance already; our record of
-    the photographs; and these where applications look for plates (new in USD 26.11; older versions
-    pass over a schema that they do not know), muted: no render may change because of them.
+def _author_capture(prim: Sdf.PrimSpec, frames: Frames) -> None:
+    """Exposure attributes whose product is 1, as the frames are radiance already; and what we
+    record of the photographs, but for their places.
 
     USD: scale = responsivity * time * (iso / 100) * 2^exposure / fStop^2.
     """
@@ -294,23 +289,43 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames, folder: Path) -> None:
         attribute(prim, f"exposure{name}", Types.Float, value)
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
-    images = [storable_path(path, folder) for path in frames.image_paths]
-    said: dict[str, Any] = {
-        "image": images, "lens": frames.lenses, "lighting": frames.lightings,
-    }  # fmt: skip
-    for name, files in (("photograph", frames.photographs), ("mask", frames.masks)):
-        said[name] = [storable_path(file, folder) if file else "" for file in files]
+    places = dict.fromkeys(_PLACES, [""] * len(frames))
+    for fact, value in known_facts(_record_of(frames, places)):
+        if fact.name not in _PLACES:
+            author_fact(prim, fact, value)
+
+
+def _record_of(frames: Frames, places: Mapping[str, Sequence[str]]) -> Photographs:
+    """Of all photographs; their files and those they were made of at ``places``."""
+    said: dict[str, Any] = {**places, "lens": frames.lenses, "lighting": frames.lightings}
     said["gain"] = [1.0] * len(frames) if frames.gain is None else frames.gain.tolist()
     for name, _ in facts_of(Photographs):
         if name not in said:
             value = getattr(frames, name)
             said[name] = value.tolist() if isinstance(value, np.ndarray) else value
-    plates = [Sdf.AssetPath(image) for image in images]
-    for fact, value in known_facts(Photographs(**said)):
-        author_fact(prim, fact, value)
-        if fact.name == "image":
-            apply_schema(prim, "BackPlateAPI:photograph")
-            attribute_per_frame(
-                prim, "backPlate:photograph:image", Types.Asset, plates, always=True
-            )
-            attribute(prim, "backPlate:photograph:plateVisibility", Types.Token, "mute")
+    return Photographs(**said)
+
+
+def _write_photographs(path: Path, frames: Frames, draft: Draft, scopes: Scopes) -> None:
+    """Where the photographs lie, for us and where applications look for plates (new in USD 26.11;
+    older versions pass over a schema that they do not know), muted: no render may change because of
+    them. A layer of its own: an asset that is copied or published is whole without the capture."""
+    layer, folder = draft.new_layer(), draft.asset.photographs_layer.parent
+    layer.documentation = (
+        "Where the capture's photographs lie. The asset is whole without them: add this layer to "
+        "the sublayers of edits.usda to see them as plates of the camera."
+    )
+    given = (frames.image_paths, frames.photographs, frames.masks)
+    files = {
+        name: [storable_path(file, folder) if file else "" for file in paths]
+        for name, paths in zip(_PLACES, given, strict=True)
+    }
+    prim = over(layer, scopes.path("cameras", "capture"))
+    for fact, value in known_facts(_record_of(frames, files)):
+        if fact.name in _PLACES:
+            author_fact(prim, fact, value)
+    plates = [Sdf.AssetPath(image) for image in files["image"]]
+    apply_schema(prim, "BackPlateAPI:photograph")
+    attribute_per_frame(prim, "backPlate:photograph:image", Types.Asset, plates, always=True)
+    attribute(prim, "backPlate:photograph:plateVisibility", Types.Token, "mute")
+    export(layer, path, folder=folder)

@@ -1,23 +1,5 @@
 """What the tasks texture, shade and fit add to the scan, each in a layer of its own.
 
-Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``. A lighter wants
-lights: something to dim, to link, to sample well. The measured emission is in the materials, and a
-renderer that honoured both would count every lamp twice. So the default prim has a variant set:
-``emissive``, the default where anything shines, has no lights; ``usdlux`` has them, and scales the
-emission of the lamps they stand for to nothing. A shot that references the asset chooses by one
-opinion of its own, which neither a muted layer nor invisible lights in the root would allow: mutes
-are a session's, not a file's, and visibility would leave the glowing surfaces on. A layer may still
-be muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
-
-The light from outside is a DomeLight with its picture, and a DistantLight where there is a sun: in
-``usdlux`` alone, too.
-
-Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
-``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
-an object only, keep their emission in both variants. Flat lights shine from the front of the faces;
-their lamps are dark where a renderer does not show lights to the camera. A ball is hidden, since
-its light encloses it, and some renderers draw such a light from its centre.
-
 Where it is asked for, the materials once more as OpenPBR networks of MaterialX, for renderers that
 take those rather than UsdPreviewSurface; they get the same numbers. materialx.usda is a sublayer of
 material.usda, weaker than it and listed there: so the root layer need not be written again, and a
@@ -26,15 +8,14 @@ emission the variants of the lights switch off."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, Vt
 
-from usdbrdf.asset.header import Draft, Scopes, StageHeader
+from usdbrdf.asset.header import Draft, Scopes
 from usdbrdf.asset.layers.author import (
     apply_schema,
     attribute,
@@ -47,6 +28,8 @@ from usdbrdf.asset.layers.author import (
     relationship,
 )
 from usdbrdf.asset.layers.looks import (
+    ALBEDO_TEXTURE,
+    EMISSION_TEXTURE,
     LIT,
     SHADED,
     SURFACE,
@@ -78,141 +61,11 @@ from usdbrdf.asset.properties import (
     UnwrappedObject,
 )
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.model.arrays import Double
-from usdbrdf.model.light import LampShape
-from usdbrdf.model.material import turned_up
-from usdbrdf.transport.warps import axes_across
 
 Types = Sdf.ValueTypeNames
 # Arrays of pairs, and the precision of their numbers; halves are too coarse for large textures.
 _PAIRS = {Vt.Vec2fArray: np.float32, Vt.Vec2dArray: np.float64}
 ALBEDO, EMISSION = "albedo", "emission"
-# Texture nodes of the materials; that of the emission has no scale of its own.
-ALBEDO_TEXTURE, EMISSION_TEXTURE = "AlbedoTexture", "EmissionTexture"
-LIGHTS = "lights"
-EMISSIVE, USDLUX = "emissive", "usdlux"
-_TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lamp:
-    """An emitter and the lights that may stand for it; none where it has no shape for that."""
-
-    prim_path: str
-    identifier: str
-    shapes: tuple[LampShape, ...]
-
-
-def write_lights_layer(
-    path: Path,
-    draft: Draft,
-    lamps: Sequence[Lamp],
-    outside: LightFromOutside | None,
-    world_from_root: Double,
-) -> None:
-    """Write lights.usda to ``path``; without a lamp that has shapes, and without light from
-    outside, it holds nothing. Where nothing in the scan shines, the lights are on.
-
-    world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
-    """
-    scopes, layer = draft.scopes, draft.new_layer()
-    shaped = [lamp for lamp in lamps if lamp.shapes]
-    if shaped or outside:
-        emissive, usdlux = (
-            Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, name)
-            for name in (EMISSIVE, USDLUX)
-        )
-        over(layer, str(emissive))
-        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE if lamps else USDLUX
-        define(layer, _within(usdlux, scopes.path("lights")), "Scope")
-        if outside:
-            _author_outside(layer, _within(usdlux, scopes.path("lights")), outside, draft.header,
-                            world_from_root)  # fmt: skip
-        for lamp in shaped:
-            lights = _within(usdlux, scopes.path("lights", lamp.identifier))
-            define(layer, lights, "Scope")
-            for number, shape in enumerate(lamp.shapes, start=1):
-                prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
-                _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
-            # The lamp itself must not shine beside them.
-            texture = scopes.path("materials", lamp.identifier, EMISSION_TEXTURE)
-            prim = over(layer, _within(usdlux, texture))
-            author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
-            if lamp.shapes[0].kind == "sphere":
-                hidden = over(layer, _within(usdlux, lamp.prim_path))
-                attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
-    export(layer, path, folder=path.parent)
-
-
-def _author_outside(
-    layer: Sdf.Layer,
-    lights: str,
-    outside: LightFromOutside,
-    header: StageHeader,
-    world_from_root: Double,
-) -> None:
-    """A DomeLight with the picture, and a DistantLight where there is a sun."""
-    dome = define(layer, f"{lights}/sky", "DomeLight")
-    file = Sdf.AssetPath(path_in_layer(outside.sky))
-    author_inputs(dome, Types.Asset, **{"texture:file": file})
-    author_inputs(dome, Types.Token, **{"texture:format": "latlong"})
-    author_inputs(dome, Types.Float, intensity=1.0)
-    # A DomeLight's pole is its y axis.
-    _author_pose(dome, np.linalg.inv(world_from_root) @ turned_up("Y", header.up_axis))
-    if not any(outside.sun_irradiance):
-        return
-    sun = define(layer, f"{lights}/sun", "DistantLight")
-    _author_emission(sun, outside.sun_irradiance, normalize=True)
-    author_inputs(sun, Types.Float, angle=math.degrees(2 * outside.sun_half_angle))
-    # It shines along its -z.
-    back, pose = np.array(outside.sun_direction, np.float64), np.eye(4)
-    pose[:3, :3] = np.stack([*axes_across(back), back], axis=-1)
-    _author_pose(sun, np.linalg.inv(world_from_root) @ pose)
-
-
-def _author_emission(prim: Sdf.PrimSpec, emission: Colour, *, normalize: bool) -> None:
-    """What a light sends out, intensity * 2^exposure * color: radiance, or, if it is to
-    ``normalize``, a distant light's irradiance."""
-    brightest = max(emission)
-    colour = Gf.Vec3f(*(value / brightest for value in emission))
-    author_inputs(prim, Types.Float, intensity=1.0, exposure=math.log2(brightest))
-    author_inputs(prim, Types.Color3f, color=colour)
-    author_inputs(prim, Types.Bool, normalize=normalize)
-
-
-def _author_pose(prim: Sdf.PrimSpec, pose: Double) -> None:
-    """USD multiplies row vectors from the left: its matrices are ours, of column vectors,
-    transposed."""
-    attribute(prim, "xformOp:transform", Types.Matrix4d, Gf.Matrix4d(pose.T.tolist()))
-    attribute(prim, "xformOpOrder", Types.TokenArray, ["xformOp:transform"], uniform=True)
-
-
-def world_from_root(stage: Usd.Stage) -> Double:
-    """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
-    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
-    return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
-
-
-def _within(variant: Sdf.Path, path: str) -> str:
-    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
-
-
-def _author_light(
-    prim: Sdf.PrimSpec, shape: LampShape, world_from_root: Double, meters_per_unit: float
-) -> None:
-    """UsdLux, normalize off: radiance = intensity * 2^exposure * color."""
-    _author_emission(prim, shape.radiance, normalize=False)
-    width, height = (side / meters_per_unit for side in shape.size)
-    if shape.kind == "rectangle":
-        author_inputs(prim, Types.Float, width=width, height=height)
-    else:
-        author_inputs(prim, Types.Float, radius=width / 2)
-    half = Gf.Vec3f(width / 2, height / 2, width / 2 if shape.kind == "sphere" else 0)
-    attribute(prim, "extent", Types.Float3Array, [-half, half])
-    # Rigid in the world, in units of the stage: what the root does to sizes is undone here.
-    in_units = shape.world_from_light.copy()
-    in_units[:3, 3] /= meters_per_unit
-    _author_pose(prim, np.linalg.inv(world_from_root) @ in_units)
 
 
 def write_uv_layer(
@@ -286,11 +139,13 @@ def write_shading_layer(
     layer.subLayerPaths = [f"./{asset.lights_layer.name}"]
     if outside:
         author_record(over(layer, scopes.root), outside)
-    define(layer, scopes.path("materials"), "Scope")
     for item in objects:
         author_record(over(layer, item.prim_path), item)
+        shines = item.radiance if item.emitter else item.mean_albedo
+        _author_display_colour(layer, scopes, item.prim_path, shines)
         # Diffuse only: the lobe is what the task fit adds, in a stronger layer.
-        material = scopes.path("materials", item.identifier)
+        material = scopes.material(item.identifier)
+        define(layer, str(Sdf.Path(material).GetParentPath()), "Scope")
         surface(layer, material)
         files = {aov.name: aov.file for aov in item.aovs}
         wanted = EMISSION if item.emitter else ALBEDO
@@ -308,10 +163,22 @@ def write_shading_layer(
                 colour_from_texture(layer, material, name, texture, files[aov], fallback=mean)
     # Emission is not a look: it is nothing on most objects, and the shaded look shows it.
     looks = aov_looks(layer, scopes, objects, hidden=frozenset([EMISSION]))
-    looks[SHADED] = {item.prim_path: scopes.path("materials", item.identifier) for item in objects}
+    looks[SHADED] = {item.prim_path: scopes.material(item.identifier) for item in objects}
     author_looks(layer, draft, looks, selected=SHADED)
     _author_render_outputs(layer, scopes)
     export(layer, path, folder=asset.layer("shading").parent)
+
+
+def _author_display_colour(layer: Sdf.Layer, scopes: Scopes, prim_path: str, mean: Colour) -> None:
+    """One colour for applications that draw no materials, at most 1. An input's mesh keeps what its
+    file says."""
+    if prim_path.startswith(scopes.path("geometry", "")):
+        brightest = max(1.0, *mean)
+        shown = Vt.Vec3fArray([Gf.Vec3f(*(value / brightest for value in mean))])
+        prim = over(layer, prim_path)
+        attribute(
+            prim, "primvars:displayColor", Types.Color3fArray, shown, interpolation="constant"
+        )
 
 
 def _author_render_outputs(layer: Sdf.Layer, scopes: Scopes) -> None:
@@ -345,7 +212,7 @@ def write_refined_layer(
             shown = (
                 preview_surface_from_fit(*lamp.shown, lamp.mapping) if lamp.is_known else NO_LOBE
             )
-            material = scopes.path("materials", lamp.identifier)
+            material = scopes.material(lamp.identifier)
             _author_diffuse(layer, material, lamp, shown.diffuse, own)
     author_looks(layer, draft, aov_looks(layer, scopes, objects), selected=SHADED)
     export(layer, path, folder=asset.layer("material").parent)
@@ -375,8 +242,10 @@ def write_material_layer(
     shading = [_shading_layer(one) for one in asset.in_each_lighting]
     networks = {}
     for item in objects:
-        material = scopes.path("materials", item.identifier)
+        material = scopes.material(item.identifier)
         author_record(over(layer, item.prim_path), item)
+        if any(mean := item.f0 if item.is_metal else item.mean_color):
+            _author_display_colour(layer, scopes, item.prim_path, mean)
         shown = NO_LOBE
         if item.is_known:
             shown = preview_surface_from_fit(*item.shown, item.mapping)

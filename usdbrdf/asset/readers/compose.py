@@ -54,7 +54,10 @@ def open_edited(asset: Asset) -> Usd.Stage:
     InputRefused where it does not compose, or USD crashes on it."""
     refuse_converted(asset)
     try_in_child(asset.root_layer)
-    return _in_lighting(open_stage(asset.root_layer), asset)
+    stage = open_stage(asset.root_layer)
+    if asset.photographs_layer.is_file():
+        stage.GetSessionLayer().subLayerPaths.append(str(asset.photographs_layer))
+    return _in_lighting(stage, asset)
 
 
 def _in_lighting(stage: Usd.Stage, asset: Asset) -> Usd.Stage:
@@ -152,7 +155,8 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     root = new_layer(read_header(layers[0]), Provenance(role="view", version="1"))
     # Texture coordinates are a sublayer of texturing.usda already.
     uv = None if asset.lighting else asset.uv_layer
-    root.subLayerPaths = [str(layer) for layer in reversed(layers) if layer != uv]
+    below = [str(layer) for layer in _beneath(asset)]
+    root.subLayerPaths = [*(str(layer) for layer in reversed(layers) if layer != uv), *below]
     return open_stage(root)
 
 
@@ -177,8 +181,15 @@ def hashes_of_inputs(
     if picture and not picture.is_file():
         raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
     behind = f".{asset.lighting}" if asset.lighting else ""
-    by_label = {layer.name: sha256_of(layer) for layer in _weaker_layers(asset, role)}
+    layers = [*_weaker_layers(asset, role), *_beneath(asset)]
+    by_label = {layer.name: sha256_of(layer) for layer in layers}
     return by_label | {f"{k}{behind}": hash_of_files(some) for k, some in files.items() if some}
+
+
+def _beneath(asset: Asset) -> list[Path]:
+    """What stands beside the scan layer, so far as it is there: where its objects are, and where
+    its photographs lie. Earlier versions had all in one."""
+    return [x for x in (asset.interface("scan"), asset.photographs_layer) if x.is_file()]
 
 
 def _weaker_layers(asset: Asset, role: str) -> list[Path]:

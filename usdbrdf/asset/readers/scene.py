@@ -47,7 +47,8 @@ LENS = (
     "horizontalApertureOffset",
     "verticalApertureOffset",
 )
-_IMAGE = CAPTURE.attribute(CAPTURE.key)
+_IMAGE, _EXPOSURE = CAPTURE.attribute("image"), CAPTURE.attribute("exposureTime")
+_PINHOLE = CAPTURE.attribute(CAPTURE.key)
 
 
 def lighting_of_stage(stage: Usd.Stage) -> str:
@@ -58,8 +59,8 @@ def lighting_of_stage(stage: Usd.Stage) -> str:
 def frames_from_stage(stage: Usd.Stage) -> Frames:
     """The photographs, with poses in metres and absolute image paths, in the order of time."""
     camera = capture_camera(stage)
-    image = camera.GetPrim().GetAttribute(_IMAGE)
-    times = image.GetTimeSamples()
+    exposure = camera.GetPrim().GetAttribute(_EXPOSURE)
+    times = exposure.GetTimeSamples()
     # Row vectors in USD: transposed they are ours.
     poses = np.array([camera.ComputeLocalToWorldTransform(time) for time in times])
     poses = np.ascontiguousarray(poses.transpose(0, 2, 1))
@@ -74,7 +75,11 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
         else:
             read[field] = attribute.Get()
     read["resolution"] = read["resolution"].astype(np.int32)
-    paths = [asset_file(image, time) for time in times]
+    image = camera.GetPrim().GetAttribute(_IMAGE)
+    # Without the layer that tells where they lie, they have numbers.
+    unknown = Path(exposure.GetPropertyStack(times[0])[0].layer.realPath).with_name("photographs")
+    found = (asset_file(image, time) if image else None for time in times)
+    paths = [file or unknown / f"{i + 1:04d}" for i, file in enumerate(found)]
 
     def of_all(name: str, get: Callable[[Usd.Attribute, float], Any]) -> tuple[Any, ...]:
         """What only some captures say of their photographs; () where this one does not."""
@@ -83,7 +88,7 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
         return tuple(get(attribute, time) for time in times) if said else ()
 
     return Frames(
-        image_paths=tuple(path for path in paths if path is not None),
+        image_paths=tuple(paths),
         world_from_camera=poses,
         photographs=of_all("photograph", asset_file),
         masks=of_all("mask", asset_file),
@@ -96,11 +101,11 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
 def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
     """The camera that carries the photographs."""
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Camera) and prim.GetAttribute(_IMAGE):
+        if prim.IsA(UsdGeom.Camera) and authored(prim, _PINHOLE) is not None:
             return UsdGeom.Camera(prim)
     raise InputRefused(
-        f"{stage.GetRootLayer().identifier}: no camera of the stage has photographs "
-        "(usdBrdf:capture:image). Run ingest again. [stage.camera]"
+        f"{stage.GetRootLayer().identifier}: no camera of the stage has taken photographs "
+        "(usdBrdf:capture:pinhole). Run ingest again. [stage.camera]"
     )
 
 
@@ -123,7 +128,8 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
-    records = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetLayerStack()]
+    used = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetUsedLayers()]
+    records = (record for record in used if record.get("role") == "scan")
     angles = (record.get("parameters", {}).get("crease_angle_deg") for record in records)
     angle = next((a for a in angles if a is not None), IngestOptions().crease_angle_deg)
     read = (_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims)
