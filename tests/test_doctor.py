@@ -14,7 +14,7 @@ import pytest
 
 from usdbrdf import doctor
 from usdbrdf.cli import main
-from usdbrdf.transport.rays import Hits
+from usdbrdf.transport.rays import Hits, RayScene
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_an_extra_that_is_not_there_breaks_nothing(told, monkeypatch):
 def test_rays_that_meet_the_wrong_thing_are_broken(told, monkeypatch):
     nothing = np.zeros(2, np.float32)
     wrong = Hits(np.array([-1, -1], np.int32), nothing, nothing, nothing)
-    monkeypatch.setattr(doctor.RayScene, "closest", lambda *_: wrong)
+    monkeypatch.setattr(RayScene, "closest", lambda *_: wrong)
     status, found = told()
     assert status == 4
     assert found["rays"]["state"] == "broken"

@@ -28,8 +28,6 @@ from usdbrdf.job.memory import GIB, machine_bytes, refuse_few_addresses
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import code_version
 from usdbrdf.kernel import mark_of_compiled, num_threads
-from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
-from usdbrdf.transport.rays import RayScene
 
 State = Literal["ok", "missing", "broken"]
 # Below these a room of a hundred frames will hardly go through.
@@ -134,6 +132,8 @@ def _images_survive() -> str:
 
 
 def _rays_hit() -> str:
+    from usdbrdf.transport.rays import RayScene  # which does not load without Embree
+
     points = np.array([[0, 0, 1], [2, 0, 1], [0, 2, 1]], np.float32)
     scene = RayScene(points, np.array([[0, 1, 2]], np.int32))
     origins = np.array([[0.5, 0.5, 0], [3, 3, 0]], np.float32)
@@ -188,6 +188,8 @@ def _programs() -> Iterator[Finding]:
 
 def _llvm() -> str | None:
     with suppress(UsdBrdfError, OSError):
+        from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
+
         variant = mitsuba_variant().variant()
         return f"Mitsuba's variant {variant}" if variant == VARIANTS[0] else None
     return None

@@ -53,7 +53,8 @@ def compile_all(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> 
     was done. The loops of light transport come first: they take longest, and the run that this is
     for comes to them when it has compiled those of its first steps itself."""
     _trace_light()
-    with TemporaryDirectory(prefix="usdbrdf-warm-up-") as folder:
+    # In the child's own folder, which the parent takes away, also from one that it ends.
+    with TemporaryDirectory(dir=".") as folder:
         capture = Path(folder) / "room"
         _write_capture(capture)
         with pipeline.working_on(Path(folder) / "asset") as asset:

@@ -13,6 +13,9 @@ import pytest
 from pxr import Sdf, Usd, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.manifest import changes
+from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
 from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
@@ -128,10 +131,41 @@ def test_what_fails_half_way_leaves_nothing(room, tmp_path, monkeypatch):
         with pytest.raises(Exception, match="No space left"):
             publish(room.asset.folder, dest)
     assert not (tmp_path / "a").exists()
-    # What a killed process leaves has no version's name, and goes with the next.
-    (dest / ".tmp-1-dead").mkdir(parents=True)
+    # What a killed process leaves has no version's name, and goes with the next; what others are
+    # making beside it stays.
+    (dest / ".usdbrdf-publish/staged/.tmp-1-dead").mkdir(parents=True)
+    (dest / ".tmp-2-copied").mkdir()
     publish(room.asset.folder, dest)
-    assert sorted(os.listdir(dest)) == [".usdbrdf-publish", "v001"]
+    assert sorted(os.listdir(dest)) == [".tmp-2-copied", ".usdbrdf-publish", "v001"]
+    assert not list((dest / ".usdbrdf-publish").rglob(".tmp-*"))
+
+
+def test_neither_half_a_run_nor_into_a_file(room, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(OwnershipConflict, match=r"is a file.*\[publish\.destination\]$"):
+        publish(room.asset.folder, file)
+    assert file.read_text() == "mine"
+    journal = room.asset.folder / ".usdbrdf/publishing-shade.json"
+    journal.parent.mkdir(exist_ok=True)
+    journal.write_text("{}")
+    try:
+        with pytest.raises(InputRefused, match=r"was stopped.*\[publish\.unfinished\]$"):
+            publish(room.asset.folder, tmp_path / "dest")
+    finally:
+        journal.unlink()
+    assert not (tmp_path / "dest").exists()
+
+
+def test_a_version_is_not_reviewed_and_bears_what_systems_leave(room, tmp_path):
+    publish(room.asset.folder, tmp_path)
+    version = tmp_path / "v001"
+    with pytest.raises(OwnershipConflict, match=r"\[review\.published\]$"):
+        write_review(Asset.made(version), {})
+    (version / ".DS_Store").write_bytes(b"")
+    assert not list(changes(version))
+    (version / "more.usda").write_text("#usda 1.0\n")
+    assert [what for _, what in changes(version)] == ["was added"]
 
 
 def test_one_at_a_time(room, tmp_path):

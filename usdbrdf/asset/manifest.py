@@ -13,6 +13,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.documents import json_text, read_json, write_json
+from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import check_relative
 
 MANIFEST = "manifest.json"
@@ -90,9 +91,8 @@ def changes(folder: Path) -> Iterator[tuple[Path, str]]:
             yield file, "is missing"
         elif sha256_of(file) != sha256:
             yield file, "was changed"
-    for file in sorted(folder.rglob("*")):
-        known = file.relative_to(folder).as_posix()
-        if file.is_file() and known not in manifest.files and known != MANIFEST:
+    for file in files_below(folder, without=folder / MANIFEST):
+        if file.relative_to(folder).as_posix() not in manifest.files:
             yield file, "was added"
 
 

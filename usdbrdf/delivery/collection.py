@@ -124,6 +124,7 @@ def forget_photographs(layer: Sdf.Layer) -> bool:
     """Take out what says where the photographs and their masks are; returns whether there was
     any."""
     gone: list[Sdf.PropertySpec] = []
+    changed: list[Sdf.Path] = []
 
     def visit(path: Sdf.Path) -> None:
         spec = layer.GetObjectAtPath(path)
@@ -140,11 +141,12 @@ def forget_photographs(layer: Sdf.Layer) -> bool:
                 make = Sdf.TokenListOp
                 own = make.CreateExplicit(kept) if schemas.isExplicit else make.Create(kept)
                 spec.SetInfo("apiSchemas", own)
+                changed.append(spec.path)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     for spec in gone:
         spec.owner.RemoveProperty(spec)
-    return bool(gone)
+    return bool(gone or changed)
 
 
 def _reached(start: Sequence[Path], stop: set[Path]) -> dict[Path, Sdf.Layer]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pxr import Sdf
 
+from usdbrdf.asset.layers.lights_layer import LIGHTS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.delivery.collection import Collection, collected, refuse_incomplete, write_collection
@@ -51,7 +52,12 @@ def write_copy(
     for one in asset.in_each_lighting:
         stage = open_edited(one)
         if space != WORKING_SPACE:
-            textures.look_at(stage, space)
+            # Lamps that glow and lights that shine are not there at once.
+            stage.SetEditTarget(stage.GetSessionLayer())
+            lights = stage.GetDefaultPrim().GetVariantSet(LIGHTS)
+            for chosen in lights.GetVariantNames() or [""]:
+                lights.SetVariantSelection(chosen)
+                textures.look_at(stage, space)
     found = collected(asset, root, photographs=photographs)
     for file in found.named_by:
         accept(file)

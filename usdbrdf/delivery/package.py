@@ -320,7 +320,15 @@ def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOpt
         others: dict[str, str] = {}
         for path in sorted(named_files(flat.GetRootLayer()) - {f"./{path}" for path in packed}):
             file, taken = file_in_asset(path, asset), {*packed, *others.values()}
-            others[path] = add_file(file, asset.folder.resolve(), folder, taken)
+            convert = partial(in_space, space=space) if file in colours.files else None
+            others[path] = add_file(
+                file,
+                asset.folder.resolve(),
+                folder,
+                taken,
+                convert,
+                space if convert else WORKING_SPACE,
+            )
         UsdUtils.ModifyAssetPaths(
             flat.GetRootLayer(), lambda path: f"./{others[path]}" if path in others else path
         )

@@ -139,15 +139,26 @@ def add_texture(
     return NewTexture(path=path, space="sRGB" if use.colour else "raw", scale=scale, bias=bias)
 
 
-def add_file(file: Path, below: Path, folder: Path, taken: Collection[str]) -> str:
+def add_file(
+    file: Path,
+    below: Path,
+    folder: Path,
+    taken: Collection[str],
+    colours: Callable[[Float], Float] | None = None,
+    encoding: str = WORKING_SPACE,
+) -> str:
     """Add a picture that is no texture of a material, such as a dome light's; returns its path in
-    the package, which is the one that it has below ``below`` if that is free."""
+    the package, which is the one that it has below ``below`` if that is free.
+
+    colours, encoding  what brings its colours to another space, and that one
+    """
     checked_size(file)
-    convert = file.suffix.lower() in CONVERTED
+    convert = file.suffix.lower() in CONVERTED or colours is not None
     place = file.relative_to(below)
     path = _free((place.with_suffix(f".{EXR}") if convert else place).as_posix(), taken, folder)
     if convert:
-        write_exr(folder / path, read_texture(file, "auto"))
+        pixels = read_texture(file, "auto")
+        write_exr(folder / path, colours(pixels) if colours else pixels, encoding=encoding)
     else:
         copy_without_metadata(file, folder / path)
     return path

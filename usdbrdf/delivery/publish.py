@@ -21,18 +21,13 @@ from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manif
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import (
-    TEMPORARY_PREFIX,
-    environment_failures,
-    publish_folder,
-    sha256_of,
-    temporary_folder,
-)
+from usdbrdf.files.atomic import environment_failures, publish_folder, sha256_of, temporary_folder
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.options import PublishOptions
 
 _LOCKED = ".usdbrdf-publish"  # holds the lock of a folder of versions
+_STAGED = "staged"  # in there, what is not whole yet
 _VERSION = re.compile(r"v(\d{3,9})")
 _ENCODINGS = {"text": "usda", "binary": "usdc"}
 
@@ -59,6 +54,16 @@ def publish(
     options = options or PublishOptions()
     asset = Asset.made(folder)
     asset.refuse_output(destination, "publish.destination")
+    if destination.exists() and not destination.is_dir():
+        raise OwnershipConflict(
+            f"{destination}: this is a file, and versions are published into a folder. Choose "
+            "another place. [publish.destination]"
+        )
+    if any((asset.folder / STATE_FOLDER).glob("publishing-*.json")):
+        raise InputRefused(
+            f"{asset.folder}: a run was stopped while it put its files in place. Run `usdbrdf "
+            "convert` again, which ends it, and publish then. [publish.unfinished]"
+        )
     state, lock = asset.folder / STATE_FOLDER, destination / _LOCKED
     # Where nobody can write, nobody works.
     state = state if os.access(state, os.W_OK) else lock
@@ -85,14 +90,14 @@ def _made(destination: Path) -> Iterator[None]:
 
 
 def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict[str, Any]:
-    for litter in destination.glob(f"{TEMPORARY_PREFIX}*"):
-        shutil.rmtree(litter, ignore_errors=True)  # what a killed run left half
+    # What a killed run left half lies where nobody else makes anything.
+    shutil.rmtree(destination / _LOCKED / _STAGED, ignore_errors=True)
     earlier = versions_in(destination)
     latest = earlier[-1] if earlier else ""
     version = _version(options.version, latest, earlier)
     final = destination / version
     like = destination / (version if version in earlier else latest)
-    with temporary_folder(final) as staged:
+    with temporary_folder(destination / _LOCKED / _STAGED / version) as staged:
         manifest = _write(asset, staged, version, options)
         if earlier and manifest.content == _content_of(like):
             return _summary(like, read_manifest(like), new=False)
@@ -189,14 +194,14 @@ def _identifier(template: str | None, name: str, version: str) -> str:
             problem = "is no URI"
         elif fields - {"name", "version"}:
             problem = "has fields other than {name} and {version}"
-    except ValueError as error:
+        else:
+            return template.format(name=name, version=version)
+    except (ValueError, KeyError, IndexError, AttributeError) as error:
         problem = f"cannot be filled in ({error})"
-    if problem:
-        raise UsageError(
-            f"--uri {template}: {problem}. Write it like "
-            "'ayon+entity://show/assets?product={name}&version={version}'. [publish.uri]"
-        )
-    return template.format(name=name, version=version)
+    raise UsageError(
+        f"--uri {template}: {problem}. Write it like "
+        "'ayon+entity://show/assets?product={name}&version={version}'. [publish.uri]"
+    )
 
 
 def _describe(layer: Sdf.Layer, name: str, version: str, identifier: str) -> None:

@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from usdbrdf.errors import CrashedChild, InputRefused, LateChild
+from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused, LateChild
 from usdbrdf.job.child import child
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
@@ -181,7 +181,7 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
             raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
     try:
         corner_uv, resolution = _side_by_side(scene, sizes)
-    except (CrashedChild, LateChild):
+    except (CrashedChild, EnvironmentFailure):  # one alone takes less memory, too
         corner_uv, resolution = _one_by_one(scene, sizes)
     for obj, (width, height) in zip(scene.objects, resolution, strict=True):
         if max(width, height) > MAX_SIDE:

@@ -57,7 +57,12 @@ def inputs_of_capture(
     objects = options.objects if isinstance(options.objects, Path) else folder / "objects.json"
     inputs = {
         label: hash_of_files(
-            [f for f in files_below(place, without=asset.folder) if f != objects.resolve()], place
+            [
+                f
+                for f in files_below(place, without=asset.folder)
+                if f.resolve() != objects.resolve()
+            ],
+            place,
         )
         for label, place in ({"capture": folder} | outside).items()
     } | _inputs_of_objects(objects)

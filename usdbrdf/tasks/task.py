@@ -59,7 +59,9 @@ class Task:
     inputs: Mapping[str, str]
 
     def run(self, work: Callable[[TaskRun], dict[str, Any]]) -> TaskResult:
-        """Do the work unless it is done already (see ``usdbrdf.job.task``)."""
+        """Do the work unless it is done already (see ``usdbrdf.job.task``); OwnershipConflict in an
+        asset of an old layout."""
+        refuse_old_layout(self.asset)
         return run_task(
             self.asset.folder,
             name_in_lighting(self.name, self.asset.lighting),
@@ -83,6 +85,5 @@ class Task:
 
     @property
     def draft(self) -> Draft:
-        """What the task's layers begin with; OwnershipConflict in an asset of an old layout."""
-        refuse_old_layout(self.asset)
+        """What the task's layers begin with."""
         return Draft(asset=self.asset, header=self.header, provenance=self.provenance)

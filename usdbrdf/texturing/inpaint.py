@@ -81,8 +81,9 @@ def _fill(
             [texels.position[index], normal_weight * texels.normal[index]], axis=-1
         )
 
+    area = float(texels.area[source].sum())
     source = source[:: -(-len(source) // _MOST_SOURCES)]
-    spacing = math.sqrt(float(texels.area[source].sum()) / len(source))
+    spacing = math.sqrt(area / len(source))
     # Each level has a part of the one before, evenly: its sources lie that much further apart.
     mixed = np.random.default_rng(_SEED).permutation(source)
     counts = [len(source)]
