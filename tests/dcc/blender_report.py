@@ -63,7 +63,8 @@ def report_material(material):
 def report(path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.usd_import(filepath=path, import_textures_mode="IMPORT_NONE")
-    meshes = {o.name: o for o in bpy.data.objects if o.type == "MESH"}
+    # The component has the name, and the mesh in it the same with a number.
+    meshes = {o.name.split(".")[0]: o for o in bpy.data.objects if o.type == "MESH"}
     camera = next(o for o in bpy.data.objects if o.type == "CAMERA")
     return {
         "meshes": {

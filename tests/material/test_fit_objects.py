@@ -24,7 +24,7 @@ class _Run:
         self.saved[name] = found
 
 
-def _fit_that_tells_the_threads(*_: object) -> ObjectFit:
+def _fit_that_tells_the_threads(*_: object, **__: object) -> ObjectFit:
     (threads,) = set(_threads_of_blas().tolist())
     return ObjectFit(cost=float(threads))
 

@@ -98,7 +98,7 @@ def test_disturbed_poses_come_back_and_the_captured_ones_are_kept(made, tmp_path
     assert [one["moved_m"] for one in told] == pytest.approx(moved.tolist(), abs=1e-5)
     assert all(one["differs"] <= one["differed"] for one in told)
     # Any reader of USD sees the refined cameras; those captured are an operation of their own.
-    stage = Usd.Stage.Open(str(Asset.at(out).layer("scan")))
+    stage = Usd.Stage.Open(str(Asset.at(out).root_layer))
     camera = next(UsdGeom.Xformable(p) for p in stage.Traverse() if p.IsA(UsdGeom.Camera))
     first, second = camera.GetOrderedXformOps()
     assert second.GetOpName() == "xformOp:transform:refined"
@@ -117,7 +117,7 @@ def test_disturbed_poses_come_back_and_the_captured_ones_are_kept(made, tmp_path
     assert "refined already" in err
     steps = json.loads(printed)["steps"]["ingest"]["refined_poses"]
     assert [one["moved_m"] for one in steps] == pytest.approx(moved.tolist(), abs=1e-5)
-    again = Usd.Stage.Open(str(Asset.at(tmp_path / "again").layer("scan")))
+    again = Usd.Stage.Open(str(Asset.at(tmp_path / "again").root_layer))
     camera = next(UsdGeom.Xformable(p) for p in again.Traverse() if p.IsA(UsdGeom.Camera))
     for one, other in zip((first, second), camera.GetOrderedXformOps(), strict=True):
         assert one.GetOpName() == other.GetOpName()

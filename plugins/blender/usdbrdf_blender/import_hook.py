@@ -27,6 +27,9 @@ class UsdBrdfImport(bpy.types.USDHook):
             prim = stage.GetPrimAtPath(path)
             # A package of ours has facts, and no looks to choose from.
             root, facts = usd_asset.look_prim(prim), usd_asset.facts_of(prim)
+            if prim.GetTypeName() == "Mesh":
+                # People pick the mesh; what is known of it stands at its component.
+                facts = {**usd_asset.facts_of(prim.GetParent()), **facts}
             if root is None and not facts:
                 continue
             for item in imported:
@@ -37,7 +40,16 @@ class UsdBrdfImport(bpy.types.USDHook):
                         item[name] = value
                     if root is not None:
                         _keep_looks(item, root)
+                    _name_as_object(item, prim)
         return True
+
+
+def _name_as_object(item, prim):
+    """A mesh has its component's name, which Blender allows but once: the mesh is to have it."""
+    name, above = prim.GetName(), item.parent
+    if item.type == "MESH" and above and above.type == "EMPTY" and above.name == name:
+        above.name = f"{name}_component"
+        item.name = name
 
 
 def _keep_looks(item, root):

@@ -95,7 +95,8 @@ def surface(item):
 
 
 def surfaces():
-    return {o.name: surface(o) for o in bpy.data.objects if o.type == "MESH"}
+    # Without the add-on the component has the name, and the mesh the same with a number.
+    return {o.name.split(".")[0]: surface(o) for o in bpy.data.objects if o.type == "MESH"}
 
 
 def select(name):
