@@ -9,12 +9,12 @@ import usdbrdf
 from tests.scenes import edited, make_capture, poses_down_and_up
 from usdbrdf.asset.directives import directives_of
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.properties import OF_FIT
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_stage, time_code
 from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.asset.review import Judgement, write_review
 from usdbrdf.errors import InputRefused
+from usdbrdf.model.mesh import OF_FIT
 from usdbrdf.validation.validate import has_errors, validate
 
 OPTIONS = usdbrdf.ConvertOptions(

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
 from usdbrdf.model.arrays import Array, Float
+from usdbrdf.model.mesh import OF_FIT, OF_SHADE
 from usdbrdf.transport.brdf import F0_OF_PSI
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
@@ -116,9 +117,6 @@ OUTSIDE = Schema("Outside", "usdBrdf:outside", "Imageable", "sky", """The light 
     show.""")
 SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER, OUTSIDE)
 _CONFIDENCES = ("high", "low", "none")
-# What people may ask of the steps shade and fit, see ``asset.directives``.
-LAMP = "lamp"
-OF_SHADE, OF_FIT = (LAMP, "not-lamp"), ("ignore", "metal", "glass", "refit")
 _CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
     of the class the rest; none: {0} is the value of the class."""
 

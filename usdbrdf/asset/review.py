@@ -21,13 +21,13 @@ from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.properties import OF_SHADE, FittedObject
+from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.documents import read_text
-from usdbrdf.model.mesh import DIRECTIVES
+from usdbrdf.model.mesh import DIRECTIVES, OF_SHADE
 
 VERDICTS = ("accept", "reject")
 MAX_COMMENT = 2000

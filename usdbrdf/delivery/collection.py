@@ -24,10 +24,10 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 PHOTOGRAPHS, CAPTURED = "photographs", "captured"  # folders for what lies elsewhere
 _LAYERS = frozenset({".usd", ".usda", ".usdc"})
 # Attributes that name photographs and their masks, and schemas that are about nothing else.
-_OF_PHOTOGRAPHS = (
+OF_PHOTOGRAPHS = (
     "usdBrdf:capture:image", "usdBrdf:capture:photograph", "usdBrdf:capture:mask", "backPlate:",
 )  # fmt: skip
-_SCHEMAS_OF_PHOTOGRAPHS = ("BackPlateAPI:",)
+SCHEMAS_OF_PHOTOGRAPHS = ("BackPlateAPI:",)
 _UDIM = "<UDIM>"
 
 
@@ -77,7 +77,7 @@ def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
         _place(found, file, file in measured, CAPTURED)
     for file, layer in found.layers.items():
         for path, attribute in _paths(layer):
-            is_photograph = attribute.startswith(_OF_PHOTOGRAPHS)
+            is_photograph = attribute.startswith(OF_PHOTOGRAPHS)
             for target in _targets(file, path):
                 if target in found.layers:
                     continue
@@ -128,15 +128,15 @@ def forget_photographs(layer: Sdf.Layer) -> bool:
 
     def visit(path: Sdf.Path) -> None:
         spec = layer.GetObjectAtPath(path)
-        if isinstance(spec, Sdf.PropertySpec) and spec.name.startswith(_OF_PHOTOGRAPHS):
+        if isinstance(spec, Sdf.PropertySpec) and spec.name.startswith(OF_PHOTOGRAPHS):
             gone.append(spec)
         elif isinstance(spec, Sdf.PrimSpec) and spec.HasInfo("apiSchemas"):
             schemas = spec.GetInfo("apiSchemas")
-            if any(name.startswith(_SCHEMAS_OF_PHOTOGRAPHS) for name in schemas.GetAppliedItems()):
+            if any(name.startswith(SCHEMAS_OF_PHOTOGRAPHS) for name in schemas.GetAppliedItems()):
                 kept = [
                     name
                     for name in schemas.GetAppliedItems()
-                    if not name.startswith(_SCHEMAS_OF_PHOTOGRAPHS)
+                    if not name.startswith(SCHEMAS_OF_PHOTOGRAPHS)
                 ]
                 make = Sdf.TokenListOp
                 own = make.CreateExplicit(kept) if schemas.isExplicit else make.Create(kept)
@@ -291,13 +291,11 @@ def refuse_incomplete(root: Path) -> None:
     folder = Path(os.path.realpath(root.parent))
     for layer in stage.GetUsedLayers():
         inside = layer.anonymous or Path(os.path.realpath(layer.realPath)).is_relative_to(folder)
-        leading = [p for p in named_files(layer) if not (p.startswith(("./", "../")) or _is_uri(p))]
+        leading = [
+            p for p in named_files(layer) if not (p.startswith(("./", "../")) or ADDRESS.match(p))
+        ]
         if not inside or leading:
             raise UsdBrdfError(
                 f"{layer.identifier}: {', '.join(leading) or 'this layer'} leads out of what is "
                 "published. This is a defect of usdbrdf; please report it. [publish.defect]"
             )
-
-
-def _is_uri(path: str) -> bool:
-    return bool(ADDRESS.match(path))

@@ -26,6 +26,7 @@ from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
+from usdbrdf.delivery.collection import OF_PHOTOGRAPHS, SCHEMAS_OF_PHOTOGRAPHS
 from usdbrdf.delivery.colours import ColourTextures, convert_layer, in_space
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.glb import write_glb
@@ -55,12 +56,9 @@ from usdbrdf.options import PackageOptions
 
 _PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
 # Properties and schemas that name files of the capture or of other looks.
-_LEFT_OUT = (
-    "usdBrdf:aov:", "usdBrdf:capture:image", "usdBrdf:capture:photograph", "usdBrdf:capture:mask",
-    "backPlate:",
-)  # fmt: skip
+_LEFT_OUT = ("usdBrdf:aov:", *OF_PHOTOGRAPHS)
 _MAPPING = "usdBrdf:fit:mapping"
-_LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", "BackPlateAPI:")
+_LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", *SCHEMAS_OF_PHOTOGRAPHS)
 USDZ, GLB = ".usdz", ".glb"
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
 _PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)

@@ -43,6 +43,7 @@ from usdbrdf.material.verdict import (
 )
 from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import GLASS, LEFT_OUT, METAL, REFIT
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
@@ -198,9 +199,6 @@ class FirstLook(NamedTuple):
         return cls(lobes, int(arrays["num_samples"]))
 
 
-# What a person may ask of an object's fit, in words; and what is then not fitted.
-METAL, REFIT, GLASS = "metal", "refit", "glass"
-LEFT_OUT = ("ignore", GLASS)
 _NAMES = {PAPER: "paper", DIELECTRIC: "microfacet"}
 # Of the share that no lobe explains, summed over objects: what the two kinds must differ by.
 _PAPER_CLEARER = calibration.number("fit.paper_clearer")
@@ -330,7 +328,7 @@ def fit_object(
     """The lobe of one object by the chosen method, of a kind (``brdf``).
 
     lightings: one alone where the method takes one frame. look: what has been fitted already.
-    mixture: see sampled_object. asked: what a person wants, see ``LEFT_OUT`` and others.
+    mixture: see sampled_object. asked: what a person wants, see ``OF_FIT``.
     """
     if asked in LEFT_OUT:
         return ObjectFit()

@@ -12,8 +12,11 @@ import numpy as np
 
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 
-# What a person may ask of the steps about an object.
-DIRECTIVES = ("ignore", "metal", "glass", "lamp", "not-lamp", "refit")
+# What a person may ask about an object: of shading, of the fit; and what is then not fitted.
+LAMP, METAL, GLASS, REFIT = "lamp", "metal", "glass", "refit"
+OF_SHADE, OF_FIT = (LAMP, "not-lamp"), ("ignore", METAL, GLASS, REFIT)
+DIRECTIVES = (*OF_FIT, *OF_SHADE)
+LEFT_OUT = ("ignore", GLASS)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.properties import LAMP, FittedObject, ShadedObject
+from usdbrdf.asset.properties import FittedObject, ShadedObject
 from usdbrdf.asset.readers.scene import read_shading
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, predict_view
 from usdbrdf.evaluation.metrics import finite
@@ -20,6 +20,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.material.fit_target import frame_samples, relative_costs
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import LAMP
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.page.pictures import Seen, data_uri, part_around, status_of

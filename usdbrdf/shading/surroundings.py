@@ -52,10 +52,9 @@ class Surroundings:
     def trend(self, z_up: bool) -> Double:
         """(D, 3): what the other directions are likely to show: of what was measured above the
         horizon, the plane through the logarithms of its radiance over the direction's three
-        coordinates, as skies darken away from the sun and from the horizon (skies of the CIE's
-        standard S 011 do so within a factor of two). Below the horizon it goes on as at it. The
-        steeper it is for what little was measured, the less it is believed; where nothing was, it
-        is the median of all."""
+        coordinates, as skies darken away from the sun and from the horizon. Below the horizon it
+        goes on as at it. The steeper it is for what little was measured, the less it is believed;
+        where nothing was, it is the median of all."""
         directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
         up = 2 if z_up else 1
         usual = self.median()

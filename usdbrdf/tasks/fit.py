@@ -13,13 +13,13 @@ from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.properties import OF_FIT
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.material.fit_objects import LEFT_OUT, Lighting, fitted_by_likelier_lobe, survey_frames
+from usdbrdf.material.fit_objects import Lighting, fitted_by_likelier_lobe, survey_frames
 from usdbrdf.material.refine import frame_reader
+from usdbrdf.model.mesh import LEFT_OUT, OF_FIT
 from usdbrdf.options import FitOptions, kind_of_light
 from usdbrdf.tasks.refined import fitted_objects, refined_objects
 from usdbrdf.tasks.task import Task

@@ -14,9 +14,10 @@ from usdbrdf.asset.layers.lights_layer import Lamp, world_from_root, write_light
 from usdbrdf.asset.layers.task_layers import write_shading_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.properties import LAMP, OF_SHADE, ShadedObject, colour
+from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.model.mesh import LAMP, OF_SHADE
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface

@@ -21,7 +21,6 @@ from usdbrdf.asset.header import (
     StageHeader,
     new_layer,
     read_header,
-    refuse_old_layout,
 )
 from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
@@ -61,7 +60,6 @@ def check_root(asset: Asset, header: StageHeader) -> None:
     """Raise if the asset has a root layer that says otherwise about units or the up axis. USD
     believes the root, which is never written again: a capture in other units would come out in the
     wrong size, beneath edits that were made for the old one."""
-    refuse_old_layout(asset)
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
