@@ -39,9 +39,23 @@ class _Talking(TalkOptions, Command):
         return 0
 
 
-class _Locking(Command):
+class _Waiting(Command):
     wait_s: float = option("--wait S", 0.0, (0, 10**9))
     "wait up to this many seconds for a busy asset folder"
+
+    def reading(self, *assets: Path) -> AbstractContextManager[object]:
+        """Assets that no run changes meanwhile."""
+        from contextlib import ExitStack
+
+        from usdbrdf.job.ownership import reading
+
+        held = ExitStack()
+        for asset in assets:
+            held.enter_context(reading(asset, self.wait_s))
+        return held
+
+
+class _Locking(_Waiting):
     without_lock: bool = option("--without-lock", False)
     """go on where the file system has no locks: see that nothing else writes into the asset"""
 
@@ -238,7 +252,7 @@ class Fit(_RunOnAsset):
     fit: options.FitOptions
 
 
-class _WithAsset(_Talking):
+class _WithAsset(_Waiting, _Talking):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder; it is not changed"
 
@@ -256,7 +270,8 @@ class Evaluate(_WithAsset):
         with loading():
             from usdbrdf.evaluation.evaluate_views import DOCUMENT, evaluate
             from usdbrdf.evaluation.report import summary_line, truth_line
-        found = evaluate(self.asset, self.views, self.output, self.options)
+        with self.reading(self.asset):
+            found = evaluate(self.asset, self.views, self.output, self.options)
         truth = {"truth": found["truth"]} if "truth" in found else {}
         lines = [summary_line(found["summary"]), f"{self.output / DOCUMENT}: written"]
         if truth:
@@ -264,7 +279,7 @@ class Evaluate(_WithAsset):
         return self.told({"output": str(self.output), **found["summary"], **truth}, *lines)
 
 
-class Compare(_Talking):
+class Compare(_Waiting, _Talking):
     """Compare two assets of one scene, lit differently."""
 
     first: Path = option("ASSET", REQUIRED)
@@ -278,7 +293,8 @@ class Compare(_Talking):
     def run(self) -> int:
         with loading():
             from usdbrdf.evaluation import compare_assets as made
-        found = made.compare(self.first, self.second, self.output, self.options)
+        with self.reading(self.first, self.second):
+            found = made.compare(self.first, self.second, self.output, self.options)
         written = f"{self.output / made.DOCUMENT}: written"
         summary = {"output": str(self.output), **made.figures(found)}
         return self.told(summary, made.comparison_line(found), written)
@@ -294,7 +310,8 @@ class Relight(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.relighting.relight import relight
-        summary = relight(self.asset, self.output, self.options)
+        with self.reading(self.asset):
+            summary = relight(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written")
 
 
@@ -308,7 +325,8 @@ class Package(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.delivery.package import package
-        summary = package(self.asset, self.output, self.options)
+        with self.reading(self.asset):
+            summary = package(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
@@ -344,7 +362,8 @@ class Report(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.page.report import report
-        summary = report(self.asset, self.output, self.options)
+        with self.reading(self.asset):
+            summary = report(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
@@ -360,11 +379,11 @@ class View(_WithAsset):
     def run(self) -> int:
         with loading():
             from usdbrdf.page.server import view
-        view(self.asset, self.options, port=self.port, browser=self.browser)
+        view(self.asset, self.options, port=self.port, browser=self.browser, wait_s=self.wait_s)
         return 0
 
 
-class Validate(Command):
+class Validate(_Waiting):
     """Check an asset by our rules and those of USD."""
 
     asset: Path = option("ASSET", REQUIRED)
@@ -379,13 +398,14 @@ class Validate(Command):
             from usdbrdf.validation.validate import has_errors, validate, write_cures
         asset = Asset.made(self.asset)
         root = asset.root_layer
-        findings = validate(root)
+        with self.reading(root):
+            findings = validate(root)
+            cured = write_cures(asset, self.fix) if self.fix is not None else None
         for finding in findings:
             show(printable(str(finding)))
         if not findings:
             say(f"{root}: no errors")
-        if self.fix is not None:
-            cured = write_cures(asset, self.fix)
+        if cured is not None:
             done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
             say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
         return 7 if has_errors(findings) else 0

@@ -16,13 +16,16 @@ from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.review import write_review
-from usdbrdf.delivery.package import stage_in_look
+from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
 from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
+from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import folder_lock
+from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
 from usdbrdf.options import PublishOptions
-from usdbrdf.validation.validate import own_findings
+from usdbrdf.page.report import report
+from usdbrdf.validation.validate import own_findings, validate
 
 RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
 over "Stuhl_No_1" { over "PreviewSurface" {
@@ -150,11 +153,37 @@ def test_neither_half_a_run_nor_into_a_file(room, tmp_path):
     journal.parent.mkdir(exist_ok=True)
     journal.write_text("{}")
     try:
-        with pytest.raises(InputRefused, match=r"was stopped.*\[publish\.unfinished\]$"):
+        with pytest.raises(InputRefused, match=r"was stopped.*\[asset\.unfinished\]$"):
             publish(room.asset.folder, tmp_path / "dest")
     finally:
         journal.unlink()
     assert not (tmp_path / "dest").exists()
+
+
+def test_neither_what_was_changed_by_hand_nor_steps_of_two_runs(room, tmp_path):
+    """Also by a user who cannot write into the asset: nothing is asked of the folder's rights."""
+    folder, dest = room.asset.folder, tmp_path / "dest"
+    texturing, shading = (f"layers/{name}.usda" for name in ("texturing", "shading"))
+    hashes = {layer: sha256_of(folder / layer) for layer in (texturing, shading)}
+
+    def stamped(order, stage, layer, inputs):
+        (folder / ".usdbrdf/stamps").mkdir(parents=True, exist_ok=True)
+        known = {layer: sha256_of(folder / layer)}
+        stamp = Stamp(stage=stage, version="1", parameters={}, inputs=inputs, outputs=known)
+        write_stamp(stamp_path(folder, order, stage), stamp)
+
+    stamped(2, "texture", texturing, {})
+    stamped(3, "shade", shading, {"texturing.usda": hashes[texturing]})
+    with (folder / texturing).open("a") as layer:
+        layer.write("# by hand\n")
+    with pytest.raises(OwnershipConflict, match=r"texturing\.usda changed.+\[ownership\.edited\]$"):
+        publish(folder, dest)
+    stamped(2, "texture", texturing, {})  # as if texture had run again
+    with pytest.raises(InputRefused, match=r"shade was made with another texturing\.usda\..+date"):
+        publish(folder, dest)
+    assert not dest.exists()
+    stamped(3, "shade", shading, {"texturing.usda": sha256_of(folder / texturing)})
+    publish(folder, dest)
 
 
 def test_a_version_is_not_reviewed_and_bears_what_systems_leave(room, tmp_path):
@@ -187,6 +216,36 @@ def test_one_at_a_time(room, tmp_path):
     finally:
         done.set()
         holder.join()
+
+
+def test_nothing_is_made_of_an_asset_in_which_a_run_works(room, tmp_path):
+    state = room.asset.folder / ".usdbrdf"
+    state.mkdir()
+    makers = {
+        "publish": lambda: publish(room.asset.folder, tmp_path / "dest"),
+        "package": lambda: package(room.asset.folder, tmp_path / "room.usdz"),
+        "report": lambda: report(room.asset.folder, tmp_path / "room.html"),
+        "validate": lambda: validate(room.asset.root_layer),
+    }
+    busy, entered, done = {}, threading.Event(), threading.Event()
+
+    def work():
+        with folder_lock(state):
+            entered.set()
+            done.wait(60)
+
+    run = threading.Thread(target=work)
+    run.start()
+    entered.wait(60)
+    try:
+        for name, make in makers.items():
+            with pytest.raises(FolderBusy) as busy[name]:
+                make()
+    finally:
+        done.set()
+        run.join()
+    assert busy.keys() == makers.keys()
+    assert sorted(os.listdir(tmp_path)) == ["capture", "out"]
 
 
 def test_what_lies_elsewhere_is_not_published(room, tmp_path):

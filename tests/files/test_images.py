@@ -546,3 +546,55 @@ def test_a_jpeg_for_people_has_no_metadata_and_is_the_picture(tmp_path):
     (tmp_path / "picture.jpg").write_bytes(content)
     assert np.abs(read_radiance(tmp_path / "picture.jpg") * 255 - picture).mean() < 2
     assert encoded_jpeg(np.ascontiguousarray(picture), 90) == content
+
+
+UNREAD = """
+import errno, itertools, sys
+from pathlib import Path
+sys.path.insert(0, "benchmarks")
+from system_calls import can_watch, run_watched
+import numpy as np
+from usdbrdf.errors import EnvironmentFailure, ImageRefused
+from usdbrdf.files.images import read_radiance
+if not can_watch():
+    sys.exit(77)
+image = Path(sys.argv[1])
+expected = np.load(sys.argv[2])
+
+def read():
+    try:
+        return 0 if np.array_equal(read_radiance(image), expected) else 1
+    except EnvironmentFailure:
+        return 4
+    except ImageRefused:
+        return 3
+
+for often in (1, 10**9):
+    for number in itertools.count():
+        passed = itertools.count()
+        answer = lambda call: errno.EIO if number <= next(passed) < number + often else None
+        status = run_watched(read, ("read", "open"), image, answer)
+        if next(passed) <= number:
+            break
+        print(often, status)
+"""
+
+
+@pytest.mark.fault("I1")
+def test_a_disk_that_fails_is_no_damage_of_a_frame(tmp_path, radiance):
+    """Once, and from some read on for good: the kernel answers so, nothing of ours is replaced."""
+    write_exr(tmp_path / "frame.exr", radiance, half=False)
+    np.save(tmp_path / "expected.npy", radiance)
+    done = subprocess.run(
+        [sys.executable, "-c", UNREAD, tmp_path / "frame.exr", tmp_path / "expected.npy"],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    if done.returncode == 77:
+        pytest.skip("watching system calls wants Linux 5.19 or later on x86-64")
+    assert done.returncode == 0, done.stderr
+    found = {tuple(line.split()) for line in done.stdout.splitlines()}
+    assert found == {("1", "0"), ("1000000000", "4")}

@@ -49,6 +49,7 @@ from usdbrdf.errors import (
 )
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
+from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import code_version
 from usdbrdf.model.material import turned_up
@@ -224,6 +225,7 @@ def _remove_empty_scopes(flat: Usd.Stage) -> None:
             flat.RemovePrim(path)
 
 
+@reads_asset("folder")
 def package(folder: Path, output: Path, options: PackageOptions | None = None) -> dict[str, Any]:
     """Write the asset in ``folder`` as one file: .usdz, or .glb for what reads no USD.
 

@@ -4,13 +4,11 @@ never changed again. The work folder keeps ``edits.usda``; a version has what it
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import shutil
 import string
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +16,12 @@ from pxr import Sdf
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
+from usdbrdf.asset.readers.compose import outdated_steps
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import environment_failures, publish_folder, sha256_of, temporary_folder
-from usdbrdf.job.ownership import folder_lock
-from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.job.ownership import edited_files, folder_lock, reading
 from usdbrdf.options import PublishOptions
 
 _LOCKED = ".usdbrdf-publish"  # holds the lock of a folder of versions
@@ -46,10 +44,12 @@ def publish(
     Where the latest version holds the same already, nothing is written. Equal assets give equal
     bytes. Returns a summary of plain values.
 
-    wait_s, without_lock   as of ``pipeline.working_on``; of the asset and of ``destination``
+    wait_s, without_lock   as of ``pipeline.working_on``: the first of the asset and of
+                           ``destination``, the second of ``destination``
 
-    Raises UsageError for options that cannot be, InputRefused where the asset names files that are
-    missing or lie elsewhere, OwnershipConflict for a version that is there with another content.
+    Raises UsageError for options that cannot be; InputRefused where the asset names files that are
+    missing or lie elsewhere, or where its steps are not of one run; OwnershipConflict for a version
+    that is there with another content, and where files of the asset were changed by hand.
     """
     options = options or PublishOptions()
     asset = Asset.made(folder)
@@ -59,19 +59,29 @@ def publish(
             f"{destination}: this is a file, and versions are published into a folder. Choose "
             "another place. [publish.destination]"
         )
-    if any((asset.folder / STATE_FOLDER).glob("publishing-*.json")):
-        raise InputRefused(
-            f"{asset.folder}: a run was stopped while it put its files in place. Run `usdbrdf "
-            "convert` again, which ends it, and publish then. [publish.unfinished]"
+    with reading(asset.folder, wait_s):
+        _refuse_unsound(asset)
+        lock = destination / _LOCKED
+        with environment_failures(str(destination)), _made(destination):
+            lock.mkdir(exist_ok=True)
+            with folder_lock(lock, wait_s, without_lock=without_lock):
+                return _published(asset, destination, options)
+
+
+def _refuse_unsound(asset: Asset) -> None:
+    """OwnershipConflict for files that somebody changed by hand; InputRefused for steps that were
+    run after those that build on them."""
+    if edited := edited_files(asset.folder):
+        raise OwnershipConflict(
+            f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `usdbrdf "
+            "convert` with --adopt to keep the changes beside edits.usda, or --discard to drop "
+            "them, and publish then. [ownership.edited]"
         )
-    state, lock = asset.folder / STATE_FOLDER, destination / _LOCKED
-    # Where nobody can write, nobody works.
-    state = state if os.access(state, os.W_OK) else lock
-    locked = partial(folder_lock, wait_s=wait_s, without_lock=without_lock)
-    with environment_failures(str(destination)), _made(destination):
-        lock.mkdir(exist_ok=True)
-        with locked(lock), locked(state):
-            return _published(asset, destination, options)
+    if old := outdated_steps(asset):
+        raise InputRefused(
+            f"{asset.folder}: {'; '.join(old)}. Run `usdbrdf convert` again, which brings all "
+            "steps up to date, and publish then. [publish.outdated]"
+        )
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.images import write_preview_png
+from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Bool, Byte, Float, Int
 from usdbrdf.model.capture import Frames
@@ -47,6 +48,7 @@ _SETS = {
 }
 
 
+@reads_asset("first", "second")
 def compare(
     first: str | Path, second: str | Path, output: str | Path, options: CompareOptions | None = None
 ) -> dict[str, Any]:

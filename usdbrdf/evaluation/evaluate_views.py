@@ -31,6 +31,7 @@ from usdbrdf.files.colour import display_exposure, to_display_srgb
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
+from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.camera import Camera
@@ -53,6 +54,7 @@ _EXPOSURE_PIXELS = 1 << 24
 _WAITING_PIXELS = 1 << 23
 
 
+@reads_asset("asset")
 def evaluate(
     asset: str | Path, views: str | Path, output: str | Path, options: EvaluateOptions | None = None
 ) -> dict[str, Any]:

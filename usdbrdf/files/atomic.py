@@ -33,9 +33,14 @@ def publish(staged: Path, final: Path) -> None:
 
 def move(staged: Path, final: Path) -> None:
     """``publish`` of one of many files: the folder is still to be flushed."""
-    with staged.open("rb") as file:
-        os.fsync(file.fileno())
+    flush_file(staged)
     os.replace(staged, final)
+
+
+def flush_file(file: Path) -> None:
+    """A file's bytes reach the disk; its name may not yet."""
+    with file.open("rb") as written:
+        os.fsync(written.fileno())
 
 
 def flush_folder(folder: Path) -> None:
@@ -94,8 +99,7 @@ def publish_folder(staged: Path, final: Path) -> None:
     """Give a finished folder its final name, durably; what is there must be an empty folder."""
     for place in staged.rglob("*"):
         if place.is_file():
-            with place.open("rb") as written:
-                os.fsync(written.fileno())
+            flush_file(place)
         else:
             flush_folder(place)
     flush_folder(staged)

@@ -11,19 +11,20 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
-from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.model.arrays import Byte, Float
 
+T = TypeVar("T")
 MAX_SIDE = 65_536  # pixels
 MAX_PIXELS = 1 << 28
 MAX_CHANNELS = 64
@@ -59,6 +60,10 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
     H, W are the display window's; its pixels that the file does not hold are NaN (unknown, not
     black). NaN and infinity in the file are returned as they are. Integer images give [0, 1].
     """
+    return _although_unread_once(path, lambda: _radiance(path, max_side))
+
+
+def _radiance(path: Path, max_side: int) -> Float:
     source = open_image(path, max_side)
     names = source.spec().channelnames
     lower = [name.lower() for name in names]
@@ -76,8 +81,26 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
 
 def read_exr(path: Path) -> Float:
     """All channels of an image in file order, (H, W, C) float32, NaN outside the data window."""
-    source = open_image(path)
-    return _in_display_window(source.spec(), pixels_of(path, source))
+
+    def read() -> Float:
+        source = open_image(path)
+        return _in_display_window(source.spec(), pixels_of(path, source))
+
+    return _although_unread_once(path, read)
+
+
+def _although_unread_once(path: Path, read: Callable[[], T]) -> T:
+    """What is read of an image. One that is refused is read again: a disk that fails for a moment
+    says nothing of the file, and would be remembered as damage of it. EnvironmentFailure where it
+    still fails."""
+    try:
+        return read()
+    except ImageRefused:
+        if not path.is_file() or not os.access(path, os.R_OK):
+            raise
+    with environment_failures(str(path)):
+        sha256_of(path)
+    return read()
 
 
 def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
@@ -240,6 +263,10 @@ def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
 def open_image(path: Path, max_side: int = MAX_SIDE) -> Any:
     """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
     part that has R, G and B, or the first if none has."""
+    return _although_unread_once(path, lambda: _opened(path, max_side))
+
+
+def _opened(path: Path, max_side: int) -> Any:
     if path.suffix.lower() in RAW_SUFFIXES:
         raise ImageRefused(
             f"{path}: camera raw files are not read here (only their preview would be). Let "

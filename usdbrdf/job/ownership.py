@@ -1,5 +1,5 @@
-"""Whose folder is this? One run at a time in it, by a lock that the kernel frees on any death; ours
-only if we made it; and edits by hand are noticed."""
+"""Whose folder is this? One run at a time in it, or any number that only read, by a lock that the
+kernel frees on any death; ours only if we made it; and edits by hand are noticed."""
 
 from __future__ import annotations
 
@@ -10,24 +10,52 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import wraps
+from inspect import signature
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, NoLocks, OwnershipConflict
-from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, sha256_of
+from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, flush_folder, sha256_of
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.paths import inside
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 
 _POLL_SECONDS = 0.2
-# Which thread of this process has which lock file. POSIX record locks belong to the process: a
-# second one from another thread would just succeed, and closing any descriptor of the file would
-# free the first. A forked child has none of them.
-_holders: dict[str, int] = {}
+_UNSIGNED = "another run, which reads it or has not signed yet"
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+P = ParamSpec("P")
+R = TypeVar("R")
 
-os.register_at_fork(after_in_child=_holders.clear)
+
+@dataclass
+class _Reading:
+    """The open lock file of those threads of this process that read an asset, and their number."""
+
+    descriptor: int
+    readers: int = 1
+
+
+# Which thread of this process has which lock file, and which are read. POSIX record locks belong to
+# the process: a second one from another thread would just succeed, and closing any descriptor of
+# the file would free the first. A forked child has none of them.
+_holders: dict[str, int] = {}
+_read: dict[str, _Reading] = {}
+_turn = threading.Lock()
+
+
+def _forget_in_child() -> None:
+    global _turn
+    _turn = threading.Lock()
+    _holders.clear()
+    _read.clear()
+
+
+os.register_at_fork(after_in_child=_forget_in_child)
 
 
 @contextmanager
@@ -51,14 +79,14 @@ def folder_lock(
         yield
         return
     deadline = time.monotonic() + wait_s
-    while _holders.setdefault(key, own) != own:
+    while not _claimed(key, own):
         _wait_or_refuse(path, deadline, f"another thread of this process (pid {os.getpid()})")
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         try:
             while not _taken(descriptor, path, without_lock):
                 signed = os.pread(descriptor, 4096, 0).decode("utf-8", "replace")
-                _wait_or_refuse(path, deadline, signed or "another run that has not signed yet")
+                _wait_or_refuse(path, deadline, signed or _UNSIGNED)
             if not os.path.samestat(os.fstat(descriptor), path.stat()):
                 raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
             since = datetime.now(timezone.utc).isoformat(timespec="seconds")
@@ -68,7 +96,9 @@ def folder_lock(
             try:
                 yield
             finally:
-                os.ftruncate(descriptor, 0)
+                # It only tells who works here; where the disk is gone, that is what is to be said.
+                with suppress(OSError):
+                    os.ftruncate(descriptor, 0)
         finally:
             os.close(descriptor)
     finally:
@@ -80,13 +110,116 @@ def is_held(state_folder: Path) -> bool:
     return _holders.get(str(state_folder.resolve() / "lock")) == threading.get_ident()
 
 
+@contextmanager
+def reading(place: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """An asset, its folder or its root layer, that no run changes meanwhile; any number may read it
+    at once, and a run in it is refused or waits until they have ended.
+
+    wait_s  how long to wait for a run before FolderBusy
+
+    Nothing happens for the thread that works in the folder itself, and in a folder without state: a
+    published version never changes. A user who may not write reads the lock file only. Where there
+    are no working locks, FolderBusy comes at the end, if a step has changed something meanwhile.
+    InputRefused: a run was stopped while it put its files in place, and they are of two runs.
+    """
+    state = (place.parent if place.is_file() else place).resolve() / STATE_FOLDER
+    if is_held(state) or not state.is_dir():
+        yield
+        return
+    with _shared(state / "lock", wait_s) as locked:
+        if any(state.glob("publishing-*.json")):
+            raise InputRefused(
+                f"{state.parent}: a run was stopped while it put its files in place. Run `usdbrdf "
+                "convert` again, which ends it. [asset.unfinished]"
+            )
+        before = None if locked else _steps_in(state)
+        yield
+        if not locked and _steps_in(state) != before:
+            raise FolderBusy(
+                f"{state.parent}: a run changed it while it was read, and what was made of it may "
+                "be a mixture. Run the same command again when that has ended. [lock.changed]"
+            )
+
+
+def reads_asset(*names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A function that reads the assets in its arguments of these names; see ``reading``."""
+
+    def of_function(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def read(*given: P.args, **named: P.kwargs) -> R:
+            arguments = signature(function).bind(*given, **named).arguments
+            with ExitStack() as held:
+                for name in names:
+                    held.enter_context(reading(Path(arguments[name])))
+                return function(*given, **named)
+
+        return read
+
+    return of_function
+
+
+@contextmanager
+def _shared(path: Path, wait_s: float) -> Iterator[bool]:
+    """Hold a lock file with all others who read; whether there is one that works."""
+    key, deadline = str(path), time.monotonic() + wait_s
+    try:
+        while (holder := _joined(key)) is not None:
+            _wait_or_refuse(path, deadline, holder)
+    except OSError as error:
+        # Not there, or not to be opened by this user.
+        if error.errno not in (*_NO_LOCKS, errno.ENOENT, errno.EACCES, errno.ELOOP):
+            raise
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        with _turn:
+            _read[key].readers -= 1
+            if not _read[key].readers:
+                os.close(_read.pop(key).descriptor)
+
+
+def _joined(key: str) -> str | None:
+    """Have this process read what a lock is for, or say who works there."""
+    with _turn:
+        if key in _holders:
+            return f"another thread of this process (pid {os.getpid()})"
+        if key in _read:
+            _read[key].readers += 1
+            return None
+        descriptor = os.open(key, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            fcntl.lockf(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            _read[key] = _Reading(descriptor)
+            return None
+        except OSError as error:
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                raise
+            return os.pread(descriptor, 4096, 0).decode("utf-8", "replace") or _UNSIGNED
+        finally:
+            if key not in _read:
+                os.close(descriptor)
+
+
+def _claimed(key: str, own: int) -> bool:
+    with _turn:
+        return key not in _read and _holders.setdefault(key, own) == own
+
+
+def _steps_in(state: Path) -> dict[str, set[str]]:
+    """What changes with every step that puts files in place."""
+    started = {journal.name: set[str]() for journal in state.glob("publishing-*.json")}
+    return known_hashes(state) | started
+
+
 def _taken(descriptor: int, path: Path, without_lock: bool) -> bool:
     try:
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EAGAIN):
             return False
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+        if error.errno not in _NO_LOCKS:
             raise
         if not without_lock:
             raise NoLocks(
@@ -146,6 +279,9 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                     )
             except InputRefused:  # absent or damaged: it only says whose folder this is
                 write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
+                # Files of ours that a power cut spares would be nobody's without it.
+                for folder in (state, *made):
+                    flush_folder(folder.parent)
             for folder in (state, *(state / name for name in ("stamps", "work", "cache"))):
                 inside(asset, folder).mkdir(exist_ok=True)
                 for litter in folder.glob(f"{TEMPORARY_PREFIX}*"):

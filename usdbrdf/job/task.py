@@ -27,6 +27,7 @@ from urllib.parse import quote, unquote
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import (
     environment_failures,
+    flush_file,
     flush_folder,
     move,
     publish,
@@ -276,6 +277,9 @@ def run_task(
             summary=summary,
             earlier={relative: sorted(hashes) for relative, hashes in earlier.items()},
         )
+        # Nobody could tell later whether these are whole: no hash of theirs is kept.
+        for relative in run.once:
+            flush_file(run.staged / relative)
         write_stamp(journal, finished)
         _publish(asset, folder, finished, order)
         give_back_freed()
@@ -283,11 +287,18 @@ def run_task(
 
 
 def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
-    """Whether every output of an interrupted publish is in the asset or still waits, intact."""
+    """Whether every output of an interrupted publish is in the asset or still waits, intact. What
+    waits and is not goes: the asset may have the same from an earlier run."""
+
+    def intact(file: Path, sha256: str) -> bool:
+        return file.is_file() and sha256_of(file) == sha256
+
+    for relative, sha256 in journal.outputs.items():
+        if not intact(staged / relative, sha256):
+            (staged / relative).unlink(missing_ok=True)
+            if not intact(asset / relative, sha256):
+                return False
     return all(
-        any(f.is_file() and sha256_of(f) == sha256 for f in (asset / relative, staged / relative))
-        for relative, sha256 in journal.outputs.items()
-    ) and all(
         (asset / relative).is_file() or (staged / relative).is_file() for relative in journal.once
     )
 
@@ -309,22 +320,32 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
         return _RANK.get(Path(relative).suffix, 0)
 
     for _, outputs in groupby(sorted(sorted(journal.outputs), key=rank), key=rank):
-        # The asset itself, too: its folders may be new.
-        for changed in {asset, *map(moved, outputs)}:
-            flush_folder(changed)
+        # The folders above them up to the asset, too: they may be new.
+        ends = {*map(moved, outputs)}
+        for changed in {asset, *(folder for end in ends for folder in (end, *end.parents))}:
+            if changed.is_relative_to(asset):
+                flush_folder(changed)
     for relative in journal.once:
         if not (asset / relative).exists():
             flush_folder(moved(relative))
-    _retire(asset, journal)
+    for changed in _retire(asset, journal):
+        flush_folder(changed)
     write_stamp(stamp_path(asset, order, journal.stage), replace(journal, earlier={}))
-    journal_path(asset, journal.stage).unlink()
+    noted = journal_path(asset, journal.stage)
+    noted.unlink()
+    flush_folder(noted.parent)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _retire(asset: Path, journal: Stamp) -> None:
-    """Delete what earlier runs made and this one did not, unless somebody edited it."""
+def _retire(asset: Path, journal: Stamp) -> set[Path]:
+    """Delete what earlier runs made and this one did not, unless somebody edited it; the folders
+    where such files are or were."""
+    folders = set()
     for relative, hashes in journal.earlier.items():
         path = asset / relative
-        if relative not in journal.outputs and path.is_file() and sha256_of(path) in hashes:
-            inside(asset, path.parent)
-            path.unlink()
+        if relative not in journal.outputs and path.parent.is_dir():
+            folders.add(path.parent)
+            if path.is_file() and sha256_of(path) in hashes:
+                inside(asset, path.parent)
+                path.unlink()
+    return folders

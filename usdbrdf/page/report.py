@@ -23,6 +23,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
+from usdbrdf.job.ownership import reading
 from usdbrdf.job.stamp import code_version
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import ReportOptions
@@ -101,6 +102,11 @@ def _part(name: str) -> str:
 
 def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     """All that the page tells, as JSON."""
+    with reading(asset.folder):
+        return _data_of(asset, options)
+
+
+def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     place, atlas = measured_atlas(asset.folder, options.lighting)
     # Where none is asked for it is the one that the asset opens in.
     place = place.in_lighting(atlas.lighting or None)

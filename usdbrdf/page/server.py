@@ -18,6 +18,7 @@ from pathlib import Path
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.review import judgements_of, write_review
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
+from usdbrdf.job.ownership import reading
 from usdbrdf.job.progress import say
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.report import page, page_data, reviewed
@@ -117,15 +118,22 @@ class PageServer:
 
 
 def view(
-    folder: str | Path, options: ReportOptions | None = None, *, port: int = 0, browser: bool = True
+    folder: str | Path,
+    options: ReportOptions | None = None,
+    *,
+    port: int = 0,
+    browser: bool = True,
+    wait_s: float = 0.0,
 ) -> None:
     """Make the page of an asset and serve it on this machine until interrupted.
 
     port     0: any that is free
     browser  whether to open it
+    wait_s   how long to wait for a run in the folder before FolderBusy
     """
     asset = Asset.made(Path(folder))
-    data = page_data(asset, options or ReportOptions())
+    with reading(asset.folder, wait_s):
+        data = page_data(asset, options or ReportOptions())
 
     def document(review: str) -> str:
         # Verdicts may have been saved since.

@@ -22,6 +22,7 @@ from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
+from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import say, warn
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.camera import Camera
@@ -34,6 +35,7 @@ LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
 _LEVELS = 1 << 16  # pixels of a picture that the exposure is taken from
 
 
+@reads_asset("folder")
 def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
     """Render the asset in ``folder`` into ``output``: a picture, or with views a folder of them.
 

@@ -18,6 +18,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.job.ownership import reading
 from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
 from usdbrdf.validation.rule import (
     PREFIX,
@@ -69,10 +70,11 @@ class ListedRule:
 
 def validate(root_layer: Path) -> list[Finding]:
     """Findings of our rules and of USD's, in that order; ``root_layer`` is NAME.usda."""
-    opened = open_or_finding(root_layer)
-    if isinstance(opened, Finding):
-        return [opened]
-    return [*own_findings(opened), *standard_findings(opened)]
+    with reading(root_layer):
+        opened = open_or_finding(root_layer)
+        if isinstance(opened, Finding):
+            return [opened]
+        return [*own_findings(opened), *standard_findings(opened)]
 
 
 def own_findings(stage: Usd.Stage) -> list[Finding]:

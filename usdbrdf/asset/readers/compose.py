@@ -18,7 +18,7 @@ from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
-from usdbrdf.job.stamp import hash_of_files
+from usdbrdf.job.stamp import STATE_FOLDER, hash_of_files, read_stamp
 from usdbrdf.model.arrays import Array
 from usdbrdf.options import NO_LIGHT, Surroundings
 
@@ -184,6 +184,18 @@ def hashes_of_inputs(
     layers = [*_weaker_layers(asset, role), *_beneath(asset)]
     by_label = {layer.name: sha256_of(layer) for layer in layers}
     return by_label | {f"{k}{behind}": hash_of_files(some) for k, some in files.items() if some}
+
+
+def outdated_steps(asset: Asset) -> list[str]:
+    """Which steps built on a layer that has changed since, in words."""
+    folder, found = asset.layer("scan").parent, []
+    for path in sorted((asset.folder / STATE_FOLDER / "stamps").glob("*.json")):
+        stamp = read_stamp(path)
+        for name, sha256 in stamp.inputs.items() if stamp else ():
+            layer = folder / name
+            if layer.parent == folder and layer.is_file() and sha256_of(layer) != sha256:
+                found.append(f"{stamp.stage} was made with another {name}")  # type: ignore[union-attr]
+    return found
 
 
 def _beneath(asset: Asset) -> list[Path]:

@@ -1,0 +1,435 @@
+"""Does a step that was disturbed anywhere end in the same bytes when it is run again?
+
+    python benchmarks/crash_campaign.py [--runs 10] [--cuts 20] [--steps shade fit]
+        [--faults kill terminate ...] [--minutes 60] [--seed 0] [--json FILE]
+
+A tiny generated room is converted, one step at a time, each from an asset that lacks the step and
+from one that has it with other options. The step runs in a forked process, whose calls of the file
+system are counted (`system_calls.py`); at the n-th write, flush, rename, removal or creation,
+spread evenly over all calls of each kind, it is killed (SIGKILL), told to end (SIGTERM, SIGINT),
+stopped while the same command runs beside it, finds its disk full, an input that cannot be read,
+its mount gone, or the power off (`power_loss.py`: `--cuts` for each start). Then the same command
+runs again: every file of the asset must have the bytes of an undisturbed run, the artist's
+`edits.usda` those that it had, and no file of ours may be left beside. What a run has finished must
+survive the power as it is. Exit code 1 if anything differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import itertools
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from generated_capture import generated_scene, write_frames, write_mesh
+from kill_sweep import STEPS, contents, verdict
+from power_loss import LOSSES, WATCHED, Disk
+from system_calls import Call, can_watch, run_watched
+
+# Loaded once, for all processes that are forked.
+import usdbrdf.commands
+import usdbrdf.pipeline  # noqa: F401
+from usdbrdf.cli import main as usdbrdf_main
+from usdbrdf.identity import tasks_identity
+from usdbrdf.job.child import scratch_folder
+
+# What makes the step short, and what makes its results differ from those.
+OPTIONS = {
+    "ingest": ([], ["--crease-angle", "41"]),
+    "texture": (["--texel-size", "1"], ["--texel-size", "0.8"]),
+    "shade": (["--rays", "16"], ["--rays", "16", "--seed", "1"]),
+    "fit": (["--max-pixels", "60"], ["--max-pixels", "50"]),
+}
+LONGEST_SECONDS = 300  # whoever takes longer hangs
+EDITS = "# The artist's.\n"
+# Calls that change what a disk holds.
+CHANGES = ("write", "sync", "rename", "unlink", "mkdir", "create")
+FULL = ("write", "sync", "mkdir", "create")
+SIGNALS = {"kill": signal.SIGKILL, "terminate": signal.SIGTERM, "interrupt": signal.SIGINT}
+FAULTS = (*SIGNALS, "stop", "full", "unreadable", "unmounted", "memory", "power")
+# How each may end: by the signal, with its exit code, with the machine's fault, or not disturbed.
+ENDS = {
+    "kill": {-signal.SIGKILL}, "terminate": {143}, "interrupt": {130}, "stop": {0},
+    "full": {0, 4}, "unreadable": {0, 3, 4}, "unmounted": {0, 4}, "memory": {0, 4}, "power": {-9},
+}  # fmt: skip
+
+
+@dataclass
+class Start:
+    """A step about to run: the asset as it is before and as it is after, and the calls between.
+
+    calls   of each kind, how many there are
+    """
+
+    step: str
+    again: bool
+    before: Path
+    expected: dict[str, str] = field(default_factory=dict)
+    calls: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def name(self) -> str:
+        return f"{self.step} {'again' if self.again else 'first'}"
+
+
+class Campaign:
+    """A folder with the capture and the assets; each case is CASES/room, equally far from it."""
+
+    def __init__(self, work: Path, seed: int) -> None:
+        self.work, self.capture = work, work / "scan"
+        self._cases = itertools.count()
+        self.rng = np.random.default_rng(seed)
+        self.tally: dict[tuple[str, str], list[str]] = {}
+        # In a process of its own: it starts threads, and those of us who fork may have none.
+        assert in_fork(lambda: make_capture(self.capture)) == 0
+
+    def starts(self, steps: Sequence[str]) -> Iterator[Start]:
+        """Each step, where it has not been done and where it was done with other options."""
+        before = self.work / "start"
+        before.mkdir()
+        for number, step in enumerate(STEPS):
+            done = self._after(before, step)
+            if step in steps:
+                yield self._start(Start(step, False, before))
+                other = self._after(before, step, 1)
+                for later in STEPS[number + 1 :] if step == "ingest" else ():
+                    other = self._after(other, later)
+                yield self._start(Start(step, True, other))
+            if step == "ingest":
+                edits = done / "room" / "edits.usda"
+                edits.write_text(edits.read_text() + EDITS)
+            before = done
+
+    def _after(self, before: Path, step: str, options: int = 0) -> Path:
+        case = self.copy_of(before)
+        if (status := self.run(case, step, options)) != 0:
+            raise SystemExit(f"{step} ended with {status}: {said(case)}")
+        (case / "said").unlink()
+        return case
+
+    def _start(self, start: Start) -> Start:
+        case, seen = self.copy_of(start.before), Counter[str]()
+
+        def count(call: Call) -> None:
+            seen[call.kind] += 1
+
+        def see(call: Call) -> int | None:
+            count(call)
+            return None
+
+        kinds = (*WATCHED, "read")
+        assert run_watched(self.work_of(case, start.step), kinds, self.work, see) == 0, said(case)
+        start.expected, start.calls = contents(case / "room"), seen
+        shutil.rmtree(case)
+        print(f"{start.name}: {dict(seen)}", flush=True)
+        return start
+
+    def copy_of(self, before: Path) -> Path:
+        """A new case that begins as another."""
+        case = self.work / f"case-{next(self._cases):05d}"
+        shutil.copytree(before, case)
+        (case / "tmp").mkdir(exist_ok=True)
+        return case
+
+    def work_of(self, case: Path, step: str, options: int = 0) -> Callable[[], int]:
+        """The command line, to be called in a process of its own."""
+        asset = case / "room"
+        place = [str(asset)] if step != "ingest" else [str(self.capture), "-o", str(asset)]
+        arguments = [step, "-q", *place, *OPTIONS[step][options]]
+
+        def work() -> int:
+            said = os.open(case / "said", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(said, 1)
+            os.dup2(said, 2)
+            signal.alarm(LONGEST_SECONDS)
+            os.environ["TMPDIR"] = str(case / "tmp")
+            tempfile.tempdir = None
+            return usdbrdf_main(arguments)
+
+        return work
+
+    def run(self, case: Path, step: str, options: int = 0) -> int:
+        """The step, undisturbed."""
+        return in_fork(self.work_of(case, step, options))
+
+    def ended(self, start: Start, fault: str, where: str, case: Path, status: int) -> None:
+        """Run the same command again where a disturbed one ended, and note the result."""
+        problem = ""
+        if status not in ENDS[fault] and status != 0:
+            problem = f"ended with {status}; "
+        if fault in ("terminate", "interrupt", "full", "memory") and os.listdir(case / "tmp"):
+            problem += "left a temporary folder; "
+        if "Traceback" in said(case):
+            problem += "a traceback; "
+        for left in (case / "tmp").iterdir():
+            os.utime(left, (0, 0))
+        again = self.run(case, start.step)
+        found = contents(case / "room")
+        result = verdict(start.expected, found) if again == 0 else f"exit {again} again"
+        in_fork(swept)
+        if left := sorted({*os.listdir(case)} - {"room", "tmp", "said"}):
+            problem += f"left {left}; "
+        if left := os.listdir(case / "tmp"):
+            problem += f"left {left}; "
+        problem += "" if result == "identical" else result
+        self.note(start, fault, "" if not problem else f"{where}: {problem} {said(case)[-300:]}")
+        if not problem:
+            shutil.rmtree(case)
+
+    def note(self, start: Start, fault: str, problem: str) -> None:
+        self.tally.setdefault((start.step, fault), []).append(problem)
+        if problem:
+            print(f"  {start.name}, {fault} at {problem}", flush=True)
+
+
+def make_capture(folder: Path) -> int:
+    """A room of eight objects in twelve frames, so small that each step takes about a second."""
+    (folder / "frames").mkdir(parents=True)
+    scene = generated_scene(8, 200)
+    write_mesh(folder, scene)
+    size = argparse.Namespace(output=folder, frames=12, width=24, height=18, threads=1)
+    write_frames(folder, scene, size)
+    return 0
+
+
+def in_fork(work: Callable[[], int]) -> int:
+    """What ``work`` returns in a process of its own, or minus the signal that ended it."""
+    process = os.fork()
+    if process == 0:
+        status = 1
+        try:
+            status = work()
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def swept() -> int:
+    """What the next run of any command that starts a child does."""
+    with scratch_folder():
+        return 0
+
+
+def said(case: Path) -> str:
+    file = case / "said"
+    return file.read_text(errors="replace") if file.is_file() else ""
+
+
+def spread(start: Start, kinds: Sequence[str], runs: int) -> list[tuple[str, int]]:
+    """Kind and number, from 1, of so many calls: each kind its share, evenly over its calls."""
+    there = [kind for kind in kinds if start.calls[kind]]
+    chosen = []
+    for i, kind in enumerate(there):
+        share = len(range(i, runs, len(there)))
+        count = start.calls[kind]
+        chosen += [(kind, 1 + int((k + 0.5) * count / share)) for k in range(share)]
+    return sorted(set(chosen))
+
+
+class At:
+    """Does something at the n-th call of a kind, and lets all others happen; ``struck`` says where
+    that was."""
+
+    def __init__(self, kind: str, number: int, act: Callable[[Call], int | None]) -> None:
+        self._kind, self._left, self._act = kind, number, act
+        self.struck = f"{kind} {number}, not reached"
+
+    def __call__(self, call: Call) -> int | None:
+        if call.kind != self._kind:
+            return None
+        self._left -= 1
+        if self._left:
+            return None
+        self.struck = f"{call.kind} of {call.path}"
+        return self._act(call)
+
+
+def disturb_by_signals(campaign: Campaign, start: Start, fault: str, runs: int) -> None:
+    for kind, number in spread(start, CHANGES, runs):
+        case = campaign.copy_of(start.before)
+
+        def strike(call: Call) -> None:
+            os.kill(call.process, SIGNALS[fault])
+
+        work = campaign.work_of(case, start.step)
+        status = run_watched(work, WATCHED, case, (where := At(kind, number, strike)))
+        campaign.ended(start, fault, where.struck, case, status)
+
+
+def stop(campaign: Campaign, start: Start, runs: int) -> None:
+    """SIGSTOP, the same command beside it, which has to be refused, and SIGCONT."""
+    for kind, number in spread(start, CHANGES, runs):
+        case = campaign.copy_of(start.before)
+        refused = []
+
+        def strike(call: Call, case: Path = case, refused: list[int] = refused) -> None:
+            os.kill(call.process, signal.SIGSTOP)
+            refused.append(campaign.run(case, start.step))
+            os.kill(call.process, signal.SIGCONT)
+
+        work = campaign.work_of(case, start.step)
+        status = run_watched(work, WATCHED, case, (where := At(kind, number, strike)))
+        # Before the lock is taken and after it is given back there is nobody to meet.
+        if refused not in ([], [5], [0]):
+            status = 1
+        campaign.ended(start, "stop", f"{where.struck}, beside it {refused}", case, status)
+
+
+def fill(campaign: Campaign, start: Start, fault: str, runs: int) -> None:
+    """From the n-th call on, a disk that is full or a mount that is gone."""
+    failing = FULL if fault == "full" else (*CHANGES, "open", "read")
+    error = errno.ENOSPC if fault == "full" else errno.ESTALE
+    for kind, number in spread(start, failing, runs):
+        case, state = campaign.copy_of(start.before), {"failed": False}
+
+        def fail(_: Call, state: dict[str, bool] = state) -> int:
+            state["failed"] = True
+            return error
+
+        where = At(kind, number, fail)
+
+        def answer(call: Call, where=where, state=state) -> int | None:  # type: ignore[no-untyped-def]
+            return error if state["failed"] and call.kind in failing else where(call)
+
+        kinds = WATCHED if fault == "full" else (*WATCHED, "read")
+        status = run_watched(
+            campaign.work_of(case, start.step), kinds, case if fault == "full" else case / "room",
+            answer,
+        )  # fmt: skip
+        campaign.ended(start, fault, where.struck, case, status)
+
+
+def make_unreadable(campaign: Campaign, start: Start, runs: int) -> None:
+    """One read of an input, or of what an earlier step wrote, fails."""
+    for kind, number in spread(start, ("read", "open"), runs):
+        case = campaign.copy_of(start.before)
+        status = run_watched(
+            campaign.work_of(case, start.step), ("read", "open"), campaign.work,
+            (where := At(kind, number, lambda _: errno.EIO)),
+        )  # fmt: skip
+        campaign.ended(start, "unreadable", where.struck, case, status)
+
+
+def narrow(campaign: Campaign, start: Start, runs: int) -> None:
+    """Addresses for all that is loaded and a little more."""
+    with open("/proc/self/statm") as statm:
+        loaded = int(statm.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    for more in np.geomspace(1 << 26, 1 << 32, runs):
+        case = campaign.copy_of(start.before)
+        work = campaign.work_of(case, start.step)
+        limit = loaded + int(more)
+
+        def limited(work: Callable[[], int] = work, limit: int = limit) -> int:
+            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+            return work()
+
+        campaign.ended(start, "memory", f"{limit >> 20} MiB", case, in_fork(limited))
+
+
+def cut(campaign: Campaign, start: Start, cuts: int) -> None:
+    """One run, of which the disk is kept as it may be were the power off at some of its calls."""
+    case = campaign.copy_of(start.before)
+    disk, passed, disks = Disk(case), Counter[str](), []
+    wanted = set(spread(start, CHANGES, cuts))
+
+    def see(call: Call) -> int | None:
+        passed[call.kind] += 1
+        if (moment := (call.kind, passed[call.kind])) in wanted:
+            loss = LOSSES[len(disks) % len(LOSSES)]
+            place = campaign.work / f"cut-{start.step}-{int(start.again)}-{len(disks):05d}"
+            disk.after(place, loss, campaign.rng)
+            disks.append((place, f"{moment[0]} {moment[1]}, {loss} lost"))
+        disk.see(call)
+        return None
+
+    run_watched(campaign.work_of(case, start.step), WATCHED, case, see)
+    ended = campaign.work / f"cut-{start.step}-{int(start.again)}-ended"
+    disk.after(ended, LOSSES[0], campaign.rng)
+    found = contents(ended / "room")
+    lost = [file for file, sha256 in start.expected.items() if found.get(file) != sha256]
+    problem = f"of a finished run {len(lost)} files are lost, first {lost[0]}" if lost else ""
+    campaign.note(start, "power", problem)
+    for place, where in (*disks, (ended, "the end")):
+        (place / "tmp").mkdir(exist_ok=True)
+        campaign.ended(start, "power", where, place, -signal.SIGKILL)
+
+
+def disturb(campaign: Campaign, start: Start, fault: str, runs: int, cuts: int) -> None:
+    if fault in SIGNALS:
+        disturb_by_signals(campaign, start, fault, runs)
+    elif fault == "stop":
+        stop(campaign, start, runs)
+    elif fault in ("full", "unmounted"):
+        fill(campaign, start, fault, runs)
+    elif fault == "unreadable":
+        make_unreadable(campaign, start, runs)
+    elif fault == "memory":
+        narrow(campaign, start, runs)
+    else:
+        cut(campaign, start, cuts)
+
+
+@contextmanager
+def working_folder(parent: Path | None) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="crash-campaign-", dir=parent) as name:
+        yield Path(name)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--runs", type=int, default=10, help="of each fault, for each start")
+    parser.add_argument("--cuts", type=int, default=20, help="of the power, for each start")
+    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS)
+    parser.add_argument("--minutes", type=float, default=1e9, help="no new fault after these")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=Path, help="folder for the assets; default: a temporary one")
+    parser.add_argument("--json", type=Path, help="write the figures into this file")
+    chosen = parser.parse_args(arguments)
+    if not can_watch():
+        print("left out: watching system calls wants Linux 5.19 or later on x86-64")
+        return 0
+    tasks_identity()  # once, for all processes that are forked
+    began = time.monotonic()
+    end = began + 60 * chosen.minutes
+    with working_folder(chosen.work) as work:
+        campaign = Campaign(work, chosen.seed)
+        starts = list(campaign.starts(chosen.steps))
+        for fault, start in itertools.product(chosen.faults, starts):
+            if time.monotonic() < end:
+                disturb(campaign, start, fault, chosen.runs, chosen.cuts)
+                print(f"{fault}, {start.name}: {time.monotonic() - began:.0f} s", flush=True)
+    return told(campaign, chosen.json)
+
+
+def told(campaign: Campaign, file: Path | None) -> int:
+    print(f"{'step':<10} {'fault':<12} {'runs':>5} {'same':>5}")
+    for (step, fault), problems in sorted(campaign.tally.items()):
+        print(f"{step:<10} {fault:<12} {len(problems):>5} {problems.count(''):>5}")
+    every = [problem for problems in campaign.tally.values() for problem in problems]
+    print(f"{every.count('')} of {len(every)} disturbed runs ended in the same bytes")
+    if file is not None:
+        table = [
+            {"step": step, "fault": fault, "runs": len(problems), "same": problems.count(""),
+             "problems": [problem for problem in problems if problem]}
+            for (step, fault), problems in sorted(campaign.tally.items())
+        ]  # fmt: skip
+        file.write_text(json.dumps(table, indent=2) + "\n")
+    return 0 if all(problem == "" for problem in every) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
