@@ -8,10 +8,10 @@ from one that has it with other options. The step runs in a forked process, whos
 system are counted (`system_calls.py`); at the n-th write, flush, rename, removal or creation,
 spread evenly over all calls of each kind, it is killed (SIGKILL), told to end (SIGTERM, SIGINT),
 stopped while the same command runs beside it, finds its disk full, an input that cannot be read,
-its mount gone, or the power off (`power_loss.py`: `--cuts` for each start). Then the same command
-runs again: every file of the asset must have the bytes of an undisturbed run, the artist's
-`edits.usda` those that it had, and no file of ours may be left beside. What a run has finished must
-survive the power as it is. Exit code 1 if anything differs.
+its mount gone, little memory, a clock that jumps, or the power off (`power_loss.py`: `--cuts` for
+each start). Then the same command runs again: every file of the asset must have the bytes of an
+undisturbed run, the artist's `edits.usda` those that it had, and no file of ours may be left
+beside. What a run has finished must survive the power as it is. Exit code 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,7 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from generated_capture import generated_scene, write_frames, write_mesh
+from generated_capture import write_tiny
 from kill_sweep import STEPS, contents, verdict
 from power_loss import LOSSES, WATCHED, Disk
 from system_calls import Call, can_watch, run_watched
@@ -59,11 +60,13 @@ EDITS = "# The artist's.\n"
 CHANGES = ("write", "sync", "rename", "unlink", "mkdir", "create")
 FULL = ("write", "sync", "mkdir", "create")
 SIGNALS = {"kill": signal.SIGKILL, "terminate": signal.SIGTERM, "interrupt": signal.SIGINT}
-FAULTS = (*SIGNALS, "stop", "full", "unreadable", "unmounted", "memory", "power")
+FAULTS = (*SIGNALS, "stop", "full", "unreadable", "unmounted", "memory", "clock", "power")
+JUMPS = (3600, 10**8, 2 * 10**9)  # seconds; the last are years before 1970 and after 2038
 # How each may end: by the signal, with its exit code, with the machine's fault, or not disturbed.
 ENDS = {
     "kill": {-signal.SIGKILL}, "terminate": {143}, "interrupt": {130}, "stop": {0},
-    "full": {0, 4}, "unreadable": {0, 3, 4}, "unmounted": {0, 4}, "memory": {0, 4}, "power": {-9},
+    "full": {0, 4}, "unreadable": {0, 3, 4}, "unmounted": {0, 4}, "memory": {0, 4}, "clock": {0},
+    "power": {-9},
 }  # fmt: skip
 
 
@@ -94,7 +97,7 @@ class Campaign:
         self.rng = np.random.default_rng(seed)
         self.tally: dict[tuple[str, str], list[str]] = {}
         # In a process of its own: it starts threads, and those of us who fork may have none.
-        assert in_fork(lambda: make_capture(self.capture)) == 0
+        assert in_fork(lambda: write_tiny(self.capture) or 0) == 0
 
     def starts(self, steps: Sequence[str]) -> Iterator[Start]:
         """Each step, where it has not been done and where it was done with other options."""
@@ -144,11 +147,15 @@ class Campaign:
         (case / "tmp").mkdir(exist_ok=True)
         return case
 
-    def work_of(self, case: Path, step: str, options: int = 0) -> Callable[[], int]:
-        """The command line, to be called in a process of its own."""
+    def command(self, case: Path, step: str, options: int = 0) -> list[str]:
+        """Arguments of `usdbrdf`."""
         asset = case / "room"
         place = [str(asset)] if step != "ingest" else [str(self.capture), "-o", str(asset)]
-        arguments = [step, "-q", *place, *OPTIONS[step][options]]
+        return [step, "-q", *place, *OPTIONS[step][options]]
+
+    def work_of(self, case: Path, step: str, options: int = 0) -> Callable[[], int]:
+        """The command line, to be called in a process of its own."""
+        arguments = self.command(case, step, options)
 
         def work() -> int:
             said = os.open(case / "said", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -193,16 +200,6 @@ class Campaign:
         self.tally.setdefault((start.step, fault), []).append(problem)
         if problem:
             print(f"  {start.name}, {fault} at {problem}", flush=True)
-
-
-def make_capture(folder: Path) -> int:
-    """A room of eight objects in twelve frames, so small that each step takes about a second."""
-    (folder / "frames").mkdir(parents=True)
-    scene = generated_scene(8, 200)
-    write_mesh(folder, scene)
-    size = argparse.Namespace(output=folder, frames=12, width=24, height=18, threads=1)
-    write_frames(folder, scene, size)
-    return 0
 
 
 def in_fork(work: Callable[[], int]) -> int:
@@ -339,6 +336,24 @@ def narrow(campaign: Campaign, start: Start, runs: int) -> None:
         campaign.ended(start, "memory", f"{limit >> 20} MiB", case, in_fork(limited))
 
 
+def jump(campaign: Campaign, start: Start) -> None:
+    """A clock that jumps back and on at every look, in a process of its own."""
+    shim = campaign.work / "jumping_clock.so"
+    source = Path(__file__).with_name("jumping_clock.c")
+    if not shim.exists():
+        subprocess.run(["cc", "-shared", "-fPIC", "-o", shim, source, "-ldl"], check=True)
+    for seconds in JUMPS:
+        case = campaign.copy_of(start.before)
+        with (case / "said").open("w") as told:
+            status = subprocess.run(
+                [sys.executable, "-m", "usdbrdf", *campaign.command(case, start.step)],
+                env={**os.environ, "LD_PRELOAD": str(shim), "CLOCK_JUMP": str(seconds),
+                     "TMPDIR": str(case / "tmp")},
+                stdout=told, stderr=told, timeout=LONGEST_SECONDS, check=False,
+            ).returncode  # fmt: skip
+        campaign.ended(start, "clock", f"{seconds} s", case, status)
+
+
 def cut(campaign: Campaign, start: Start, cuts: int) -> None:
     """One run, of which the disk is kept as it may be were the power off at some of its calls."""
     case = campaign.copy_of(start.before)
@@ -378,7 +393,9 @@ def disturb(campaign: Campaign, start: Start, fault: str, runs: int, cuts: int) 
         make_unreadable(campaign, start, runs)
     elif fault == "memory":
         narrow(campaign, start, runs)
-    else:
+    elif fault == "clock" and shutil.which("cc"):
+        jump(campaign, start)
+    elif fault == "power":
         cut(campaign, start, cuts)
 
 

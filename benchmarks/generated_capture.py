@@ -72,6 +72,15 @@ def main() -> int:
     return 0
 
 
+def write_tiny(folder: Path) -> None:
+    """A room of eight objects in twelve frames, so small that each step takes about a second."""
+    (folder / "frames").mkdir(parents=True)
+    scene = generated_scene(8, 200)
+    write_mesh(folder, scene)
+    size = argparse.Namespace(output=folder, frames=12, width=24, height=18, threads=1)
+    write_frames(folder, scene, size)
+
+
 def generated_scene(objects: int, triangles: int) -> Scene:
     """The room, its lamp and the things in it; edges as long as the number of triangles wants."""
     coarse = assembled(shapes(objects, 0.2))

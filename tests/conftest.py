@@ -28,7 +28,9 @@ SLOW = (
     "faults/test_bad_captures.py",
     "faults/test_frames_that_disagree.py",
     "faults/test_kill_resume.py",
+    "faults/test_two_at_once.py",
     "job/test_child.py",
+    "job/test_disturbed.py",
     "job/test_kill_resume.py",
     "material/test_fit_lobe.py",
     "material/test_refine.py",
@@ -73,6 +75,7 @@ SWEEPS = (
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
+    "faults/test_two_at_once.py::test_nobody_sees_half_a_run_and_an_artist_may_save",
     "job/test_first_run.py::test_what_a_run_needs_was_compiled",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",

@@ -141,6 +141,32 @@ def test_a_forked_child_has_no_part_in_the_lock(tmp_path):
 
 
 @pytest.mark.fault("R6")
+def test_two_machines_that_share_a_folder_meet(tmp_path):
+    """Two mount namespaces, where the folder lies in different places."""
+    shared, there = tmp_path / "shared", tmp_path / "elsewhere"
+    shared.mkdir()
+    there.mkdir()
+    own = ["unshare", "--map-root-user", "--mount"]
+    if subprocess.run([*own, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no namespaces here")
+    mounted = 'mount --bind "$1" "$2" && exec "$3" -c "$4" "$2"'
+    with subprocess.Popen(
+        [*own, "sh", "-c", mounted, "sh", str(shared), str(there), sys.executable, HOLD],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        assert not list(there.iterdir())  # it is mounted over there alone
+        with pytest.raises(FolderBusy), folder_lock(shared):
+            pass
+        other.kill()
+    with folder_lock(shared):
+        pass
+
+
+@pytest.mark.fault("R6")
 @pytest.mark.parametrize("error", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
 def test_without_locks_a_run_refuses_unless_told_otherwise(tmp_path, monkeypatch, error):
     def no_locks(*_arguments):

@@ -14,7 +14,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
@@ -49,6 +48,7 @@ from usdbrdf.errors import (
 )
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
+from usdbrdf.job.child import scratch_folder
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import code_version
@@ -271,10 +271,10 @@ def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[st
         layer.documentation = "A packed asset: all its looks and lightings are variants."
 
     with environment_failures(str(output)), _folder_of(output):
-        with TemporaryDirectory(prefix="usdbrdf-package-") as name:
+        with scratch_folder() as folder:
             found = write_copy(
                 asset,
-                Path(name),
+                folder,
                 root=root,
                 encoding="",
                 space=SPACES[options.texture_space],
@@ -283,7 +283,7 @@ def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[st
                 accept=_refuse_unpacked,
             )
             members = {found.places[file] for file in (*found.layers, *found.named_by)} - {root}
-            write_usdz(output, Path(name), [root, *sorted(members)])
+            write_usdz(output, folder, [root, *sorted(members)])
         size, textures = output.stat().st_size, len(found.named_by)
     return {"output": str(output), "look": "", "bytes": size, "textures": textures, "format": EXR}
 
@@ -304,8 +304,7 @@ def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOpt
     if space != WORKING_SPACE:
         colours.look_at(flat, space)
         convert_layer(flat.GetRootLayer(), colours, space)
-    with TemporaryDirectory(prefix="usdbrdf-package-") as name:
-        folder = Path(name)
+    with scratch_folder() as folder:
         textures: dict[tuple[Any, ...], NewTexture] = {}
         packed: set[str] = set()
         for use in texture_uses(flat, asset):

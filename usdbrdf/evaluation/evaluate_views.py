@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from usdbrdf.files.colour import display_exposure, to_display_srgb
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
+from usdbrdf.job.child import scratch_folder
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Float
@@ -69,16 +69,13 @@ def evaluate(
     """
     chosen = options or EvaluateOptions()
     place, atlas = measured_atlas(Path(asset), chosen.lighting)
-    with (
-        report.output_folder(Path(output), DOCUMENT, (place,)) as work,
-        TemporaryDirectory(prefix="usdbrdf-") as folder,
-    ):
+    with report.output_folder(Path(output), DOCUMENT, (place,)) as work, scratch_folder() as folder:
         known = {}
         if chosen.truth is not None:
             albedo = _map_or(atlas, "base_color", "albedo")
             known = {"truth": metrics.compare_with_truth(atlas, chosen.truth, chosen.mesh, albedo)}
         photographs = photographs_of_views(
-            Path(views), place, atlas.stage, atlas.scene, Path(folder), chosen.allow_outside
+            Path(views), place, atlas.stage, atlas.scene, folder, chosen.allow_outside
         )
         exposure = exposure_of_views(photographs.frames)
         seen = viewed_asset(place, atlas, chosen.environment)

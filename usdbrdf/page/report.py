@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from usdbrdf.asset.header import read_header
@@ -23,6 +22,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
+from usdbrdf.job.child import scratch_folder
 from usdbrdf.job.ownership import reading
 from usdbrdf.job.stamp import code_version
 from usdbrdf.model.capture import Frames
@@ -120,8 +120,8 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
-    with TemporaryDirectory(prefix="usdbrdf-") as folder:
-        views = _asked_views(place, atlas, options, Path(folder))
+    with scratch_folder() as folder:
+        views = _asked_views(place, atlas, options, folder)
         # Pictures of ``evaluate`` are the photograph where the model has nothing to show.
         if options.evaluation is None or not pictures:
             shown, rows = rendered_views(seen, views, pictures)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,6 +14,7 @@ from usdbrdf.delivery.package import package
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import resized
+from usdbrdf.job.child import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions
@@ -34,8 +33,8 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
            radiance times m^2
     """
     try:
-        with TemporaryDirectory(prefix="usdbrdf-room-") as folder:
-            file = Path(folder) / "room.glb"
+        with scratch_folder() as folder:
+            file = folder / "room.glb"
             options = PackageOptions(max_size=_TEXTURE, lighting=asset.lighting or None)
             package(asset.folder, file, options)
             content = file.read_bytes()

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.develop import developed_in
@@ -14,6 +13,7 @@ from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
+from usdbrdf.job.child import scratch_folder
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
@@ -30,12 +30,12 @@ def inspect(
     if mesh is None or every is None or not found.could_be_read:
         return found
 
-    def developed_frames(numbers: Sequence[int], folder: str) -> Frames:
+    def developed_frames(numbers: Sequence[int], folder: Path) -> Frames:
         views = [found.views[i] for i in numbers] if found.views else []
-        return developed_in(every.at(numbers), views, Path(folder))
+        return developed_in(every.at(numbers), views, folder)
 
     try:
-        with TemporaryDirectory(prefix="usdbrdf-") as folder:
+        with scratch_folder() as folder:
             frames = developed_frames(spread_evenly(len(every), ASKED), folder)
             agrees = agreement_of_frames(mesh, frames, partial(read_frame, frames), capture)
             objects = found.objects
