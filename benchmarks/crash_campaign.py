@@ -186,7 +186,7 @@ class Campaign:
         again = self.run(case, start.step)
         found = contents(case / "room")
         result = verdict(start.expected, found) if again == 0 else f"exit {again} again"
-        in_fork(swept)
+        in_fork(lambda: swept(case / "tmp"))
         if left := sorted({*os.listdir(case)} - {"room", "tmp", "said"}):
             problem += f"left {left}; "
         if left := os.listdir(case / "tmp"):
@@ -214,8 +214,9 @@ def in_fork(work: Callable[[], int]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
 
-def swept() -> int:
+def swept(temporary: Path) -> int:
     """What the next run of any command that starts a child does."""
+    tempfile.tempdir = str(temporary)
     with scratch_folder():
         return 0
 
@@ -378,7 +379,8 @@ def cut(campaign: Campaign, start: Start, cuts: int) -> None:
     problem = f"of a finished run {len(lost)} files are lost, first {lost[0]}" if lost else ""
     campaign.note(start, "power", problem)
     for place, where in (*disks, (ended, "the end")):
-        (place / "tmp").mkdir(exist_ok=True)
+        shutil.rmtree(place / "tmp", ignore_errors=True)  # which a machine that starts clears
+        (place / "tmp").mkdir()
         campaign.ended(start, "power", where, place, -signal.SIGKILL)
 
 

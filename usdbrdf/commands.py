@@ -45,14 +45,9 @@ class _Waiting(Command):
 
     def reading(self, *assets: Path) -> AbstractContextManager[object]:
         """Assets that no run changes meanwhile."""
-        from contextlib import ExitStack
-
         from usdbrdf.job.ownership import reading
 
-        held = ExitStack()
-        for asset in assets:
-            held.enter_context(reading(asset, self.wait_s))
-        return held
+        return reading(*assets, wait_s=self.wait_s)
 
 
 class _Locking(_Waiting):
@@ -142,15 +137,9 @@ class Convert(EditOptions, _RunOnCapture):
         with loading():
             from usdbrdf.pipeline import convert
         results = convert(
-            self.capture,
-            self.output,
-            self.options,
-            adapter=self.adapter,
-            plugins=self.plugins,
-            hand_edits=self.hand_edits,
-            wait_s=self.wait_s,
-            without_lock=self.without_lock,
-        )
+            self.capture, self.output, self.options, adapter=self.adapter, plugins=self.plugins,
+            hand_edits=self.hand_edits, wait_s=self.wait_s, without_lock=self.without_lock,
+        )  # fmt: skip
         return self.report(results, self.output)
 
 
@@ -166,13 +155,9 @@ class Ingest(_RunOnCapture):
             from usdbrdf.pipeline import ingest
         with self.working_on(self.output) as asset:
             done = ingest(
-                self.capture,
-                asset,
-                self.ingest,
-                self.adapter,
-                plugins=self.plugins,
+                self.capture, asset, self.ingest, self.adapter, plugins=self.plugins,
                 copy_to=self.write_capture,
-            )
+            )  # fmt: skip
         return self.report({"ingest": done}, self.output)
 
 

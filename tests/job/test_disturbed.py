@@ -34,9 +34,9 @@ def disturbed(folder: Path, fault: str, stride: int) -> dict[str, object]:
 @pytest.mark.fault("R1")
 @pytest.mark.fault("R2")
 @pytest.mark.parametrize(
-    ("fault", "stride"), [("kill", 7), ("full", 5), ("gone", 11), ("power", 3), ("power first", 3)]
+    ("fault", "stride"), [("kill", 17), ("full", 6), ("gone", 29), ("power", 5), ("power first", 5)]
 )
 def test_the_same_task_ends_in_the_same_bytes(tmp_path, fault, stride):
     told = disturbed(tmp_path, fault, stride)
     assert told["wrong"] == []
-    assert told["runs"] >= 10
+    assert told["runs"] >= 4

@@ -59,7 +59,7 @@ def publish(
             f"{destination}: this is a file, and versions are published into a folder. Choose "
             "another place. [publish.destination]"
         )
-    with reading(asset.folder, wait_s):
+    with reading(asset.folder, wait_s=wait_s):
         _refuse_unsound(asset)
         lock = destination / _LOCKED
         with environment_failures(str(destination)), _made(destination):

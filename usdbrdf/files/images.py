@@ -96,7 +96,7 @@ def _although_unread_once(path: Path, read: Callable[[], T]) -> T:
     try:
         return read()
     except ImageRefused:
-        if not path.is_file() or not os.access(path, os.R_OK):
+        if not os.path.isfile(path) or not os.access(path, os.R_OK):
             raise
     with environment_failures(str(path)):
         sha256_of(path)
@@ -173,11 +173,7 @@ def write_exr(
         spec.alpha_channel = 3
     with temporary_beside(path) as staged:
         write_image(path, staged, spec, stored)
-        if not np.array_equal(read_exr(staged), stored.astype(np.float32), equal_nan=holes):
-            raise EnvironmentFailure(
-                f"{path}: the file does not read back as it was written. Check the disk. "
-                "[image.write]"
-            )
+        refuse_other(path, staged, stored.astype(np.float32), holes=holes)
         publish(staged, path)
     return int(np.count_nonzero(np.abs(image) > HALF_MAX)) if half else 0
 
@@ -212,6 +208,7 @@ def write_preview_png(path: Path, rgb8: Byte) -> None:
     spec.set_colorspace("srgb_rec709_scene")
     with temporary_beside(path) as staged:
         write_image(path, staged, spec, np.ascontiguousarray(rgb8))
+        refuse_other(path, staged, rgb8)
         publish(staged, path)
 
 
@@ -415,6 +412,30 @@ def write_image(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
             f"{path}: cannot be written ({message or 'closing failed'}). Free disk space or "
             "correct the permission, then run the same command again. [image.write]"
         )
+
+
+def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool = False) -> None:
+    """EnvironmentFailure unless these are the pixels of the file that was written: closing it says
+    nothing of a full disk.
+
+    holes  NaN is compared too; else it stands for any value
+    """
+    try:
+        stored = pixels_of(staged, open_image(staged))
+        if pixels.dtype == np.uint8:
+            stored = np.rint(stored * 255)
+        known = np.ones(pixels.shape, bool) if holes else np.isfinite(pixels)
+        if stored.shape == pixels.shape and np.array_equal(
+            stored[known], pixels[known], equal_nan=holes
+        ):
+            return
+        cause = None
+    except ImageRefused as error:
+        cause = error
+    raise EnvironmentFailure(
+        f"{path}: the file does not read back as it was written. Free disk space or check the "
+        "disk, then run the same command again. [image.write]"
+    ) from cause
 
 
 def _message(speaker: Any) -> str:

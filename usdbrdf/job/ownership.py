@@ -111,9 +111,9 @@ def is_held(state_folder: Path) -> bool:
 
 
 @contextmanager
-def reading(place: Path, wait_s: float = 0.0) -> Iterator[None]:
-    """An asset, its folder or its root layer, that no run changes meanwhile; any number may read it
-    at once, and a run in it is refused or waits until they have ended.
+def reading(*places: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Assets, by their folders or root layers, that no run changes meanwhile; any number may read
+    one at once, and a run in it is refused or waits until they have ended.
 
     wait_s  how long to wait for a run before FolderBusy
 
@@ -122,6 +122,29 @@ def reading(place: Path, wait_s: float = 0.0) -> Iterator[None]:
     are no working locks, FolderBusy comes at the end, if a step has changed something meanwhile.
     InputRefused: a run was stopped while it put its files in place, and they are of two runs.
     """
+    with ExitStack() as held:
+        for place in places:
+            held.enter_context(_reading(place, wait_s))
+        yield
+
+
+def reads_asset(*names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A function that reads the assets in its arguments of these names; see ``reading``."""
+
+    def of_function(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def read(*given: P.args, **named: P.kwargs) -> R:
+            arguments = signature(function).bind(*given, **named).arguments
+            with reading(*(Path(arguments[name]) for name in names)):
+                return function(*given, **named)
+
+        return read
+
+    return of_function
+
+
+@contextmanager
+def _reading(place: Path, wait_s: float) -> Iterator[None]:
     state = (place.parent if place.is_file() else place).resolve() / STATE_FOLDER
     if is_held(state) or not state.is_dir():
         yield
@@ -139,23 +162,6 @@ def reading(place: Path, wait_s: float = 0.0) -> Iterator[None]:
                 f"{state.parent}: a run changed it while it was read, and what was made of it may "
                 "be a mixture. Run the same command again when that has ended. [lock.changed]"
             )
-
-
-def reads_asset(*names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A function that reads the assets in its arguments of these names; see ``reading``."""
-
-    def of_function(function: Callable[P, R]) -> Callable[P, R]:
-        @wraps(function)
-        def read(*given: P.args, **named: P.kwargs) -> R:
-            arguments = signature(function).bind(*given, **named).arguments
-            with ExitStack() as held:
-                for name in names:
-                    held.enter_context(reading(Path(arguments[name])))
-                return function(*given, **named)
-
-        return read
-
-    return of_function
 
 
 @contextmanager

@@ -132,7 +132,7 @@ def view(
     wait_s   how long to wait for a run in the folder before FolderBusy
     """
     asset = Asset.made(Path(folder))
-    with reading(asset.folder, wait_s):
+    with reading(asset.folder, wait_s=wait_s):
         data = page_data(asset, options or ReportOptions())
 
     def document(review: str) -> str:
