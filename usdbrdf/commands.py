@@ -348,6 +348,21 @@ class Report(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
+class Advise(_Locking, _Talking):
+    """Say what to photograph next, as guide cameras in a layer of their own."""
+
+    asset: Path = option("ASSET", REQUIRED)
+    "asset folder; only layers/advice.usda in it is written"
+    options: options.AdviseOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.advice.advise import advise
+            from usdbrdf.advice.words import lines
+        found = advise(self.asset, self.options, wait_s=self.wait_s, without_lock=self.without_lock)
+        return self.told(found, *lines(found))
+
+
 class View(_WithAsset):
     """Serve that page on this machine alone, where verdicts are saved into ASSET/review.usda."""
 
@@ -481,6 +496,7 @@ _OTHERS = (
     Publish,
     Report,
     View,
+    Advise,
     Validate,
     Rules,
     Adapters,

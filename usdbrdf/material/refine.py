@@ -112,8 +112,8 @@ _MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
 # sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
-_RELATIVE_ERROR = calibration.number("refine.relative_error")
-_OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
+RELATIVE_ERROR = calibration.number("refine.relative_error")
+OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 _DARKEST = calibration.number("refine.darkest")
 
 
@@ -297,10 +297,10 @@ def _means_without_lobes(
             own_seed = seed + len(frames) + some.frame
             specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
             unit, covered = level[texel], footprints(texels, texel, camera)
-            noise = np.float32(_OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
+            noise = np.float32(OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
             # A wide view of a texel says less of it than its noise tells.
             wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-            deviation = np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+            deviation = np.asarray(np.hypot(RELATIVE_ERROR, noise) * wide, np.float32)
             values = (some.radiance[taken] - specular) / unit[:, None]
             update(observed, texel - np.int32(part.start), values, deviation, covered)
             run.save_latest_in_time(name, done, observed._asdict)
