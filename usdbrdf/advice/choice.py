@@ -16,8 +16,8 @@ from usdbrdf.advice.knowledge import Exposure, Outlook, Products, view_of
 from usdbrdf.advice.survey import Survey, Target
 from usdbrdf.model.arrays import Bool, Double, Long
 
-# What seeing all that clipped without clipping counts for, in objects that become known. All that can
-# be seen for the first time counts as much as all objects that are not known.
+# What seeing all that clipped without clipping counts for, in objects that become known. All that
+# can be seen for the first time counts as much as all objects that are not known.
 _WORTH_OF_CLIPPED = 1.0
 # Points of an object in the picture, without which nothing is expected of it.
 _FEWEST = 4

@@ -150,7 +150,7 @@ def _reached(rays: RayScene, nodes: Double, free: Bool, eyes: Double, farthest: 
 
 
 def _ground(rays: RayScene, nodes: Double, usable: Bool, up: int) -> Double:
-    """(nodes,): height of the first surface below; infinity below others and where there is none."""
+    """(nodes,): height of the first surface below usable nodes; infinity where there is none."""
     ground = np.full(len(nodes), np.inf)
     index = np.flatnonzero(usable)
     down = np.zeros((len(index), 3), np.float32)

@@ -4,9 +4,10 @@ design: a review", Statistical Science 1995).
 
 The fit compares lobes by what they leave unexplained of samples whose diffuse part is free per
 texel. So what tells two lobes apart is how differently they change between a texel's views,
-against the samples' errors. Lobes are sums of ``basis`` functions, of which one table of products per texel
-suffices: it adds up over views, whichever lobe is the true one. Of every lobe that the frames so
-far leave likely, the posterior that the fit would then have is computed, and judged as the fit judges.
+against the samples' errors. Lobes are sums of ``basis`` functions, of which one table of products
+per texel suffices: it adds up over views, whichever lobe is the true one. Of every lobe that the
+frames so far leave likely, the posterior that the fit would then have is computed, and judged as
+the fit judges.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def view_of(
 def contrast(products: Products, typical: Double) -> Double:
     """(K, K): what tells lobes apart, per degree of freedom: d' contrast d is the mean squared
     difference of two lobes, d (K,) apart, over the samples' variance, with each texel's diffuse
-    part left free. Half of the texels are those that show highlights best, as the fit chooses them."""
+    part left free. Half of the texels are those that show highlights best, as the fit has it."""
     usable = np.flatnonzero((products.views >= MIN_VIEWS) & (products.weight > 0))
     if len(usable) < _FEWEST:
         return np.zeros(products.square.shape[1:])
@@ -161,9 +162,9 @@ def contrast(products: Products, typical: Double) -> Double:
 
 
 def share_found(known: Lobes, likely: Double, contrasts: Double, evidence: float) -> float:
-    """Of the contrast that is reckoned with, how much the fit found in the frames: its evidence, 1 -
-    unexplained / all, against the one that was to be expected. Patterns, curvature and poses make
-    errors of samples that no reckoning knows; they will be there in further photographs too.
+    """Of the contrast that is reckoned with, how much the fit found in the frames: its evidence,
+    1 - unexplained / all, against the one that was to be expected. Patterns, curvature and poses
+    make errors of samples that no reckoning knows; they will be there in further photographs too.
     evidence NaN: there was no fit to compare with."""
     own = np.einsum("hk,kl,hl->h", known.combination, contrasts, known.combination)
     reckoned = float(likely @ np.maximum(own, 0))

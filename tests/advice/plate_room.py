@@ -1,0 +1,132 @@
+"""A dark room whose glossy plate mirrors the lamp to one side alone, photographed from the other
+side, with a wall that no frame shows. Lengths in metres, z up.
+
+The plate stands upright in the plane x = PLATE_X, its front towards +x. The lamp hangs on the wall
+y = 3; mirrored in the plate's plane it stands behind the plate, so that its reflection is seen from
+low y. The frames stand at high y and look to low x.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from tests.scenes import camera_at, look_at, write_ply
+from usdbrdf.files.images import write_exr
+from usdbrdf.transport.rays import RayScene
+
+ROOM = (4.0, 3.0, 2.4)
+PLATE_X, PLATE_Y, PLATE_Z = 0.4, (1.1, 1.9), (0.4, 1.8)
+LAMP_X, LAMP_Y, LAMP_Z = (1.6, 2.4), 2.98, (0.7, 1.5)
+# What a closed cabinet keeps cameras out of: low and high corner.
+CABINET = ((3.0, 0.1, 0.0), (3.9, 1.1, 1.9))
+RADIANCE = {
+    "floor": 0.05, "ceiling": 0.06, "walls": 0.05, "east": 0.05, "plate": 0.05, "lamp": 9.0,
+    "cabinet": 0.04,
+}  # fmt: skip
+SIZE, FOCAL = (48, 36), 30.0
+
+
+def quads():
+    """Name, corner and two edges; the normal is their cross product."""
+    x, y, z = ROOM
+    (lx, ly, lz), (hx, hy, hz) = CABINET
+    a, b, c = hx - lx, hy - ly, hz - lz
+    return [
+        ("floor", (0, 0, 0), (x, 0, 0), (0, y, 0)),
+        ("ceiling", (0, 0, z), (0, y, 0), (x, 0, 0)),
+        ("walls", (0, 0, 0), (0, 0, z), (x, 0, 0)),
+        ("walls", (0, y, 0), (x, 0, 0), (0, 0, z)),
+        ("walls", (0, 0, 0), (0, y, 0), (0, 0, z)),
+        ("east", (x, 0, 0), (0, 0, z), (0, y, 0)),
+        ("plate", (PLATE_X, PLATE_Y[0], PLATE_Z[0]), (0, 0.8, 0), (0, 0, 1.4)),
+        ("plate", (PLATE_X - 0.02, PLATE_Y[0], PLATE_Z[0]), (0, 0, 1.4), (0, 0.8, 0)),
+        ("lamp", (LAMP_X[0], LAMP_Y, LAMP_Z[0]), (0.8, 0, 0), (0, 0, 0.8)),
+        ("cabinet", (lx, ly, hz), (a, 0, 0), (0, b, 0)),
+        ("cabinet", (lx, ly, lz), (0, b, 0), (a, 0, 0)),
+        ("cabinet", (lx, ly, lz), (a, 0, 0), (0, 0, c)),
+        ("cabinet", (lx, hy, lz), (0, 0, c), (a, 0, 0)),
+        ("cabinet", (lx, ly, lz), (0, 0, c), (0, b, 0)),
+        ("cabinet", (hx, ly, lz), (0, b, 0), (0, 0, c)),
+    ]
+
+
+def mesh(squares: int = 6):
+    """points (V, 3), triangles (F, 3), object (F,), names."""
+    names = tuple(dict.fromkeys(name for name, *_ in quads()))
+    points, triangles, owner, first = [], [], [], 0
+    steps = np.arange(squares + 1) / squares
+    b, a = (grid.reshape(-1, 1) for grid in np.meshgrid(steps, steps, indexing="ij"))
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(squares), np.arange(squares)))
+    corner = j * (squares + 1) + i
+    square = np.stack([corner, corner + 1, corner + squares + 2, corner + squares + 1], axis=-1)
+    for name, origin, u, v in quads():
+        points.append(np.array(origin) + a * np.array(u) + b * np.array(v))
+        triangles.append(square[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3) + first)
+        owner.append(np.full(2 * len(square), names.index(name)))
+        first += len(points[-1])
+    return (
+        np.concatenate(points).astype(np.float32),
+        np.concatenate(triangles).astype(np.int32),
+        np.concatenate(owner).astype(np.int32),
+        names,
+    )
+
+
+def frame_poses():
+    """Eight poses at high y that look to low x, or up and down, none towards the east wall."""
+    targets = [(0.4, 1.5, 1.1), (0.2, 0.6, 0.6), (0.4, 2.4, 0.2), (0.6, 1.2, 2.3)]
+    return (
+        [
+            look_at(np.array([1.9 + 0.2 * k, 2.35 + 0.05 * k, 1.0 + 0.2 * k]), np.array(target))
+            for k, target in enumerate(targets)
+        ]
+        + [
+            look_at(np.array([1.5 + 0.2 * k, 2.6 - 0.05 * k, 1.6 - 0.2 * k]), np.array(target))
+            for k, target in enumerate(targets)
+        ]
+        + [look_at(np.array([1.2, 1.6, 1.2]), np.array([1.9, 2.98, 1.1]))]
+    )
+
+
+def write_capture(folder: Path) -> Path:
+    """The capture, rendered by its first surfaces, of the same radiance from everywhere."""
+    (folder / "frames").mkdir(parents=True)
+    points, triangles, owner, names = mesh()
+    write_ply(folder / "mesh.ply", points, triangles, owner)
+    labels = [{"id": k, "name": name, "class_name": name} for k, name in enumerate(names)]
+    (folder / "objects.json").write_text(json.dumps({"objects": labels}))
+    table = np.array([[RADIANCE[name]] * 3 for name in names], np.float32)
+    rays, (width, height) = RayScene(points, triangles), SIZE
+    lens = (FOCAL, FOCAL, width / 2, height / 2)
+    frames = []
+    for k, pose in enumerate(frame_poses()):
+        camera = camera_at(pose, lens, width, height)
+        face = rays.closest(*camera.rays(camera.pixels())).face
+        write_exr(folder / f"frames/{k}.exr", table[owner[face]].reshape(height, width, 3))
+        frames.append({"file_path": f"frames/{k}.exr", "transform_matrix": pose.tolist()})
+    document = {
+        "camera_model": "PINHOLE", "w": width, "h": height, "fl_x": FOCAL, "fl_y": FOCAL,
+        "cx": width / 2, "cy": height / 2, "mesh": "mesh.ply", "objects": "objects.json",
+        "exposure_time": 0.02, "saturation_radiance": 64.0, "noise_floor_radiance": 0.0005,
+        "frames": frames,
+    }  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def mirrors_the_lamp(eye) -> float:
+    """Share of the plate's front on which a camera at ``eye`` (3,) sees the lamp, by the lamp's
+    mirror image: the sight line through a point of the plate goes on to it."""
+    if eye[0] <= PLATE_X:
+        return 0.0
+    y, z = np.meshgrid(np.linspace(*PLATE_Y, 21), np.linspace(*PLATE_Z, 21))
+    # In the plane y = LAMP_Y behind the plate, where the mirrored lamp is.
+    t = (LAMP_Y - eye[1]) / np.where(np.abs(y - eye[1]) < 1e-9, 1e-9, y - eye[1])
+    x = eye[0] + t * (PLATE_X - eye[0])
+    up = eye[2] + t * (z - eye[2])
+    image = 2 * PLATE_X - x
+    hit = (t > 1) & (image > LAMP_X[0]) & (image < LAMP_X[1]) & (up > LAMP_Z[0]) & (up < LAMP_Z[1])
+    return float(hit.mean())
