@@ -103,6 +103,9 @@ def test_a_fit_that_found_less_than_was_reckoned_lowers_what_is_reckoned():
     contrasts = np.eye(BASIS)
     own = EVEN @ np.einsum("hk,hk->h", KNOWN.combination, KNOWN.combination)
     assert share_found(KNOWN, EVEN, contrasts, own / (1 + own)) == pytest.approx(1)
-    half = 0.5 * own
-    assert share_found(KNOWN, EVEN, contrasts, half / (1 + half)) == pytest.approx(0.5)
+    found = [share_found(KNOWN, EVEN, scale * contrasts, 0.3) for scale in (0.1, 1, 10, 100)]
+    assert found == sorted(found, reverse=True)
+    assert found[0] == 1 > 0.1 > found[-1]
+    # Where next to nothing was to be found, finding nothing is no news.
+    assert share_found(KNOWN, EVEN, 0.01 * contrasts, 0.0) > 0.9
     assert share_found(KNOWN, EVEN, contrasts, np.nan) == 1

@@ -13,7 +13,15 @@ import numpy as np
 
 from usdbrdf.advice.choice import Choice, choose
 from usdbrdf.advice.free_space import Places, free_places
-from usdbrdf.advice.knowledge import Exposure, Products, contrast, likely_lobes, lobes, share_found
+from usdbrdf.advice.knowledge import (
+    Exposure,
+    Products,
+    contrast,
+    likely_lobes,
+    lobes,
+    reckoned_samples,
+    share_found,
+)
 from usdbrdf.advice.survey import (
     Survey,
     Target,
@@ -43,6 +51,7 @@ from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.evaluation.evaluate_views import measured_atlas, viewed_asset
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.material.fit_views import MIN_OBSERVATIONS
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AdviseOptions
 from usdbrdf.transport.lit_scene import LitScene
@@ -54,6 +63,8 @@ _MOST_FRAMES, _PLACES, _MOST_OBJECTS = 72, 220, 48
 _SHORTER = 4.0
 # An object that is a lamp by more than this share needs no lobe.
 _LAMP = 0.5
+# Samples that are no sample: one view less, and there were some.
+_HARDLY_ANY = 10
 # Directives by which nothing is fitted.
 _LEFT_OUT = ("ignore", "glass")
 
@@ -189,6 +200,7 @@ def survey_of(
                 known, target.likely, contrast(target.products, target.typical),
                 fits[target.index].evidence,
             ),
+            samples=_samples(fits[target.index], target.products),
         )
         for target in targets
     ]  # fmt: skip
@@ -212,6 +224,13 @@ def survey_of(
         camera=camera,
         exposures=_to_choose_from(frames, clipped=bool(clipped.any())),
     )
+
+
+def _samples(fit: FittedObject, products: Products) -> float:
+    """How many samples the fit had for each that is reckoned with; of large things enough."""
+    if fit.num_pixels >= MIN_OBSERVATIONS:
+        return math.inf
+    return (fit.num_pixels + _HARDLY_ANY) / max(reckoned_samples(products), _HARDLY_ANY)
 
 
 def _wanted(atlas: AssetMaps, fits: Sequence[FittedObject]) -> list[int]:

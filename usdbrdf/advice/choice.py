@@ -16,9 +16,9 @@ from usdbrdf.advice.knowledge import Exposure, Outlook, Products, view_of
 from usdbrdf.advice.survey import Survey, Target
 from usdbrdf.model.arrays import Bool, Double, Long
 
-# What seeing all that clipped without clipping counts for, in objects that become known. All that
-# can be seen for the first time counts as much as all objects that are not known.
-_WORTH_OF_CLIPPED = 1.0
+# What seeing all that clipped without clipping counts for, in objects that become known; and seeing
+# all that can be seen for the first time, as a share of the objects that are not known.
+_WORTH_OF_CLIPPED, _WORTH_OF_UNSEEN = 0.5, 1 / 3
 # Points of an object in the picture, without which nothing is expected of it.
 _FEWEST = 4
 # A photograph that adds less than this, in objects, is not worth advising.
@@ -58,7 +58,8 @@ class _State:
             seen[which[which < survey.of_surface]] = True
         unseen = max(float(survey.area @ (self.unseen & seen)), 1e-12)
         clipped = max(float(survey.area @ (self.clipped & seen)), 1e-12)
-        self._of_unseen = max(len(survey.targets), 1) / unseen * survey.area
+        worth = max(_WORTH_OF_UNSEEN * len(survey.targets), 1.0)
+        self._of_unseen = worth / unseen * survey.area
         self._of_clipped = _WORTH_OF_CLIPPED / clipped * survey.area
         self.products = [
             Products(*(values.copy() for values in target.products)) for target in survey.targets
@@ -69,7 +70,7 @@ class _State:
         old = self.survey.targets[i]
         return Target(
             index=old.index, own=old.own, likely=old.likely, typical=old.typical,
-            products=self.products[i], holds=old.holds, sights=old.sights,
+            products=self.products[i], holds=old.holds, samples=old.samples, sights=old.sights,
         )  # fmt: skip
 
     def _outlook(self, i: int, *more: tuple[Long, Double, Double]) -> Outlook:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.material.fit_views import ABOVE_NOISE, MIN_VIEWS
+from usdbrdf.material.fit_views import ABOVE_NOISE, MIN_OBSERVATIONS, MIN_VIEWS
 from usdbrdf.material.refine import OF_NOISE_FLOOR, RELATIVE_ERROR
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
@@ -25,6 +25,7 @@ from usdbrdf.material.verdict import (
     MIN_EVIDENCE,
     MODEL_DISCREPANCY,
     NOTHING_KNOWN,
+    SOME_EVIDENCE,
     UNEXPLAINED,
 )
 from usdbrdf.model.arrays import Bool, Double, Float, Long
@@ -39,8 +40,10 @@ _KEPT_VIEWS, _BEST, _FEWEST = 12, 0.2, 8
 _SHARED = 0.02
 # Beyond the bound that the fit gives for psi, with a probability of 5 %, lobes are this unlikely.
 _BEYOND_BOUND = 0.05
-# Where a fit found nothing at all, there may still be something to find.
-_LEAST_FOUND = 0.2
+# Contrast below that of this evidence tells nothing: the errors of frames alone have as much.
+_NO_NEWS = SOME_EVIDENCE / (1 - SOME_EVIDENCE)
+# Samples of which a fit is sure to be made.
+_ENOUGH = 1.5 * MIN_OBSERVATIONS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +174,19 @@ def share_found(known: Lobes, likely: Double, contrasts: Double, evidence: float
     if not np.isfinite(evidence) or reckoned <= 0:
         return 1.0
     found = max(evidence, 0.0) / max(1 - evidence, 1e-3)
-    return float(np.clip(found / reckoned, _LEAST_FOUND, 1.0))
+    return float(min((found + _NO_NEWS) / (reckoned + _NO_NEWS), 1.0))
+
+
+def reckoned_samples(products: Products) -> float:
+    """How many samples the views give, of texels that enough of them see."""
+    views = products.views[products.views >= MIN_VIEWS]
+    return float(np.minimum(views, _KEPT_VIEWS).sum())
+
+
+def share_of_enough(products: Products, samples_per_reckoned: float) -> float:
+    """From 0 to 1: of small things the fit may have too few samples."""
+    reckoned = reckoned_samples(products)
+    return min(1.0, samples_per_reckoned * reckoned / _ENOUGH) if reckoned else 0.0
 
 
 class Outlook(NamedTuple):
@@ -205,5 +220,7 @@ def outlook(known: Lobes, likely: Double, contrasts: Double) -> Outlook:
     measured &= (of_phi <= MAX_PHI_ERROR) & (of_psi <= MAX_PSI_ERROR)
     probability = float(likely @ measured)
     knows = 1 - float(likely @ (of_phi + of_psi)) / (2 * NOTHING_KNOWN)
-    worth = (probability + knows + float(likely @ np.minimum(evidence / MIN_EVIDENCE, 1))) / 3
+    # Knowing a little of two objects is not as good as measuring one.
+    on_the_way = (knows + float(likely @ np.minimum(evidence / MIN_EVIDENCE, 1))) / 2
+    worth = (2 * probability + on_the_way) / 3
     return Outlook(float(likely @ of_phi), float(likely @ of_psi), probability, worth)

@@ -17,6 +17,7 @@ from usdbrdf.advice.knowledge import (
     Products,
     contrast,
     outlook,
+    share_of_enough,
     view_of,
 )
 from usdbrdf.advice.sight import Spots, in_picture, visible_spots
@@ -43,6 +44,7 @@ class Target:
     likely    (H,) how likely each lobe is; typical (K,) the mean of them
     products  what the frames so far tell
     holds     the share of the reckoned contrast that the fit found in the frames so far
+    samples   how many samples the fit had for each that is reckoned with
     sights    of each place that sees it: which of its points, (M,), and their basis (M, K)
     """
 
@@ -52,6 +54,7 @@ class Target:
     typical: Double
     products: Products
     holds: float = 1.0
+    samples: float = 1.0
     sights: dict[int, tuple[Long, Double]] = field(default_factory=dict)
 
     def expected(self, known: Lobes, *more: tuple[Long, Double, Double]) -> Outlook:
@@ -62,7 +65,8 @@ class Target:
             products = Products(*(values.copy() for values in products))
             for which, weight, basis in more:
                 products.add(which, weight, basis)
-        return outlook(known, self.likely, self.holds * contrast(products, self.typical))
+        holds = self.holds * share_of_enough(products, self.samples)
+        return outlook(known, self.likely, holds * contrast(products, self.typical))
 
 
 @dataclass(frozen=True, kw_only=True)
