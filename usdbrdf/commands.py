@@ -487,23 +487,9 @@ class PluginPath(Command):
 
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
-    MergeBrackets,
-    DevelopRaw,
-    Evaluate,
-    Compare,
-    Relight,
-    Package,
-    Publish,
-    Report,
-    View,
-    Advise,
-    Validate,
-    Rules,
-    Adapters,
-    Doctor,
-    Completion,
-    PluginPath,
-)
+    MergeBrackets, DevelopRaw, Evaluate, Compare, Relight, Package, Publish, Report, View,
+    Advise, Validate, Rules, Adapters, Doctor, Completion, PluginPath,
+)  # fmt: skip
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
     for command in (*_TASKS, *_OTHERS)

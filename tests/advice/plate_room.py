@@ -23,8 +23,8 @@ LAMP_X, LAMP_Y, LAMP_Z = (1.6, 2.4), 2.98, (0.7, 1.5)
 # What a closed cabinet keeps cameras out of: low and high corner.
 CABINET = ((3.0, 0.1, 0.0), (3.9, 1.1, 1.9))
 RADIANCE = {
-    "floor": 0.05, "ceiling": 0.06, "walls": 0.05, "east": 0.05, "plate": 0.05, "lamp": 9.0,
-    "cabinet": 0.04,
+    "floor": 0.01, "ceiling": 0.012, "walls": 0.01, "east": 0.01, "plate": 0.3, "lamp": 60.0,
+    "cabinet": 0.01,
 }  # fmt: skip
 SIZE, FOCAL = (48, 36), 30.0
 
@@ -101,16 +101,18 @@ def write_capture(folder: Path) -> Path:
     table = np.array([[RADIANCE[name]] * 3 for name in names], np.float32)
     rays, (width, height) = RayScene(points, triangles), SIZE
     lens = (FOCAL, FOCAL, width / 2, height / 2)
-    frames = []
+    frames, rng = [], np.random.default_rng(5)
     for k, pose in enumerate(frame_poses()):
         camera = camera_at(pose, lens, width, height)
         face = rays.closest(*camera.rays(camera.pixels())).face
-        write_exr(folder / f"frames/{k}.exr", table[owner[face]].reshape(height, width, 3))
+        image = table[owner[face]].reshape(height, width, 3)
+        noise = 1 + 0.01 * rng.standard_normal(image.shape)
+        write_exr(folder / f"frames/{k}.exr", (image * noise).astype(np.float32))
         frames.append({"file_path": f"frames/{k}.exr", "transform_matrix": pose.tolist()})
     document = {
         "camera_model": "PINHOLE", "w": width, "h": height, "fl_x": FOCAL, "fl_y": FOCAL,
         "cx": width / 2, "cy": height / 2, "mesh": "mesh.ply", "objects": "objects.json",
-        "exposure_time": 0.02, "saturation_radiance": 64.0, "noise_floor_radiance": 0.0005,
+        "exposure_time": 0.02, "saturation_radiance": 500.0, "noise_floor_radiance": 0.0002,
         "frames": frames,
     }  # fmt: skip
     (folder / "transforms.json").write_text(json.dumps(document))

@@ -80,12 +80,13 @@ def visible_spots(surface: TexturedScene, spots: Spots, eye: Double, focal: floa
     return index[shown.reshape(sides, -1).all(axis=0)]
 
 
-def in_picture(camera: Camera, position: Float) -> Bool:
-    """(N,): whether points (N, 3) lie before the camera and clearly within its picture."""
-    turn = camera.world_from_camera[:3, :3]
-    x, y, z = ((position - camera.eye) @ turn).T
+def in_pictures(camera: Camera, eye: Double, turns: Double, position: Float) -> Bool:
+    """(L, N): whether points (N, 3) lie before the camera and clearly within its picture, were it
+    at ``eye`` and turned (L, 3, 3), world from camera."""
+    way = (position - eye).astype(np.float32)
+    x, y, z = (way @ axis.T.astype(np.float32) for axis in np.moveaxis(turns, 2, 0))
     fx, fy, cx, cy = camera.intrinsics
-    depth = np.maximum(-z, 1e-9)
+    depth = np.maximum(-z, np.float32(1e-9))
     u, v = cx + fx * x / depth, cy - fy * y / depth
     inside = (z < 0) & (u > _RIM_PX) & (u < camera.width - _RIM_PX)
-    return np.asarray(inside & (v > _RIM_PX) & (v < camera.height - _RIM_PX), np.bool_)
+    return np.asarray((inside & (v > _RIM_PX) & (v < camera.height - _RIM_PX)).T, np.bool_)

@@ -20,7 +20,7 @@ from usdbrdf.advice.knowledge import (
     share_of_enough,
     view_of,
 )
-from usdbrdf.advice.sight import Spots, in_picture, visible_spots
+from usdbrdf.advice.sight import Spots, in_pictures, visible_spots
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
@@ -137,7 +137,8 @@ def seen_by_frames(
     seen = []
     for camera in progress(cameras, total=len(cameras), label="advise", unit="frames"):
         visible = visible_spots(lit, spots, camera.eye, camera.intrinsics[0])
-        seen.append(visible[in_picture(camera, spots.position[visible])])
+        turn = camera.world_from_camera[None, :3, :3]
+        seen.append(visible[in_pictures(camera, camera.eye, turn, spots.position[visible])[0]])
     eyes = np.array([camera.eye for camera in cameras])
     for target in targets:
         for i, (which, basis) in _bases(lit, spots, target.own, seen, eyes, seed).items():
@@ -175,9 +176,7 @@ def look_from(
     for eye in progress(places, total=len(places), label="advise", unit="places"):
         which = visible_spots(lit, spots, eye, camera.intrinsics[0])
         visible.append(which)
-        inside.append(
-            np.stack([in_picture(placed(camera, eye, t), spots.position[which]) for t in looks])
-        )
+        inside.append(in_pictures(camera, eye, looks, spots.position[which]))
     for target in targets:
         target.sights.update(_bases(lit, spots, target.own, visible, places, seed))
     return tuple(visible), tuple(inside)
