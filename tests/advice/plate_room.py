@@ -119,9 +119,10 @@ def write_capture(folder: Path) -> Path:
     return folder
 
 
-def mirrors_the_lamp(eye) -> float:
-    """Share of the plate's front on which a camera at ``eye`` (3,) sees the lamp, by the lamp's
-    mirror image: the sight line through a point of the plate goes on to it."""
+def mirrors_the_lamp(eye, around: float = 0.5) -> float:
+    """Share of the plate's front on which a camera at ``eye`` (3,) sees the lamp, or what is so
+    many metres ``around`` it, for a lobe has some width; by the lamp's mirror image: the sight line
+    through a point of the plate goes on to it."""
     if eye[0] <= PLATE_X:
         return 0.0
     y, z = np.meshgrid(np.linspace(*PLATE_Y, 21), np.linspace(*PLATE_Z, 21))
@@ -130,5 +131,6 @@ def mirrors_the_lamp(eye) -> float:
     x = eye[0] + t * (PLATE_X - eye[0])
     up = eye[2] + t * (z - eye[2])
     image = 2 * PLATE_X - x
-    hit = (t > 1) & (image > LAMP_X[0]) & (image < LAMP_X[1]) & (up > LAMP_Z[0]) & (up < LAMP_Z[1])
+    hit = (t > 1) & (image > LAMP_X[0] - around) & (image < LAMP_X[1] + around)
+    hit &= (up > LAMP_Z[0] - around) & (up < LAMP_Z[1] + around)
     return float(hit.mean())

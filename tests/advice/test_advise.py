@@ -13,7 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 from scipy.spatial import cKDTree
 
 import usdbrdf
-from tests.advice.plate_room import ROOM, mesh, mirrors_the_lamp, write_capture
+from tests.advice.plate_room import ROOM, frame_poses, mesh, mirrors_the_lamp, write_capture
 from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
@@ -49,13 +49,14 @@ def advised(tmp_path_factory):
 
 def test_one_pose_sees_the_reflection_that_no_frame_saw(advised):
     _, _, found = advised
+    assert max(mirrors_the_lamp(pose[:3, 3]) for pose in frame_poses()) == 0
     shares = [mirrors_the_lamp(np.array(pose["eye"])) for pose in found["poses"]]
-    assert max(shares) > 0.05
+    assert max(shares) > 0.1
     told = [
-        (one["reflects"], one["psi_error_expected"] < 0.8 * one["psi_error"])
+        (one["reflects"], one["psi_error_expected"] < 0.5 * one["psi_error"])
         for pose, share in zip(found["poses"], shares, strict=True)
         for one in pose["objects"]
-        if one["identifier"] == "plate" and share > 0.05
+        if one["identifier"] == "plate" and share > 0.1
     ]
     assert ("lamp", True) in told
 
