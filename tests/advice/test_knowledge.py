@@ -78,6 +78,14 @@ def test_a_stated_posterior_is_kept_to():
     assert EVEN @ KNOWN.phi == pytest.approx(0.5, abs=0.03)
 
 
+def test_where_no_lobe_is_likelier_less_is_to_be_had():
+    none = likely_lobes(KNOWN, 0.7, 0.0, 0.29, 0.29, 0.9)
+    assert 0 < none.sum() < 0.45
+    clear = 1e4 * np.eye(BASIS)
+    assert outlook(KNOWN, none, clear).measured == pytest.approx(none.sum())
+    assert outlook(KNOWN, none, clear).psi_error > 0.15
+
+
 def test_what_clips_or_is_noise_weighs_nothing():
     level = np.array([0.0004, 0.5, 3.0])
     exposure = Exposure(0.02, 2.0, 0.001)

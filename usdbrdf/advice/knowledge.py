@@ -24,6 +24,7 @@ from usdbrdf.material.verdict import (
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
     MODEL_DISCREPANCY,
+    NO_LOBE,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
     UNEXPLAINED,
@@ -75,7 +76,8 @@ def likely_lobes(
     known: Lobes, phi: float, psi: float, phi_error: float, psi_error: float, psi_upper: float
 ) -> Double:
     """(H,): how likely each lobe is after the frames so far, of which the fit tells value, standard
-    deviation and bound (NaN: nothing is known)."""
+    deviation and bound (NaN: nothing is known); the rest of 1 is that there is no lobe at all,
+    which the fit holds for likelier where it says that psi is 0."""
     log = np.log(known.width)
     for values, value, error in ((known.phi, phi, phi_error), (known.psi, psi, psi_error)):
         # A deviation of an even distribution says that nothing is known.
@@ -84,7 +86,9 @@ def likely_lobes(
     if np.isfinite(psi_upper):
         log = log + np.where(known.psi > psi_upper, np.log(_BEYOND_BOUND), 0.0)
     density = np.exp(log - log.max())
-    return np.asarray(density / density.sum(), np.float64)
+    # All that is known then is that the chance of a lobe lies between none and this.
+    chance = (1 - NO_LOBE) / 2 if psi == 0 else 1.0
+    return np.asarray(chance * density / density.sum(), np.float64)
 
 
 class Exposure(NamedTuple):
@@ -219,8 +223,11 @@ def outlook(known: Lobes, likely: Double, contrasts: Double) -> Outlook:
     measured = (evidence >= MIN_EVIDENCE) & (known.psi > of_psi)
     measured &= (of_phi <= MAX_PHI_ERROR) & (of_psi <= MAX_PSI_ERROR)
     probability = float(likely @ measured)
-    knows = 1 - float(likely @ (of_phi + of_psi)) / (2 * NOTHING_KNOWN)
+    # Where there is no lobe, further photographs do not find one.
+    none = (1 - float(likely.sum())) * NOTHING_KNOWN
+    of_phi_mean, of_psi_mean = (float(likely @ errors) + none for errors in (of_phi, of_psi))
+    knows = 1 - (of_phi_mean + of_psi_mean) / (2 * NOTHING_KNOWN)
     # Knowing a little of two objects is not as good as measuring one.
     on_the_way = (knows + float(likely @ np.minimum(evidence / MIN_EVIDENCE, 1))) / 2
     worth = (2 * probability + on_the_way) / 3
-    return Outlook(float(likely @ of_phi), float(likely @ of_psi), probability, worth)
+    return Outlook(of_phi_mean, of_psi_mean, probability, worth)

@@ -19,7 +19,7 @@ _PSI_GRID = np.linspace(0, 1, 201)
 POSTERIOR = ("phi_median", "psi_median", "psi_upper")
 MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
-_NO_LOBE = calibration.number("fit.no_lobe")
+NO_LOBE = calibration.number("fit.no_lobe")
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 
@@ -80,7 +80,7 @@ def lobe_from_costs(
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
     psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (0.5, 0.95))
-    psi_median = 0.0 if none > _NO_LOBE else psi_median
+    psi_median = 0.0 if none > NO_LOBE else psi_median
     (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
