@@ -26,9 +26,9 @@ _LEAST = 0.01
 
 
 class Gain(NamedTuple):
-    """Of one object by one photograph: its index, and what is expected before and after it."""
+    """Of one object by one photograph: its number, and what is expected before and after it."""
 
-    index: int
+    owner: int
     before: Outlook
     after: Outlook
 

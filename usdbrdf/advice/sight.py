@@ -77,7 +77,8 @@ def visible_spots(surface: TexturedScene, spots: Spots, eye: Double, focal: floa
     )
     shown = surface.owner(hits.face) == spots.owner[repeated]
     shown &= np.abs(off) <= _OFF_PLANE_PX / focal * np.tile(far, sides)
-    return index[shown.reshape(sides, -1).all(axis=0)]
+    seen: Long = index[shown.reshape(sides, -1).all(axis=0)]
+    return seen
 
 
 def in_pictures(camera: Camera, eye: Double, turns: Double, position: Float) -> Bool:

@@ -38,13 +38,13 @@ def told_objects(
     stated deviations of phi and psi before any of the photographs."""
     best = sorted(choice.gains, key=lambda gain: gain.before.worth - gain.after.worth)
     told = [gain for gain in best if gain.after.worth - gain.before.worth > _TOLD][:_MOST]
-    return tuple(_told(lit, survey, choice, gain, errors[gain.index]) for gain in told)
+    return tuple(_told(lit, survey, choice, gain, errors[gain.owner]) for gain in told)
 
 
 def _told(
     lit: LitScene, survey: Survey, choice: Choice, gain: Gain, stated: tuple[float, float]
 ) -> AdvisedObject:
-    obj = lit.scene.objects[gain.index]
+    obj = lit.scene.objects[gain.owner]
     before = (gain.before.phi_error, gain.before.psi_error)
     # What was found and what is expected come from two reckonings: the larger one is told before.
     known = [max(a, b) if math.isfinite(b) else a for a, b in zip(before, stated, strict=True)]
@@ -56,7 +56,7 @@ def _told(
         phi_error_expected=min(gain.after.phi_error, known[0]),
         psi_error_expected=min(gain.after.psi_error, known[1]),
         measured_expected=gain.after.measured,
-        reflects=_reflected(lit, survey, choice, gain.index),
+        reflects=_reflected(lit, survey, choice, gain.owner),
     )
 
 
