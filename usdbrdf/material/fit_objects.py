@@ -14,11 +14,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from usdbrdf import calibration
-from usdbrdf.files.frames import FramePixels, FrameReader, read_frames
+from usdbrdf.ahead import ahead
+from usdbrdf.files.frames import FramePixels, FrameReader
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_lobe import first_seed
 from usdbrdf.material.fit_target import (
+    FrameCounts,
     Residual,
     choose_target_frames,
     count_frame,
@@ -145,15 +147,19 @@ def survey_frames(
         by_views = options.method == "views"
         followed = usable & lit.texels.interior & by_views
         follower = Follower(lit, followed, len(own), options.seed)
-        counts = []
-        images = read_frames(reader.read, own)
-        for i, pixels in progress(images, total=len(own), label="fit: survey", unit="frames"):
+
+        def look(i: int) -> FrameCounts | None:
+            pixels = reader.read(i)
             if by_views:
-                noise_floor = float(frames.noise_floor_radiance[i])
-                follower.add(_view(frames, i, pixels), pixels.clipped, noise_floor)
-            else:
-                stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
-                counts.append(count_frame(lit, pixels.valid, frames.camera(i), stride))
+                view, noise_floor = _view(frames, i, pixels), float(frames.noise_floor_radiance[i])
+                follower.add(i - own.start, view, pixels.clipped, noise_floor)
+                return None
+            stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
+            return count_frame(lit, pixels.valid, frames.camera(i), stride)
+
+        looks = ahead(look, own)
+        looked = progress(looks, total=len(own), label="fit: survey", unit="frames")
+        counts = [count for count in looked if count is not None]
         target, shown = follower.target_frames() if by_views else choose_target_frames(counts)
         observed = follower.chosen(options.seed)
         return {
