@@ -15,7 +15,9 @@ from usdbrdf.advice.choice import Choice, choose
 from usdbrdf.advice.free_space import Places, free_places
 from usdbrdf.advice.knowledge import (
     Exposure,
+    Lobes,
     Products,
+    coarser_than_reckoned,
     contrast,
     likely_lobes,
     lobes,
@@ -193,17 +195,7 @@ def survey_of(
     cameras = [frames.camera(i) for i in counted]
     exposures = [_exposure(frames, i) for i in counted]
     seen_by_frames(lit, spots, level, targets, cameras, exposures, seed)
-    targets = [
-        replace(
-            target,
-            holds=share_found(
-                known, target.likely, contrast(target.products, target.typical),
-                fits[target.index].evidence,
-            ),
-            samples=_samples(fits[target.index], target.products),
-        )
-        for target in targets
-    ]  # fmt: skip
+    targets = [_as_the_fit_found(target, known, fits[target.index]) for target in targets]
     coverage, first = atlas.coverage, spots.texel[:of_surface]
     clipped = coverage.clipped[first]
     looks, camera = all_looks(up), frames.camera(0)
@@ -224,6 +216,18 @@ def survey_of(
         camera=camera,
         exposures=_to_choose_from(frames, clipped=bool(clipped.any())),
     )
+
+
+def _as_the_fit_found(target: Target, known: Lobes, fit: FittedObject) -> Target:
+    """With what the fit made of the frames so far against what was reckoned."""
+    contrasts = contrast(target.products, target.typical)
+    found = replace(
+        target,
+        holds=share_found(known, target.likely, contrasts, fit.evidence),
+        samples=_samples(fit, target.products),
+    )
+    stated = fit.phi_error, fit.psi_error
+    return replace(found, coarser=coarser_than_reckoned(found.expected(known), *stated))
 
 
 def _samples(fit: FittedObject, products: Products) -> float:

@@ -8,6 +8,7 @@ from a place would tell, whatever the picture's borders, bounds them (M. Minoux,
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -67,11 +68,7 @@ class _State:
         self.before = [self._outlook(i) for i in range(len(survey.targets))]
 
     def _target(self, i: int) -> Target:
-        old = self.survey.targets[i]
-        return Target(
-            index=old.index, own=old.own, likely=old.likely, typical=old.typical,
-            products=self.products[i], holds=old.holds, samples=old.samples, sights=old.sights,
-        )  # fmt: skip
+        return replace(self.survey.targets[i], products=self.products[i])
 
     def _outlook(self, i: int, *more: tuple[Long, Double, Double]) -> Outlook:
         return self._target(i).expected(self.survey.lobes, *more)

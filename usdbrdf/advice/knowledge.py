@@ -168,6 +168,16 @@ def contrast(products: Products, typical: Double) -> Double:
     return total
 
 
+class Outlook(NamedTuple):
+    """What a fit is expected to tell: standard deviations of phi and psi, the probability that it
+    measures both, and how much is known in all, from 0 to 1."""
+
+    phi_error: float
+    psi_error: float
+    measured: float
+    worth: float
+
+
 def share_found(known: Lobes, likely: Double, contrasts: Double, evidence: float) -> float:
     """Of the contrast that is reckoned with, how much the fit found in the frames: its evidence,
     1 - unexplained / all, against the one that was to be expected. Patterns, curvature and poses
@@ -179,6 +189,17 @@ def share_found(known: Lobes, likely: Double, contrasts: Double, evidence: float
         return 1.0
     found = max(evidence, 0.0) / max(1 - evidence, 1e-3)
     return float(min((found + _NO_NEWS) / (reckoned + _NO_NEWS), 1.0))
+
+
+def coarser_than_reckoned(
+    reckoned: Outlook, phi_error: float, psi_error: float
+) -> tuple[float, float]:
+    """How many times larger the errors are that the fit states, NaN: none; at least once."""
+    pairs = (phi_error, reckoned.phi_error), (psi_error, reckoned.psi_error)
+    first, second = (
+        max(1.0, stated / max(own, 0.01)) if np.isfinite(stated) else 1.0 for stated, own in pairs
+    )
+    return first, second
 
 
 def reckoned_samples(products: Products) -> float:
@@ -193,19 +214,12 @@ def share_of_enough(products: Products, samples_per_reckoned: float) -> float:
     return min(1.0, samples_per_reckoned * reckoned / _ENOUGH) if reckoned else 0.0
 
 
-class Outlook(NamedTuple):
-    """What a fit is expected to tell: standard deviations of phi and psi, the probability that it
-    measures both, and how much is known in all, from 0 to 1."""
-
-    phi_error: float
-    psi_error: float
-    measured: float
-    worth: float
-
-
-def outlook(known: Lobes, likely: Double, contrasts: Double) -> Outlook:
+def outlook(
+    known: Lobes, likely: Double, contrasts: Double, coarser: tuple[float, float] = (1.0, 1.0)
+) -> Outlook:
     """The mean over lobes, as ``likely`` (H,) as they are, of what the fit would find were they
-    true; contrasts (K, K)."""
+    true; contrasts (K, K); coarser: how many times larger the errors of phi and psi are than they
+    are reckoned."""
     products = known.combination @ contrasts @ known.combination.T
     own = np.maximum(np.diag(products), 0)
     apart = np.maximum(own[:, None] + own[None] - 2 * products, 0)
@@ -218,8 +232,9 @@ def outlook(known: Lobes, likely: Double, contrasts: Double) -> Outlook:
     ]
     evidence = own / (1 + own)
     unexplained = (1 - evidence) / np.maximum(evidence, 1e-6)
-    of_phi = np.minimum(errors[0] * np.sqrt(1 + UNEXPLAINED * unexplained), NOTHING_KNOWN)
-    of_psi = np.minimum(errors[1], NOTHING_KNOWN)
+    errors[0] *= coarser[0] * np.sqrt(1 + UNEXPLAINED * unexplained)
+    errors[1] *= coarser[1]
+    of_phi, of_psi = (np.minimum(error, NOTHING_KNOWN) for error in errors)
     measured = (evidence >= MIN_EVIDENCE) & (known.psi > of_psi)
     measured &= (of_phi <= MAX_PHI_ERROR) & (of_psi <= MAX_PSI_ERROR)
     probability = float(likely @ measured)

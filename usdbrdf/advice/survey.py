@@ -45,6 +45,7 @@ class Target:
     products  what the frames so far tell
     holds     the share of the reckoned contrast that the fit found in the frames so far
     samples   how many samples the fit had for each that is reckoned with
+    coarser   how many times larger the fit's errors of phi and psi are than they are reckoned
     sights    of each place that sees it: which of its points, (M,), and their basis (M, K)
     """
 
@@ -55,6 +56,7 @@ class Target:
     products: Products
     holds: float = 1.0
     samples: float = 1.0
+    coarser: tuple[float, float] = (1.0, 1.0)
     sights: dict[int, tuple[Long, Double]] = field(default_factory=dict)
 
     def expected(self, known: Lobes, *more: tuple[Long, Double, Double]) -> Outlook:
@@ -66,7 +68,8 @@ class Target:
             for which, weight, basis in more:
                 products.add(which, weight, basis)
         holds = self.holds * share_of_enough(products, self.samples)
-        return outlook(known, self.likely, holds * contrast(products, self.typical))
+        contrasts = holds * contrast(products, self.typical)
+        return outlook(known, self.likely, contrasts, self.coarser)
 
 
 @dataclass(frozen=True, kw_only=True)
