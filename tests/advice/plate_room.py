@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.physics.brdf import f_nd
 from tests.scenes import camera_at, look_at, write_ply
 from usdbrdf.files.images import write_exr
 from usdbrdf.transport.rays import RayScene
@@ -119,18 +120,27 @@ def write_capture(folder: Path) -> Path:
     return folder
 
 
-def mirrors_the_lamp(eye, around: float = 0.5) -> float:
-    """Share of the plate's front on which a camera at ``eye`` (3,) sees the lamp, or what is so
-    many metres ``around`` it, for a lobe has some width; by the lamp's mirror image: the sight line
-    through a point of the plate goes on to it."""
+def highlight(eye, phi: float = 0.25, psi: float = 0.5) -> float:
+    """Mean radiance that the plate's front would send to ``eye`` (3,) of the lamp's light by a lobe
+    of the paper, written out: the lamp is a grid of small areas."""
     if eye[0] <= PLATE_X:
         return 0.0
-    y, z = np.meshgrid(np.linspace(*PLATE_Y, 21), np.linspace(*PLATE_Z, 21))
-    # In the plane y = LAMP_Y behind the plate, where the mirrored lamp is.
-    t = (LAMP_Y - eye[1]) / np.where(np.abs(y - eye[1]) < 1e-9, 1e-9, y - eye[1])
-    x = eye[0] + t * (PLATE_X - eye[0])
-    up = eye[2] + t * (z - eye[2])
-    image = 2 * PLATE_X - x
-    hit = (t > 1) & (image > LAMP_X[0] - around) & (image < LAMP_X[1] + around)
-    hit &= (up > LAMP_Z[0] - around) & (up < LAMP_Z[1] + around)
-    return float(hit.mean())
+    y, z = (
+        grid.ravel() for grid in np.meshgrid(np.linspace(*PLATE_Y, 9), np.linspace(*PLATE_Z, 9))
+    )
+    plate = np.stack([np.full(y.size, PLATE_X), y, z], axis=1)[:, None]
+    x, z = (grid.ravel() for grid in np.meshgrid(_at(LAMP_X, steps), _at(LAMP_Z, steps)))
+    lamp = np.stack([x, np.full(x.size, LAMP_Y), z], axis=1)[None]
+    to_lamp, to_eye = lamp - plate, eye - plate
+    far = np.linalg.norm(to_lamp, axis=-1)
+    w = to_lamp / far[..., None]
+    wo = to_eye / np.linalg.norm(to_eye, axis=-1, keepdims=True)
+    n = np.array([1.0, 0, 0])
+    reflected = f_nd(np.broadcast_to(n, w.shape), w, np.broadcast_to(wo, w.shape), phi, psi)
+    area = (LAMP_X[1] - LAMP_X[0]) * (LAMP_Z[1] - LAMP_Z[0]) / x.size
+    light = RADIANCE["lamp"] * np.maximum(w[..., 0], 0) * w[..., 1] * area / far**2
+    return float((reflected * light).sum(axis=1).mean())
+
+
+def _at(ends, steps):
+    return ends[0] + (ends[1] - ends[0]) * steps
