@@ -125,9 +125,8 @@ def highlight(eye, phi: float = 0.25, psi: float = 0.5) -> float:
     of the paper, written out: the lamp is a grid of small areas."""
     if eye[0] <= PLATE_X:
         return 0.0
-    y, z = (
-        grid.ravel() for grid in np.meshgrid(np.linspace(*PLATE_Y, 9), np.linspace(*PLATE_Z, 9))
-    )
+    steps = np.linspace(0, 1, 9)
+    y, z = (grid.ravel() for grid in np.meshgrid(_at(PLATE_Y, steps), _at(PLATE_Z, steps)))
     plate = np.stack([np.full(y.size, PLATE_X), y, z], axis=1)[:, None]
     x, z = (grid.ravel() for grid in np.meshgrid(_at(LAMP_X, steps), _at(LAMP_Z, steps)))
     lamp = np.stack([x, np.full(x.size, LAMP_Y), z], axis=1)[None]
