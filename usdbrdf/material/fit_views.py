@@ -40,8 +40,8 @@ _KEPT = calibration.number("fit.kept_in_footprint")
 _SPREAD_OF_WIDTHS = math.log(calibration.number("fit.spread_of_footprints"))
 _CURVED = calibration.number("fit.curved_from")
 MIN_OBSERVATIONS = calibration.count("fit.min_observations")
-_MIN_VIEWS = calibration.count("fit.min_views")
-_ABOVE_NOISE = calibration.number("fit.above_noise")
+MIN_VIEWS = calibration.count("fit.min_views")
+ABOVE_NOISE = calibration.number("fit.above_noise")
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
@@ -306,12 +306,12 @@ def _clear_of_noise(observed: Observations) -> Bool:
     texel = np.unique(observed.texel, return_inverse=True)[1]
     count = np.bincount(texel)
     mean = [np.bincount(texel, channel) / count for channel in observed.radiance.T]
-    return np.asarray(np.min(mean, axis=0)[texel] > _ABOVE_NOISE * observed.noise, np.bool_)
+    return np.asarray(np.min(mean, axis=0)[texel] > ABOVE_NOISE * observed.noise, np.bool_)
 
 
 def _several_views(texel: Int) -> Bool:
     number = np.unique(texel, return_inverse=True)[1]
-    return np.asarray(np.bincount(number)[number] >= _MIN_VIEWS, np.bool_)
+    return np.asarray(np.bincount(number)[number] >= MIN_VIEWS, np.bool_)
 
 
 def _pixel_size(position: Float, frame: Int, camera_of: Callable[[int], Camera]) -> float:
