@@ -9,6 +9,10 @@ BSDF in Python runs only in Mitsuba's vectorised variants. On Debian or Ubuntu:
     python samples/make_study.py --check          # the BSDF against plain NumPy
     python samples/make_study.py                  # rewrites samples/study
     python samples/make_study.py --samples 16 --output out/draft
+    python samples/make_study.py --poses POSES.json --output out/more
+
+The last photographs the room from other poses: a document like transforms.json, whose frames have
+``transform_matrix`` and ``exposure_time``; written are these frames alone.
 
 ``study_scene`` holds the room, built of ``study_shapes``; ``study_brdf`` the BRDF;
 ``study_camera`` the camera and its sensor.
@@ -20,7 +24,7 @@ import argparse
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -45,6 +49,17 @@ SEED = 20
 SAMPLES_PER_PASS = 256  # bounds the memory of the vectorised path tracer
 MAX_DEPTH = 14  # path vertices
 ROULETTE_DEPTH = 4
+
+
+class Lens(NamedTuple):
+    """Of a camera whose principal point is the middle, in pixels."""
+
+    width: int
+    height: int
+    focal: float
+
+
+STUDY = Lens(WIDTH, HEIGHT, FOCAL)
 
 
 def mitsuba_shape(item: StudyObject) -> mi.Mesh:
@@ -76,7 +91,9 @@ def mitsuba_scene(objects: list[StudyObject]) -> mi.Scene:
     return mi.load_dict(scene)
 
 
-def render(scene: mi.Scene, world_from_camera: Array, samples: int, seed: int) -> Array:
+def render(
+    scene: mi.Scene, world_from_camera: Array, samples: int, seed: int, lens: Lens = STUDY
+) -> Array:
     """(H, W, 3) mean radiance over each pixel's square, from ``samples`` paths per pixel."""
     # Mitsuba's cameras look down +z with x to the left.
     pose = world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -84,22 +101,22 @@ def render(scene: mi.Scene, world_from_camera: Array, samples: int, seed: int) -
         {
             "type": "perspective",
             "fov_axis": "x",
-            "fov": float(np.degrees(2 * np.arctan(WIDTH / 2 / FOCAL))),
+            "fov": float(np.degrees(2 * np.arctan(lens.width / 2 / lens.focal))),
             "near_clip": 0.01,
             "far_clip": 100.0,
             "to_world": mi.ScalarTransform4f(pose),
             "sampler": {"type": "multijitter"},
             "film": {
                 "type": "hdrfilm",
-                "width": WIDTH,
-                "height": HEIGHT,
+                "width": lens.width,
+                "height": lens.height,
                 "pixel_format": "rgb",
                 "component_format": "float32",
                 "rfilter": {"type": "box"},
             },
         }
     )
-    total = np.zeros((HEIGHT, WIDTH, 3))
+    total = np.zeros((lens.height, lens.width, 3))
     passes = max(1, round(samples / SAMPLES_PER_PASS))
     for k in range(passes):
         image = mi.render(scene, sensor=sensor, spp=samples // passes, seed=seed * 1000 + k)
@@ -164,13 +181,20 @@ def capture_header() -> dict[str, Any]:
     }
 
 
-def write_frames(folder: Path, scene: mi.Scene, samples: int) -> None:
+def write_frames(
+    folder: Path,
+    scene: mi.Scene,
+    samples: int,
+    poses: list[tuple[Array, float]],
+    seed: int = SEED,
+    lens: Lens = STUDY,
+) -> list[dict[str, Any]]:
+    """Photographs from poses (4, 4), each with its exposure in seconds; returns their records."""
     records = []
-    for k, pose in enumerate(frame_poses()):
-        exposure = EXPOSURES[k % len(EXPOSURES)]
-        clean = render(scene, pose, samples, seed=SEED + k)
+    for k, (pose, exposure) in enumerate(poses):
+        clean = render(scene, pose, samples, seed=seed + k, lens=lens)
         name = f"frames/{k:04d}.exr"
-        rng = np.random.default_rng([SEED, k])
+        rng = np.random.default_rng([seed, k])
         write_exr(folder / name, photograph(clean, exposure, rng), exposure)
         records.append(
             {
@@ -181,8 +205,13 @@ def write_frames(folder: Path, scene: mi.Scene, samples: int) -> None:
                 "noise_floor_radiance": noise_floor_radiance(exposure),
             }
         )
-    header = capture_header() | {"mesh": "mesh.ply", "objects": "objects.json"}
-    write_json(folder / "transforms.json", header | {"frames": records})
+    return records
+
+
+def poses_of(document: Path) -> list[tuple[Array, float]]:
+    """Those of a document like transforms.json."""
+    frames = json.loads(document.read_text("utf-8"))["frames"]
+    return [(np.array(f["transform_matrix"], np.float64), f["exposure_time"]) for f in frames]
 
 
 def write_held_out(folder: Path, scene: mi.Scene, samples: int) -> None:
@@ -199,19 +228,34 @@ def main() -> None:
     default = Path(__file__).resolve().parent / "study"
     parser.add_argument("--output", type=Path, default=default, help="folder (%(default)s)")
     parser.add_argument("--samples", type=int, default=256, help="paths per pixel (%(default)s)")
+    parser.add_argument("--poses", type=Path, help="photograph from these alone")
     parser.add_argument("--check", action="store_true", help="only check the BSDF")
     options = parser.parse_args()
     if options.check:
         print("\n".join(study_brdf.check_brdf()))
         return
+    if options.poses and options.output == default:
+        parser.error("--poses: name another folder with --output.")
     start = time.monotonic()
+    if options.poses:
+        (options.output / "frames").mkdir(parents=True)
+        scene = mitsuba_scene(study_objects())
+        # Random numbers of their own: the same noise as in the sample's frames would be no noise.
+        records = write_frames(
+            options.output, scene, options.samples, poses_of(options.poses), SEED + 5000
+        )
+        write_json(options.output / "transforms.json", capture_header() | {"frames": records})
+        return
     for folder in ("frames", "truth"):
         (options.output / folder).mkdir(parents=True, exist_ok=True)
     objects = study_objects()
     write_mesh(options.output / "mesh.ply", objects)
     write_objects(options.output, objects)
     scene = mitsuba_scene(objects)
-    write_frames(options.output, scene, options.samples)
+    poses = [(pose, EXPOSURES[k % len(EXPOSURES)]) for k, pose in enumerate(frame_poses())]
+    records = write_frames(options.output, scene, options.samples, poses)
+    header = capture_header() | {"mesh": "mesh.ply", "objects": "objects.json"}
+    write_json(options.output / "transforms.json", header | {"frames": records})
     write_held_out(options.output, scene, 8 * options.samples)
     files = [p for p in options.output.rglob("*") if p.is_file()]
     size = sum(p.stat().st_size for p in files) / 1e6

@@ -30,7 +30,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 GROUND = {"ahead", "calibration", "errors", "identity", "kernel", "option", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
-READERS = {"delivery", "evaluation", "page", "relighting", "validation"}
+READERS = {"advice", "delivery", "evaluation", "page", "relighting", "validation"}
 
 ARROWS: dict[str, set[str]] = {
     "ahead": set(),
@@ -58,6 +58,8 @@ ARROWS: dict[str, set[str]] = {
     "warm_up": {"pipeline"},
     "delivery": {"asset"},
     "evaluation": {"asset"},
+    # Reckons with the light, the lobes and the errors that the fit does.
+    "advice": {"evaluation", "material"},
     # Shows what others measure and pack; the evidence is the method's own residual.
     "page": {"delivery", "evaluation", "material"},
     "relighting": {"asset"},

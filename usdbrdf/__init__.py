@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
+    from usdbrdf.advice.advise import advise as advise
     from usdbrdf.delivery.package import package as package
     from usdbrdf.delivery.publish import publish as publish
     from usdbrdf.evaluation.compare_assets import compare as compare
     from usdbrdf.evaluation.evaluate_views import evaluate as evaluate
+    from usdbrdf.options import AdviseOptions as AdviseOptions
     from usdbrdf.options import CompareOptions as CompareOptions
     from usdbrdf.options import ConvertOptions as ConvertOptions
     from usdbrdf.options import EvaluateOptions as EvaluateOptions
@@ -43,12 +45,13 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "usdbrdf.options": (
-        *("CompareOptions", "ConvertOptions", "EvaluateOptions", "FitOptions"),
+        *("AdviseOptions", "CompareOptions", "ConvertOptions", "EvaluateOptions", "FitOptions"),
         *("IngestOptions", "Insert"),
         *("PackageOptions", "PublishOptions", "RelightOptions", "ReportOptions"),
         *("Sampling", "ShadeOptions", "TextureOptions"),
     ),
     "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
+    "usdbrdf.advice.advise": ("advise",),
     "usdbrdf.delivery.package": ("package",),
     "usdbrdf.delivery.publish": ("publish",),
     "usdbrdf.evaluation.compare_assets": ("compare",),

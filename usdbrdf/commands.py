@@ -326,12 +326,9 @@ class Publish(_Locking, _WithAsset):
         with loading():
             from usdbrdf.delivery.publish import publish
         summary = publish(
-            self.asset,
-            self.destination,
-            self.options,
-            wait_s=self.wait_s,
+            self.asset, self.destination, self.options, wait_s=self.wait_s,
             without_lock=self.without_lock,
-        )
+        )  # fmt: skip
         done = f"written, {summary['files']} files, {summary['bytes']:,} bytes"
         told = done if summary["new"] else "holds this already, nothing was written"
         return self.told(summary, f"{summary['publish']}: {told}")
@@ -350,6 +347,21 @@ class Report(_WithAsset):
         with self.reading(self.asset):
             summary = report(self.asset, self.output, self.options)
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
+
+
+class Advise(_Locking, _Talking):
+    """Say what to photograph next, as guide cameras in a layer of their own."""
+
+    asset: Path = option("ASSET", REQUIRED)
+    "asset folder; only layers/advice.usda in it is written"
+    options: options.AdviseOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.advice.advise import advise
+            from usdbrdf.advice.words import lines
+        found = advise(self.asset, self.options, wait_s=self.wait_s, without_lock=self.without_lock)
+        return self.told(found, *lines(found))
 
 
 class View(_WithAsset):
@@ -477,22 +489,9 @@ class PluginPath(Command):
 
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
-    MergeBrackets,
-    DevelopRaw,
-    Evaluate,
-    Compare,
-    Relight,
-    Package,
-    Publish,
-    Report,
-    View,
-    Validate,
-    Rules,
-    Adapters,
-    Doctor,
-    Completion,
-    PluginPath,
-)
+    MergeBrackets, DevelopRaw, Evaluate, Compare, Relight, Package, Publish, Report, View,
+    Advise, Validate, Rules, Adapters, Doctor, Completion, PluginPath,
+)  # fmt: skip
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
     for command in (*_TASKS, *_OTHERS)

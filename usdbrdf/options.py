@@ -465,3 +465,27 @@ class ReportOptions(Options):
         super().__post_init__()
         if self.views is not None and self.evaluation is not None:
             raise UsageError("--views, --evaluation: they exclude each other. [usage.option]")
+
+
+class AdviseOptions(Options):
+    """What may be photographed next."""
+
+    poses: int = option("--poses N", 6, (1, 100))
+    "photographs to advise, the most telling first"
+    lowest: float = option("--lowest M", 0.5, (0, 100))
+    "least height of the camera above the floor of a room, in metres"
+    highest: float = option("--highest M", 2.0, (0, 100))
+    "greatest height of the camera above the floor of a room, in metres"
+    clearance: float = option("--clearance M", 0.25, (0.01, 10))
+    "from the camera to any surface, in metres"
+    environment: Surroundings = _environment()
+    lighting: str | None = _lighting()
+    seed: int = _seed()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lowest >= self.highest:
+            raise UsageError(
+                f"--lowest {self.lowest:g}, --highest {self.highest:g}: the former must be less. "
+                "[usage.option]"
+            )

@@ -130,6 +130,12 @@ class Asset:
         whoever wants to see them adds it as a sublayer."""
         return self.folder / "layers" / "photographs.usdc"
 
+    @property
+    def advice_layer(self) -> Path:
+        """What to photograph next, where somebody asked. No layer names it, as with the
+        photographs."""
+        return self.folder / "layers" / f"advice{self._of_lighting}.usda"
+
     def interface(self, role: str) -> Path:
         """What applications see of a task's layer before they load the payload."""
         return self.folder / "layers" / f"{self.layer(role).stem}.interface.usda"

@@ -29,7 +29,8 @@ from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import CONDUCTOR, PAPER
+from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
+from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
 
@@ -39,8 +40,8 @@ _KEPT = calibration.number("fit.kept_in_footprint")
 _SPREAD_OF_WIDTHS = math.log(calibration.number("fit.spread_of_footprints"))
 _CURVED = calibration.number("fit.curved_from")
 MIN_OBSERVATIONS = calibration.count("fit.min_observations")
-_MIN_VIEWS = calibration.count("fit.min_views")
-_ABOVE_NOISE = calibration.number("fit.above_noise")
+MIN_VIEWS = calibration.count("fit.min_views")
+ABOVE_NOISE = calibration.number("fit.above_noise")
 # Of curved objects few samples tell: their lobes and lights get so many times the rays.
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
@@ -87,14 +88,34 @@ class SampledObject(NamedTuple):
             lobe_basis(part.lit, part.footprints[width], len(stream), seed, self.mixture, stream)
             for part, stream in zip(self.parts, streams, strict=True)
         ]
-        if len(of_parts) == 1:
-            return of_parts[0]
 
         def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
             bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
-            return np.concatenate(bases), np.concatenate(slopes)
+            base, slope = np.concatenate(bases), np.concatenate(slopes)
+            if kind != DIELECTRIC:
+                return base, slope
+            kept = kept_below(phis, self._cosine(width))
+            taken = self._mean_of_texel[..., None] * np.stack(kept)[:, :, None]
+            return base - taken[0], slope - taken[1]
 
         return basis
+
+    def _cosine(self, width: int) -> Float:
+        """(P,): of the angle between the normal and the camera, the mean over the footprint."""
+        found = []
+        for part in self.parts:
+            points = part.footprints[width]
+            cosine = (points.normal * points.to_camera).sum(axis=1)
+            found.append(cosine.reshape(len(part.observed.texel), -1).mean(axis=1))
+        return np.concatenate(found)
+
+    @property
+    def _mean_of_texel(self) -> Float:
+        """(P, 3) W/(m^2 sr): about its diffuse radiance, what the lobe adds being much less."""
+        texel, radiance = self.samples.texel, self.samples.radiance
+        sums = np.stack([np.bincount(texel, channel) for channel in radiance.T], axis=1)
+        means: Float = (sums / np.bincount(texel)[:, None])[texel].astype(np.float32)
+        return means
 
     @property
     def irradiance(self) -> Float | None:
@@ -285,12 +306,12 @@ def _clear_of_noise(observed: Observations) -> Bool:
     texel = np.unique(observed.texel, return_inverse=True)[1]
     count = np.bincount(texel)
     mean = [np.bincount(texel, channel) / count for channel in observed.radiance.T]
-    return np.asarray(np.min(mean, axis=0)[texel] > _ABOVE_NOISE * observed.noise, np.bool_)
+    return np.asarray(np.min(mean, axis=0)[texel] > ABOVE_NOISE * observed.noise, np.bool_)
 
 
 def _several_views(texel: Int) -> Bool:
     number = np.unique(texel, return_inverse=True)[1]
-    return np.asarray(np.bincount(number)[number] >= _MIN_VIEWS, np.bool_)
+    return np.asarray(np.bincount(number)[number] >= MIN_VIEWS, np.bool_)
 
 
 def _pixel_size(position: Float, frame: Int, camera_of: Callable[[int], Camera]) -> float:

@@ -114,9 +114,9 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=150, always=24)
-_RELATIVE_ERROR = calibration.number("refine.relative_error")
+RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
-_OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
+OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 _DARKEST = calibration.number("refine.darkest")
 
 
@@ -301,11 +301,11 @@ def _means_without_lobes(
             specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
             covered = footprints(texels, texel, camera)
             unit = level[texel] * _let_through(lit, of_texel, texel, camera.eye)
-            noise = np.float32(_OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
+            noise = np.float32(OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
             of_lobe = _OF_LOBE * np.abs(specular).mean(axis=1) / unit
             # A wide view of a texel says less of it than its noise tells.
             wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-            error = np.sqrt(_RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
+            error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
             deviation = np.asarray(error * wide, np.float32)
             values = (some.radiance[taken] - specular) / unit[:, None]
             update(observed, texel - np.int32(part.start), values, deviation, covered)

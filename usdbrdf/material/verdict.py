@@ -17,9 +17,9 @@ from usdbrdf.transport.brdf import F0_OF_PSI
 _PSI_GRID = np.linspace(0, 1, 201)
 # What an estimate says of the posterior beside its least cost.
 POSTERIOR = ("phi_median", "psi_median", "psi_upper")
-_MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
+MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
-_NO_LOBE = calibration.number("fit.no_lobe")
+NO_LOBE = calibration.number("fit.no_lobe")
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 
@@ -67,7 +67,7 @@ def lobe_from_costs(
     surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
     # Where rays are noisy, what they show is badly known as well, as the place of a mirrored lamp.
     noise_ratio = max(1.0, noisy / max(least, 1e-12))
-    temper = max(1.0, _MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
+    temper = max(1.0, MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
     lowest = min(float(surface.min()), without)
     density = np.exp(-0.5 * (surface - lowest) / temper)
     density *= np.gradient(phis)[:, None]
@@ -80,7 +80,7 @@ def lobe_from_costs(
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
     psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (0.5, 0.95))
-    psi_median = 0.0 if none > _NO_LOBE else psi_median
+    psi_median = 0.0 if none > NO_LOBE else psi_median
     (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
@@ -111,7 +111,7 @@ def averaged(
     samples were asked, ``likely``, and with them. Cost and evidence are the best one's."""
     costs = np.array([estimate.cost * max(freedom, 1) for estimate in estimates])
     least = float(costs.min())
-    weight = np.exp(-0.5 * (costs - least) / max(1.0, _MODEL_DISCREPANCY * least))
+    weight = np.exp(-0.5 * (costs - least) / max(1.0, MODEL_DISCREPANCY * least))
     weight *= np.array(likely)
     weight /= weight.sum()
 
@@ -171,7 +171,7 @@ MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
-_UNEXPLAINED = calibration.number("verdict.unexplained_in_phi")
+UNEXPLAINED = calibration.number("verdict.unexplained_in_phi")
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
@@ -213,7 +213,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
         return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
-    phi_error = lobe.phi_error * math.sqrt(1 + _UNEXPLAINED * unexplained)
+    phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)
     phi_error = min(math.hypot(phi_error, lobe.unresolved), NOTHING_KNOWN)
     psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 

@@ -65,18 +65,26 @@ def frame_rows(frames: Frames) -> list[dict[str, Any]]:
     return rows
 
 
-def room_map(atlas: AssetMaps, lit: LitScene, colours: Float, up_axis: str) -> dict[str, Any]:
+def room_map(
+    atlas: AssetMaps,
+    lit: LitScene,
+    colours: Float,
+    up_axis: str,
+    advised: Sequence[Mapping[str, Any]] = (),
+) -> dict[str, Any]:
     """The room from above, cut open at the cameras' height, and where the cameras stood on that
     picture: x, y as shares of width and height, and the direction that they looked in, in the
     same, of unit length.
 
     colours  (T, 3), linear
+    advised  poses of photographs to come, which are told of in the same way
     """
     up = 2 if up_axis == "Z" else 1
     # On the map right and down, so that it is no mirror image: x and -y, or x and z.
     right, down, sign = (0, 1, -1.0) if up == 2 else (0, 2, 1.0)
     poses = atlas.frames.world_from_camera
-    eyes, looks = poses[:, :3, 3], -poses[:, :3, 2]
+    eyes = np.array([*poses[:, :3, 3], *(pose["eye"] for pose in advised)], np.float64)
+    looks = np.array([*-poses[:, :3, 2], *(pose["direction"] for pose in advised)], np.float64)
     plan = np.stack([eyes[:, right], sign * eyes[:, down]], axis=1)
     points = atlas.scene.points
     across = np.concatenate([np.stack([points[:, right], sign * points[:, down]], axis=1), plan])
@@ -86,7 +94,7 @@ def room_map(atlas: AssetMaps, lit: LitScene, colours: Float, up_axis: str) -> d
     size = high - low
     width = _MAP_WIDTH
     height = int(np.clip(round(width * size[1] / max(size[0], 1e-9)), 40, 2 * width))
-    level = float(np.median(eyes[:, up]))
+    level = float(np.median(poses[:, up, 3]))
     picture = _from_above(
         lit, colours, (low, size), (height, width), (right, down, up, sign, level)
     )
@@ -95,7 +103,8 @@ def room_map(atlas: AssetMaps, lit: LitScene, colours: Float, up_axis: str) -> d
     place = (plan - low) / size
     cameras = np.concatenate([place, direction], axis=1).round(4).tolist()
     return {
-        "picture": data_uri(picture), "width": width, "height": height, "cameras": cameras,
+        "picture": data_uri(picture), "width": width, "height": height,
+        "cameras": cameras[: len(poses)], "advised": cameras[len(poses) :],
         "metres": [round(float(n), 2) for n in size],
     }  # fmt: skip
 

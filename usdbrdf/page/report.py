@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps, camera_hits
@@ -115,7 +116,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
-    frames, found = atlas.frames, summaries(place)
+    frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
     pictures = options.photographs
@@ -148,7 +149,13 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             if pictures or not any(path.name in sentence for path in frames.image_paths)
         ],
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
-        "map": room_map(atlas, seen.lit, atlas.map_where_present(colours, 3), up_axis),
+        "map": room_map(
+            atlas,
+            seen.lit,
+            atlas.map_where_present(colours, 3),
+            up_axis,
+            advice[0] if advice else (),
+        ),
         "objects": object_rows(
             atlas, seen, known, where, chosen, photographs=pictures, seed=options.seed
         ),
@@ -156,6 +163,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
         "plot": models_only(rows),
         "maps": _maps(atlas, seen, known, _overviews(views.frames)),
         "room": room_model(place, atlas, up_axis),
+        "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
         **reviewed(place),
     }
 

@@ -63,12 +63,35 @@
         el('line', { x1: cx, y1: cy, x2: cx + long * dx, y2: cy + long * dy, stroke: '#0b5cad', 'stroke-width': 1.5 }),
         el('circle', { cx, cy, r: 3.4, fill: '#ffb000', stroke: '#000', 'stroke-width': 0.8 }));
     });
+    marks.push(...map.advised.map(([x, y, dx, dy], i) => {
+      const [cx, cy] = [x * map.width, y * map.height];
+      return el('g', {},
+        el('title', {}, `Advised photograph ${i + 1}`),
+        el('line', { x1: cx, y1: cy, x2: cx + 1.6 * long * dx, y2: cy + 1.6 * long * dy, stroke: '#fff', 'stroke-width': 4 }),
+        el('line', { x1: cx, y1: cy, x2: cx + 1.6 * long * dx, y2: cy + 1.6 * long * dy, stroke: '#b3261e', 'stroke-width': 2 }),
+        el('circle', { cx, cy, r: 8, fill: '#b3261e', stroke: '#fff', 'stroke-width': 1 }),
+        el('text', { x: cx, y: cy + 3.6, fill: '#fff', 'font-size': 10, 'text-anchor': 'middle' }, String(i + 1)));
+    }));
     $('map').append(
       el('svg', {
         viewBox: `0 0 ${map.width} ${map.height}`, role: 'img', width: map.width,
         'aria-label': `Map of the room from above, with ${map.cameras.length} cameras and the directions they look in`,
       }, el('image', { href: map.picture, width: map.width, height: map.height }), ...marks),
-      el('figcaption', {}, `From above, cut at the cameras\u2019 height: ${map.metres.map(metres).join(' \u00d7 ')}. Dots: cameras; lines: where they look.`));
+      el('figcaption', {}, `From above, cut at the cameras\u2019 height: ${map.metres.map(metres).join(' \u00d7 ')}. Dots: cameras; lines: where they look.${map.advised.length ? ' Numbers: photographs that are advised.' : ''}`));
+  }
+
+  function advice() {
+    const { advice: found } = data;
+    if (!found) {
+      $('advised').append(el('p', { class: 'soft' }, 'Nobody asked yet: usdbrdf advise says which photographs would tell most.'));
+      return;
+    }
+    if (!found.current) {
+      $('advised').append(el('p', { class: 'warning' }, 'The asset has changed since: ask usdbrdf advise again.'));
+    }
+    $('advised').append(
+      el('p', { class: 'soft' }, 'The most telling first, each with what it adds to those before it. Numbers as on the map.'),
+      el('ol', {}, ...found.poses.map((pose) => el('li', {}, el('strong', {}, pose.where), ' ', pose.reason))));
   }
 
   function frameChart(title, unit, value, logarithmic) {
@@ -560,6 +583,7 @@
   }
 
   capture();
+  advice();
   objects();
   views();
   maps();

@@ -1,0 +1,87 @@
+"""Where cameras can stand, against distances that another program measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from tests.advice.plate_room import CABINET, ROOM, frame_poses, mesh
+from usdbrdf.advice.free_space import free_places, is_enclosed, surface_samples
+from usdbrdf.transport.rays import RayScene
+
+CLEARANCE = 0.3
+
+
+@pytest.fixture(scope="module")
+def room():
+    points, triangles, _, _ = mesh()
+    return points, triangles, RayScene(points, triangles)
+
+
+@pytest.fixture(scope="module")
+def eyes():
+    return np.array([pose[:3, 3] for pose in frame_poses()])
+
+
+def test_places_are_clear_reached_and_at_a_persons_height(room, eyes):
+    points, triangles, rays = room
+    found = free_places(rays, eyes, 2, heights=(0.8, 1.7), clearance=CLEARANCE, count=60)
+    assert found.in_room
+    assert len(found.eye) == 60
+    surface = trimesh.Trimesh(points, triangles, process=False)
+    distance = cKDTree(trimesh.sample.sample_surface(surface, 400_000, seed=1)[0]).query(found.eye)[
+        0
+    ]
+    assert distance.min() >= CLEARANCE
+    low, high = np.array(CABINET)
+    assert not ((found.eye > low) & (found.eye < high)).all(axis=1).any()
+    assert ((found.eye > 0) & (found.eye < ROOM)).all()
+    assert ((found.eye[:, 2] >= 0.8) & (found.eye[:, 2] <= 1.7)).all()
+    # Over all of the room, not about its middle alone.
+    assert np.ptp(found.eye[:, 0]) > 2.8
+    assert np.ptp(found.eye[:, 1]) > 2.0
+
+
+def test_a_wall_across_keeps_cameras_on_their_side(room, eyes):
+    points, triangles, _ = room
+    x, (_, y, z) = 2.6, ROOM
+    wall = np.array([[x, 0, 0], [x, y, 0], [x, y, z], [x, 0, z]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(points)
+    rays = RayScene(np.concatenate([points, wall]), np.concatenate([triangles, faces]))
+    here = eyes[eyes[:, 0] < x - 0.3]
+    found = free_places(rays, here, 2, heights=(0.5, 2.0), clearance=CLEARANCE, count=50)
+    assert len(found.eye) > 10
+    assert found.eye[:, 0].max() < x - CLEARANCE
+
+
+def test_around_an_object_as_far_away_as_the_cameras_were():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    rays = RayScene(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    turn = np.linspace(0, 2 * np.pi, 9)[:-1]
+    eyes = np.stack([1.2 * np.cos(turn), 1.2 * np.sin(turn), 0.1 + 0.05 * np.arange(8)], axis=1)
+    assert not is_enclosed(rays, eyes)
+    found = free_places(rays, eyes, 2, heights=(0.5, 2.0), clearance=0.2, count=40)
+    assert not found.in_room
+    away = np.linalg.norm(found.eye, axis=1) - 0.3
+    assert len(found.eye) == 40
+    assert away.min() > 0.6
+    assert away.max() < 1.2
+    assert ((found.eye[:, 2] >= 0.09) & (found.eye[:, 2] <= 0.46)).all()
+    assert np.isnan(found.height).sum() > 20  # there is no ground beside the ball
+
+
+def test_where_there_is_no_room_there_is_no_place(room, eyes):
+    found = free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=2.0, count=50)
+    assert len(found.eye) == 0
+
+
+def test_samples_lie_as_close_as_is_asked(room):
+    points, triangles, _ = room
+    samples = surface_samples(points, triangles, 0.1)
+    surface = trimesh.Trimesh(points, triangles, process=False)
+    anywhere = trimesh.sample.sample_surface(surface, 2000, seed=3)[0]
+    assert cKDTree(samples).query(anywhere)[0].max() <= 0.1
+    dense = cKDTree(trimesh.sample.sample_surface(surface, 400_000, seed=1)[0])
+    assert dense.query(samples)[0].max() < 0.08
