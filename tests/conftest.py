@@ -27,6 +27,7 @@ SLOW = (
     "evaluation",
     "faults/test_bad_captures.py",
     "faults/test_frames_that_disagree.py",
+    "faults/test_hostile_files.py",
     "faults/test_kill_resume.py",
     "job/test_child.py",
     "job/test_kill_resume.py",
@@ -57,6 +58,8 @@ SLOW = (
 
 # Sweeps whose cases take seconds each: every third runs for each change, the others at night.
 SWEEPS = (
+    "faults/test_hostile_files.py::test_a_promise_is_refused_and_not_made_room_for",
+    "faults/test_hostile_files.py::test_a_stage_that_leads_out_is_refused",
     "faults/test_kill_resume.py::test_killed_step_resumes_to_the_same_bytes",
     "job/test_kill_resume.py::test_killed_run_resumes_to_the_same_bytes",
     "job/test_kill_resume.py::test_full_disk_keeps_the_previous_asset_and_resumes",

@@ -73,7 +73,8 @@ def _in_child(
     """``read_here`` in a child."""
     refuse_nameless(path)
     # Absolute and without links.
-    allowed = [str(folder.resolve()) for folder in (path.resolve().parent, *allow)]
+    own = os.path.dirname(os.path.realpath(path))
+    allowed = [own, *(os.path.realpath(folder) for folder in allow)]
     parameters = {"reader": reader, "allowed": allowed}
     return read_in_child(
         "stage", f"{__name__}:read_here", path, returns, parts=parts, parameters=parameters
@@ -103,9 +104,15 @@ def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
 
 @contextmanager
 def _usd_errors(path: Path) -> Iterator[None]:
-    """USD's own errors become InputRefused."""
+    """USD's own errors become InputRefused, and text of the file that Python cannot hold."""
     try:
         yield
+    except UnicodeDecodeError as error:
+        shown = repr(error.object[max(error.start - 20, 0) : error.start + 20])
+        raise InputRefused(
+            f"{path}: a name or a path in it is not UTF-8 ({shown}), so no program can be told of "
+            "it. Rename it, or export the file again. [stage.input]"
+        ) from error
     except Tf.ErrorException as error:
         raise InputRefused(
             f"{path}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
@@ -128,15 +135,16 @@ def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
         for mesh in meshes
     ]
     points, triangles, face_object = joined([part[:2] for part in parts])
+    owner_of_face = []
     prims = [mesh.GetPrim() for mesh in meshes]
     split = [face_subsets(mesh) if subsets else [] for mesh in meshes]
     owners: list[Usd.Prim] = []
     for i, (mesh, own) in enumerate(zip(meshes, split, strict=True)):
         which = _subset_of_triangles(mesh, own, parts[i][3], time)
-        face_object[face_object == i] = len(owners) + np.where(which < 0, len(own), which)
+        owner_of_face.append(len(owners) + np.where(which < 0, len(own), which))
         owners += [*(subset.GetPrim() for subset in own), prims[i]]
     if any(split):  # a whole mesh is an object even without an area: the asset refers to it
-        used, numbered = np.unique(face_object, return_inverse=True)
+        used, numbered = np.unique(np.concatenate(owner_of_face), return_inverse=True)
         owners, face_object = [owners[i] for i in used.tolist()], numbered.astype(np.int32)
     labels = [prim.GetDisplayName() or prim.GetName() for prim in owners]
     identifiers = unique_identifiers(labels)
@@ -213,33 +221,63 @@ def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
     """The layers that ``path`` reaches, itself first; InputRefused unless every path in them stays
     in one of the ``allowed`` folders, which are absolute and without links.
 
-    Layers, references, payloads, of every variant, and asset-valued attributes count; links are
-    judged by where they lead. What a crafted crate file does to USD's own reader is not caught
-    here: call this in a child process.
+    Layers, references, payloads, of every variant, and asset-valued attributes count, in packages
+    too; links are judged by where they lead. What a crafted crate file does to USD's own reader is
+    not caught here: call this in a child process.
     """
-    waiting, seen, total = [path.resolve()], list[Path](), 0
+    waiting, seen, total = [str(path.resolve())], list[str](), 0
     while waiting:
         layer = waiting.pop()
         if layer in seen:
             continue
         seen.append(layer)
-        total += layer.stat().st_size
+        total += 0 if Ar.IsPackageRelativePath(layer) else Path(layer).stat().st_size
         if len(seen) > _MAX_LAYERS or total > LIMITS["stage"].file_bytes:
             raise InputRefused(
                 f"{path}: more than {_MAX_LAYERS} layers or {LIMITS['stage'].file_bytes} bytes of "
                 "layers. Flatten the stage, or name the part that was captured. [stage.input_size]"
             )
-        package = Sdf.ZipFile.Open(str(layer)) if layer.suffix.lower() == ".usdz" else None
-        for name in package.GetFileNames() if package else ():
-            if name.startswith(("/", "\\")) or ".." in Path(name).parts:
-                raise _outside(layer, name, "is an entry that leaves the package")
-        with _usd_errors(layer):
-            found = UsdUtils.ExtractExternalReferences(str(layer))
+        waiting += _layers_in_package(layer)
+        with _usd_errors(Path(layer)):
+            opened = Sdf.Layer.FindOrOpen(layer)
+            found = UsdUtils.ExtractExternalReferences(layer)
+            if opened and opened.HasExpressionVariables():
+                # Which value counts depends on the layer that composes this one.
+                raise InputRefused(
+                    f"{layer}: its asset paths may hold variables (expressionVariables), so that "
+                    "nobody can say where they lead. Flatten the stage. [paths.variables]"
+                )
         for reference in sorted({reference for kind in found for reference in kind if reference}):
-            target = _target(layer, reference, allowed)
+            if Ar.IsPackageRelativePath(layer):
+                _refuse_leaving_package(layer, reference)
+                continue
+            target = _target(Path(layer), reference, allowed)
             if target.suffix.lower() in USD_SUFFIXES and target.is_file():
-                waiting.append(target)
-    return seen
+                waiting.append(str(target))
+    return [Path(layer) for layer in seen if not Ar.IsPackageRelativePath(layer)]
+
+
+def _layers_in_package(layer: str) -> list[str]:
+    """The layers in a USDZ, which may itself lie in one; none in other layers."""
+    name = Ar.SplitPackageRelativePathInner(layer)[1] or layer
+    if not name.lower().endswith(".usdz"):
+        return []
+    with _usd_errors(Path(layer)):
+        package = Sdf.ZipFile.Open(layer)
+    names = package.GetFileNames() if package else ()
+    for name in names:
+        if name.startswith(("/", "\\")) or ".." in Path(name).parts:
+            raise _outside(layer, name, "is an entry that leaves the package")
+    inside = [name for name in names if Path(name).suffix.lower() in USD_SUFFIXES]
+    return [Ar.JoinPackageRelativePath(layer, name) for name in inside]
+
+
+def _refuse_leaving_package(layer: str, reference: str) -> None:
+    """InputRefused where a layer in a package refers to anything but what lies in there with it:
+    nothing else is found, but for absolute paths."""
+    name = Ar.SplitPackageRelativePathOuter(reference)[0]
+    if os.path.isabs(name) or "://" in name or name.startswith("\\"):
+        raise _outside(layer, reference, "is no path in the package")
 
 
 def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
@@ -257,7 +295,7 @@ def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
     return target
 
 
-def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
+def _outside(layer: Path | str, reference: str, reason: str) -> InputRefused:
     return InputRefused(
         f"{layer}: the asset path {reference[:200]!r} {reason}. Keep what belongs to the stage "
         "beside it and name it by relative paths. [paths.outside]"
@@ -265,7 +303,15 @@ def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
 
 
 def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:300]
+    return " ".join(words_of(error).split())[:300]
+
+
+def words_of(error: object) -> str:
+    """What an error of USD says, which may quote bytes of a file that are no text."""
+    try:
+        return str(getattr(error, "commentary", error))
+    except UnicodeDecodeError as undecoded:
+        return undecoded.object.decode("utf-8", "replace")
 
 
 def check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
