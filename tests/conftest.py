@@ -29,6 +29,8 @@ SLOW = (
     "faults/test_frames_that_disagree.py",
     "faults/test_hostile_files.py",
     "faults/test_kill_resume.py",
+    "faults/test_what_children_open.py",
+    "fuzzing",
     "job/test_child.py",
     "job/test_kill_resume.py",
     "material/test_fit_lobe.py",
@@ -76,6 +78,8 @@ SWEEPS = (
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
+    "faults/test_what_children_open.py::"
+    "test_children_open_the_capture_and_their_own_libraries_alone",
     "job/test_first_run.py::test_what_a_run_needs_was_compiled",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",

@@ -30,12 +30,14 @@ from usdbrdf.files.documents import load_arrays, read_json
 from usdbrdf.files.images import image_size, read_radiance
 from usdbrdf.files.tables import csv_rows, number_rows, read_array, read_xml
 from usdbrdf.options import IngestOptions
+from usdbrdf.relighting.relit_scene import _scene_of_others
 from usdbrdf.untrusted.colmap_models import colmap_model
 from usdbrdf.untrusted.e57_files import pictures_of_e57
 from usdbrdf.untrusted.mesh_files import mesh_from_file, model_from_file
 from usdbrdf.untrusted.pictures import picture_from_file
 from usdbrdf.untrusted.raw_files import raw_picture
 from usdbrdf.untrusted.replica_files import labelled_faces
+from usdbrdf.untrusted.usd_cameras import cameras_from_usd
 from usdbrdf.untrusted.usd_files import meshes_from_usd
 
 Read = Callable[[Path], object]
@@ -377,3 +379,42 @@ def test_a_name_with_newlines_and_control_characters_stays_on_one_line(tmp_path)
         assert str(refused.value).endswith("[mesh.read]")
     write_ply(tmp_path / "a\nb.ply", np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
     assert len(mesh_from_file(tmp_path / "a\nb.ply").triangles) == 1
+
+
+# --- Values of types that their attributes cannot have --------------------------------------------
+
+_TYPES = {
+    "points": (_TRIANGLE.replace("point3f[] points", "double[] points").replace(
+        "[(0, 0, 0), (1, 0, 0), (0, 1, 0)]", "[1, 2, 3, 4]"), "mesh.topology"),
+    "points of a type that nobody knows": (
+        _TRIANGLE.replace("point3f[]", "vector9q[]"), "mesh.topology"
+    ),
+    "indices beyond 32 bits": (
+        _TRIANGLE.replace("int[] faceVertexIndices = [0, 1, 2]",
+                          "int64[] faceVertexIndices = [0, 1, 99999999999]"), "mesh.topology"
+    ),
+    "normals": (_TRIANGLE.replace("point3f", "string normals = 'up'\n    point3f"), ""),
+    "labels": (
+        _TRIANGLE.replace("point3f", "double semantics:labels:class = 3\n    point3f"), ""
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.fault("G2")
+@pytest.mark.parametrize("kind", _TYPES)
+@pytest.mark.parametrize("read", [meshes_from_usd, _scene_of_others])
+def test_a_value_of_another_type_ends_in_a_sentence_or_counts_as_none(tmp_path, read, kind):
+    text, rule = _TYPES[kind]
+    (tmp_path / "a.usda").write_text(_HEAD + text)
+    read_it = read if read is meshes_from_usd else lambda path: _scene_of_others(path, ())
+    if rule:
+        assert f"[{rule}]" in _refused(read_it, tmp_path / "a.usda", tmp_path)
+    else:
+        read_it(tmp_path / "a.usda")
+
+
+def test_a_back_plate_that_is_no_path_is_none(tmp_path):
+    camera = 'def Camera "c" {\n custom string backPlate:a:image = "x.exr"\n}\n'
+    (tmp_path / "a.usda").write_text(_HEAD + _TRIANGLE + camera)
+    (found,) = cameras_from_usd(tmp_path / "a.usda").cameras
+    assert found.images == ("",)

@@ -249,7 +249,7 @@ READERS = {
             read=_whole_stage,
             lines=("usdbrdf.untrusted.usd_files", "usdbrdf.untrusted.usd_cameras"),
             in_child=True,
-            unknown=frozenset(("corner_normals", "times", "lens")),
+            unknown=frozenset(("corner_normals", "times", "lens", "world_from_camera")),
         ),
         Reader(
             name="usd-materials",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import unique_identifiers
@@ -186,9 +186,9 @@ def _subset_of_triangles(
     mesh: UsdGeom.Mesh, subsets: Sequence[UsdGeom.Subset], polygon: Int, time: Any
 ) -> Int:
     """(T,) the subset that each triangle's polygon is in, the first of several; -1 for none."""
-    subset_of = np.full(len(mesh.GetFaceVertexCountsAttr().Get(time) or []), -1, np.int32)
+    subset_of = np.full(len(mesh.GetFaceVertexCountsAttr().Get(time)), -1, np.int32)
     for i, subset in reversed(list(enumerate(subsets))):
-        indices = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
+        indices = numbers_of(subset.GetIndicesAttr().Get(time), np.int64)
         subset_of[indices[(indices >= 0) & (indices < len(subset_of))]] = i
     return np.asarray(subset_of[polygon], np.int32)
 
@@ -209,7 +209,8 @@ def _labels_at(prim: Usd.Prim) -> list[str]:
     for attribute in prim.GetAuthoredAttributes():
         words = attribute.GetName().split(":")
         if words[:2] == ["semantics", "labels"]:
-            values = attribute.Get(Usd.TimeCode.EarliestTime()) or ()
+            values = attribute.Get(Usd.TimeCode.EarliestTime())
+            values = values if isinstance(values, Vt.TokenArray) else ()
             found += [(words[-1] not in ("class", "category"), str(value)) for value in values]
         elif words[0] == "semantic" and words[-1] == "semanticData":
             kind = prim.GetAttribute(":".join([*words[:-1], "semanticType"]))
@@ -343,6 +344,14 @@ def is_deforming(mesh: UsdGeom.Mesh) -> bool:
     return any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
 
 
+def refuse_broken_meshes(path: Path) -> None:
+    """InputRefused where a mesh of a stage, hidden or not, has faces that its points do not fit."""
+    stage, time = Usd.Stage.Open(str(path), Usd.Stage.LoadAll), Usd.TimeCode.EarliestTime()
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
+        if prim.IsA(UsdGeom.Mesh):
+            _topology(UsdGeom.Mesh(prim), time, path)
+
+
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
     """Visible meshes in the order of the stage, and sentences about the rest."""
     meshes, other, hidden = [], [], 0
@@ -409,7 +418,7 @@ def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float
     points, counts, indices = _topology(mesh, time, path)
     mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
-    holes = np.array(mesh.GetHoleIndicesAttr().Get(time) or [], np.int32)
+    holes = numbers_of(mesh.GetHoleIndicesAttr().Get(time), np.int32)
     fans = triangulate(counts, indices, left_handed=left_handed != mirrored, holes=holes)
     world = points @ matrix[:3, :3] + matrix[3, :3]
     normals = np.full((len(fans.triangles), 3, 3), np.nan, np.float32)
@@ -427,9 +436,9 @@ def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:
 
     Nothing can be repaired here: the file is referenced, and the asset must mean the same mesh.
     """
-    points = np.array(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int32)
-    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int32)
+    points = _vectors(mesh.GetPointsAttr().Get(time))
+    counts = numbers_of(mesh.GetFaceVertexCountsAttr().Get(time), np.int32)
+    indices = numbers_of(mesh.GetFaceVertexIndicesAttr().Get(time), np.int32)
     problem = ""
     if len(points) == 0 or len(counts) == 0:
         problem = f"is empty ({len(points)} points, {len(counts)} faces)"
@@ -449,6 +458,20 @@ def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:
     return points, counts, indices
 
 
+def numbers_of(value: Any, kind: Any) -> Any:
+    """An attribute's value as an array; an empty one where a file has given it another type."""
+    try:
+        return np.array([] if value is None else value, kind)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0, kind)
+
+
+def _vectors(value: Any) -> Double:
+    """(N, 3); none where the numbers are no multiple of three."""
+    numbers = numbers_of(value, np.float64)
+    return np.asarray(numbers.reshape(-1, 3) if numbers.size % 3 == 0 else np.zeros((0, 3)))
+
+
 def _authored_normals(
     mesh: Any, fans: Triangulation, num_points: int, num_faces: int, num_corners: int, time: Any
 ) -> Double | None:
@@ -461,7 +484,7 @@ def _authored_normals(
         values, interpolation = primvar.ComputeFlattened(time), primvar.GetInterpolation()
     else:
         values, interpolation = mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation()
-    normals = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
+    normals = _vectors(values)
     expected = {"constant": 1, "uniform": num_faces, "vertex": num_points, "varying": num_points}
     expected["faceVarying"] = num_corners
     if len(normals) != expected.get(interpolation, -1):
