@@ -35,7 +35,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import frames_from_stage
-from usdbrdf.files.frames import read_frame, read_frames
+from usdbrdf.files.frames import read_frame
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing import psquare
 from usdbrdf.texturing.exposures import Probes
@@ -130,9 +130,10 @@ def streamed(
     atlas: AssetMaps, rays: RayScene, frames: Frames, observed: Observation, count: int
 ) -> tuple[float, float]:
     """CPU and wall seconds of the first ``count`` frames, from one frame's end to another's."""
-    images = read_frames(functools.partial(read_frame, frames), range(count))
+    read = functools.partial(read_frame, frames)
+    surface = TexturedScene(atlas.scene, atlas.texels, rays)
     cpu, wall = time.process_time(), time.perf_counter()
-    for some in samples_from_frames(TexturedScene(atlas.scene, atlas.texels, rays), frames, images):
+    for some in samples_from_frames(surface, frames, read, range(count)):
         observed.add(some, QUANTILE)
     return time.process_time() - cpu, time.perf_counter() - wall
 

@@ -27,12 +27,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 
 # --- The arrows. A room may import what it names here, and all rooms that those may. -------------
 
-GROUND = {"calibration", "errors", "identity", "kernel", "option", "options"}
+GROUND = {"ahead", "calibration", "errors", "identity", "kernel", "option", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
 READERS = {"delivery", "evaluation", "page", "relighting", "validation"}
 
 ARROWS: dict[str, set[str]] = {
+    "ahead": set(),
     "errors": set(),
     "identity": set(),
     "calibration": set(),
@@ -40,11 +41,11 @@ ARROWS: dict[str, set[str]] = {
     "options": {"model", "calibration", "option"},
     "kernel": {"identity"},
     "model": {"errors"},
-    "files": {"model"},
+    "files": {"model", "ahead"},
     "job": {"files", "identity"},
     "untrusted": {"job"},
     "transport": {"model", "untrusted", "kernel", "calibration", "options"},
-    "geometry": {"transport"},
+    "geometry": {"transport", "ahead"},
     "texturing": {"geometry"},
     "capture": {"geometry"},
     "shading": {"texturing"},

@@ -15,6 +15,7 @@ import fcntl
 import functools
 import hashlib
 import inspect
+import itertools
 import logging
 import os
 import pickle
@@ -255,13 +256,18 @@ def parallel_kernel(
     @functools.wraps(function)
     def in_parts(count: int, /, *arguments: P.args, **named: P.kwargs) -> None:
         parts = min(count, _PARTS_PER_THREAD * num_threads())
-        ends = [part * count // max(parts, 1) for part in range(parts + 1)]
+        turns = itertools.count()
 
-        def work(part: int) -> None:
-            compiled(ends[part], ends[part + 1], *arguments, **named)
+        def work() -> None:
+            while (part := next(turns)) < parts:
+                first, last = part * count // parts, (part + 1) * count // parts
+                compiled(first, last, *arguments, **named)
 
-        for _ in map(work, range(parts)) if parts < 2 else _pool().map(work, range(parts)):
-            pass
+        # Whoever calls works too: to wake one thread less is what small kernels feel.
+        others = [_pool().submit(work) for _ in range(min(parts, num_threads()) - 1)]
+        work()
+        for other in others:
+            other.result()
 
     return in_parts
 

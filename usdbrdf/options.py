@@ -438,6 +438,9 @@ class PublishOptions(Options):
     photographs: bool = option("--no-photographs", True)
     "leave the photographs out; else they are copied without EXIF, GPS and the like"
     texture_space: TextureSpace = _texture_space()
+    proxies: int | None = option("--proxies N", None, _COUNT, unset="none")
+    """stand-ins of about N triangles in all: purpose proxy, the measured meshes get purpose
+    render"""
     encoding: Literal["text", "binary"] = option("--encoding", "text")
     "of the root layer, NAME.usd"
 

@@ -10,7 +10,7 @@ import threading
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from usdbrdf.asset.layout import Asset
@@ -261,3 +261,56 @@ def test_a_manifest_that_lists_what_lies_elsewhere_is_none(tmp_path, path):
     write_manifest(tmp_path, manifest)
     with pytest.raises(InputRefused, match=r"\[publish\.manifest\]$"):
         read_manifest(tmp_path)
+
+
+def dense_grid(room, side=20):
+    """The artist made the first mesh a grid of 2 side^2 triangles; its path."""
+    stage = Usd.Stage.Open(str(room.asset.root_layer))
+    mesh = next(UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 1, side + 1)] * 2))
+    points = np.stack([x, y, 0.2 * np.sin(6 * x)], axis=1).astype(np.float32)
+    a = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    corners = np.stack([a, a + 1, a + side + 2, a, a + side + 2, a + side + 1], axis=1).ravel()
+    stage.SetEditTarget(Sdf.Layer.FindOrOpen(str(room.asset.edits_layer)))
+    mesh.GetPointsAttr().Set(points)
+    mesh.GetFaceVertexCountsAttr().Set(np.full(2 * side**2, 3, np.int32))
+    mesh.GetFaceVertexIndicesAttr().Set(corners.astype(np.int32))
+    mesh.GetExtentAttr().Set(np.stack([points.min(axis=0), points.max(axis=0)]))
+    mesh.GetNormalsAttr().Block()
+    UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").GetIndicesAttr().Block()
+    UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").GetAttr().Set(
+        np.zeros((len(corners), 2), np.float32)
+    )
+    stage.GetEditTarget().GetLayer().Save()
+    return mesh.GetPath()
+
+
+def test_stand_ins_have_few_triangles_and_lie_beside_each_mesh(room, tmp_path):
+    grid, folder, dest = dense_grid(room), room.asset.folder, tmp_path / "dest"
+    publish(folder, dest)
+    publish(folder, dest, PublishOptions(proxies=100))
+    plain, stage = (Usd.Stage.Open(str(dest / v / "room.usd")) for v in ("v001", "v002"))
+    meshes = [prim for prim in plain.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    for prim in meshes:
+        assert UsdGeom.Imageable(prim).ComputePurpose() == "default"
+        shown = UsdGeom.Imageable(stage.GetPrimAtPath(prim.GetPath()))
+        proxy = UsdGeom.Mesh(shown.ComputeProxyPrim()[0])
+        assert (shown.ComputePurpose(), proxy.ComputePurpose()) == ("render", "proxy")
+        assert proxy.GetPrim().GetParent() == shown.GetPrim().GetParent()
+        assert proxy.GetDisplayColorAttr().Get() == UsdGeom.Mesh(shown).GetDisplayColorAttr().Get()
+        ours, theirs = (np.array(UsdGeom.Mesh(m).GetExtentAttr().Get()) for m in (shown, proxy))
+        assert np.abs(ours - theirs).max() < 0.1 * np.ptp(ours)
+        count = len(proxy.GetFaceVertexCountsAttr().Get())
+        corners = np.array(proxy.GetFaceVertexIndicesAttr().Get())
+        assert len(corners) == 3 * count
+        assert corners.max() < len(proxy.GetPointsAttr().Get())
+        assert 4 <= count <= (200 if prim.GetPath() == grid else 12)
+    assert own_findings(stage) == []
+    # Nothing of them is loaded before the payload is.
+    unloaded = Usd.Stage.Open(str(dest / "v002" / "room.usd"), Usd.Stage.LoadNone)
+    assert not any(prim.IsA(UsdGeom.Mesh) for prim in unloaded.Traverse())
+
+
+def test_no_stand_ins_where_the_meshes_are_coarser(room, tmp_path):
+    publish(room.asset.folder, tmp_path / "dest", PublishOptions(proxies=10**7))
+    assert not (tmp_path / "dest/v001/layers/proxies.usdc").exists()

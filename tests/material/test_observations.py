@@ -46,7 +46,7 @@ def _view(i: int) -> View:
 def _followed(world: World, frames: int, usable: np.ndarray) -> tuple[Follower, object]:
     follower = Follower(_lit(world), usable, frames, 0)
     for i in range(frames):
-        follower.add(_view(i), np.zeros((SIZE, SIZE), bool), 0.25 * i)
+        follower.add(i, _view(i), np.zeros((SIZE, SIZE), bool), 0.25 * i)
     return follower, follower.chosen(0)
 
 
@@ -82,7 +82,7 @@ def test_on_a_plane_a_sample_is_the_mean_over_a_square(floor: World):
     )
     hall = _lit(floor, size=20.0)
     follower = Follower(hall, np.ones(len(floor.texels), bool), 1, 0)
-    follower.add(view, np.zeros((pixels, pixels), bool), 0.0)
+    follower.add(0, view, np.zeros((pixels, pixels), bool), 0.0)
     radiance = follower._radiance[0][follower._seen[0]]
     assert len(radiance) > 300
     # Sixteen pixels' means, read bilinearly: at most a sixteenth of the variance.
@@ -116,7 +116,7 @@ def test_the_frames_noise_tells_how_far_they_were_smoothed(floor: World, blur: f
             radiance=np.repeat(shown[..., None], 3, axis=2).astype(np.float32),
             valid=np.ones((height, width), bool), camera=camera_at(pose, lens, width, height),
         )  # fmt: skip
-        follower.add(view, np.zeros((height, width), bool), 0.0)
+        follower.add(seed, view, np.zeros((height, width), bool), 0.0)
     assert follower.smoothing == pytest.approx(blur, rel=0.15)
 
 
@@ -143,10 +143,10 @@ def test_the_target_frame_shows_the_highlight():
     ])  # fmt: skip
     usable = room.texels.object_index() != 2
     follower = Follower(_lit(room, lamp=2), usable, 6, 0)
-    for x in (0.0, 1.0, 2.0, -2.5, 0.5, 1.5):
+    for i, x in enumerate((0.0, 1.0, 2.0, -2.5, 0.5, 1.5)):
         view = View(
             radiance=np.ones((SIZE, SIZE, 3), np.float32), valid=np.ones((SIZE, SIZE), bool),
             camera=camera_at(look_at(np.array([x, -0.1, 2.0]), np.zeros(3)), LENS, SIZE, SIZE),
         )  # fmt: skip
-        follower.add(view, np.zeros((SIZE, SIZE), bool), 0.0)
+        follower.add(i, view, np.zeros((SIZE, SIZE), bool), 0.0)
     np.testing.assert_array_equal(follower.target_frames()[0], [3, -1, -1])

@@ -22,7 +22,7 @@ from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import frames_from_stage, read_aovs, read_shading
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.frames import FramePixels, FrameReader, read_frame, read_frames
+from usdbrdf.files.frames import FramePixels, FrameReader, read_frame
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
@@ -391,19 +391,15 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
     starts = []
     through_all = refine.samples_from_frames
 
-    def read(how, order):
+    def interrupted(surface, frames, read, order, part):
         starts.append(NUM_FRAMES - len(order))
-        return read_frames(how, order)
-
-    def interrupted(*arguments, **options):
-        for done, samples in enumerate(through_all(*arguments, **options)):
+        for done, samples in enumerate(through_all(surface, frames, read, order, part)):
             yield samples
             if len(starts) == 1 and done == INTERRUPTED:
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
     monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
-    monkeypatch.setattr(refine, "read_frames", read)
     monkeypatch.setattr(refine, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())

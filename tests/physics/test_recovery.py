@@ -186,7 +186,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
     angles = np.radians(np.linspace(-60, 60, 9))
     cameras = []
     follower = Follower(lit, usable, len(angles), 0)
-    for angle in angles:
+    for i, angle in enumerate(angles):
         eye = np.array([1.6 * np.sin(angle), -1.6 * np.cos(angle), 1.0 + 0.3 * np.sin(3 * angle)])
         there = studio._replace(
             camera=replace(studio.camera, world_from_camera=look_at(eye, CENTRE))
@@ -194,7 +194,7 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         view = View(
             radiance=_render(there, phi, psi, samples=32), valid=_whole(there), camera=there.camera
         )
-        follower.add(view, np.zeros_like(view.valid), 1e-3)
+        follower.add(i, view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
     observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
     sampled, used = sampled_object(lit, observed, smoothing, cameras.__getitem__, SPHERE)

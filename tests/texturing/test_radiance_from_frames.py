@@ -13,7 +13,7 @@ import pytest
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf import kernel
-from usdbrdf.files.frames import read_frame, read_frames
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
@@ -83,10 +83,10 @@ def _empty(world: World, part: slice | None = None) -> Observation:
 def _observe(
     world: World, frames: Frames, observed: Observation, start: int = 0, part: slice | None = None
 ) -> list[int]:
-    images = read_frames(partial(read_frame, frames), range(start, len(frames)))
+    read, order = partial(read_frame, frames), range(start, len(frames))
     surface = TexturedScene(world.scene, world.texels, world.rays)
     done = []
-    for some in samples_from_frames(surface, frames, images, part):
+    for some in samples_from_frames(surface, frames, read, order, part):
         observed.add(some, 0.5)
         done.append(some.frame)
     return done

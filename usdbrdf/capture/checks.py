@@ -16,7 +16,7 @@ from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import encoding_of_tag, kind_of_encoding
-from usdbrdf.files.frames import FramePixels, read_frame
+from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.files.images import MAX_SIDE, colour_tag, image_size
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
@@ -433,14 +433,20 @@ def _looked_through(
     """Of the frames ``which`` those that can be used, as ``check_frames``."""
     usable: list[int] = []
     name_of: dict[str, str] = {}
-    for i in progress(which, total=len(which), label="images", unit="frames"):
+
+    def look(i: int) -> tuple[FramePixels, str] | str:
         path = frames.image_paths[i]
         try:
-            pixels = read_frame(frames, i)
+            return read_frame(frames, i), sha256_of(path)
         except ImageRefused as error:
-            findings.drop(names[i], clause_of(error, path), "capture.image")
+            return clause_of(error, path)
+
+    looks = progress(read_frames(look, which), total=len(which), label="images", unit="frames")
+    for i, found in looks:
+        if isinstance(found, str):
+            findings.drop(names[i], found, "capture.image")
             continue
-        digest = sha256_of(path)
+        pixels, digest = found
         if digest in name_of:
             findings.drop(names[i], f"the same image as {name_of[digest]!r}", "capture.duplicate")
             continue

@@ -15,8 +15,15 @@ from pxr import Sdf
 from usdbrdf.asset.layers.lights_layer import LIGHTS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.delivery.collection import Collection, collected, refuse_incomplete, write_collection
+from usdbrdf.delivery.collection import (
+    Collection,
+    canonical,
+    collected,
+    refuse_incomplete,
+    write_collection,
+)
 from usdbrdf.delivery.colours import ColourTextures, convert_layer, converted_texture
+from usdbrdf.delivery.proxies import add_proxies
 from usdbrdf.files.colour import ACESCG, WORKING_SPACE
 from usdbrdf.files.images import needs_float, write_exr
 from usdbrdf.files.published_images import copy_without_metadata, write_texture
@@ -34,6 +41,7 @@ def write_copy(
     encoding: str,
     space: str,
     photographs: bool,
+    proxies: int | None = None,
     describe: Callable[[Sdf.Layer], None],
     accept: Callable[[Path], object] = lambda file: None,
 ) -> Collection:
@@ -43,6 +51,7 @@ def write_copy(
     encoding     "usda" or "usdc" for the root layer where its name does not say it, else ""
     space        linear space of all colours but those that were measured
     photographs  whether they are copied too, without EXIF, GPS and the like
+    proxies      triangles of stand-ins for all meshes together, None for no stand-ins
     describe     changes the root layer after all else
     accept       raises for files that may not be copied
 
@@ -82,5 +91,7 @@ def write_copy(
             copy_without_metadata(file, place)
 
     write_collection(found, folder, edit=edit, write=write, encodings={root: encoding})
+    if proxies is not None:
+        add_proxies(folder / root, folder / found.places[canonical(asset.contents_layer)], proxies)
     refuse_incomplete(folder / root)
     return found

@@ -159,6 +159,7 @@ def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) ->
         encoding=_ENCODINGS[options.encoding],
         space=space,
         photographs=options.photographs,
+        proxies=options.proxies,
         describe=describe,
     )
     files = {

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from typing import TypeVar
 
 import numpy as np
 
+from usdbrdf.ahead import ahead
 from usdbrdf.files.colour import kind_of_encoding, to_working_space
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.model.arrays import Bool, Double, Float
@@ -19,8 +19,6 @@ from usdbrdf.model.capture import Frames
 PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 # A half float stores 3.2 as 3.19922: a clipped channel is one close to the saturation.
 CLIPPED_SHARE = 0.998
-# Threads that decode, and frames in memory besides the one that is used.
-_READERS, _AHEAD = 2, 3
 # Of a frame: three channels of radiance and four masks.
 _BYTES_OF_PIXEL = 16
 # Resampling rings a little below zero; what is further below was never light.
@@ -158,22 +156,13 @@ def read_recorded(
 
 
 Read = Callable[[int], FramePixels]
+T = TypeVar("T")
 
 
-def read_frames(read: Read, order: Sequence[int]) -> Iterator[tuple[int, FramePixels]]:
-    """Number and pixels of the frames of ``order``, the next ones decoded while one is used."""
-    with ThreadPoolExecutor(max_workers=_READERS) as readers:
-        coming = deque((i, readers.submit(read, i)) for i in order[:_AHEAD])
-        try:
-            for ahead in range(_AHEAD, len(order) + _AHEAD):
-                i, pixels = coming.popleft()
-                found = pixels.result()
-                if ahead < len(order):
-                    coming.append((order[ahead], readers.submit(read, order[ahead])))
-                yield i, found
-        finally:
-            for _, job in coming:
-                job.cancel()
+def read_frames(read: Callable[[int], T], order: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Number and pixels of the frames of ``order``, or what else ``read`` makes of them, from any
+    thread; that of the next ones while one is used."""
+    return zip(order, ahead(read, order), strict=True)
 
 
 class FrameReader:

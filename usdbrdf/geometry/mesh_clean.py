@@ -56,15 +56,9 @@ def clean_mesh(
         points, triangles, origin = _repaired(points, triangles, found, label)
         face_object, repaired = face_object[origin], np.unique(found.damaged_sheets // 2)
     if decimate is not None and decimate < len(triangles):
-        given = {"points": points, "triangles": triangles, "face_object": face_object}
-        reduced = run_child(
-            function="usdbrdf.geometry.mesh_filters:decimate_objects",
-            arrays={**given, "joined": repaired},
-            parameters={"target": decimate},
-            timeout_s=60 + len(triangles) / 2000,
-            label=f"{label}: reduction to {decimate} triangles",
+        points, triangles, face_object = decimated(
+            points, triangles, face_object, decimate, label=label, joined=repaired
         )
-        points, triangles, face_object = (reduced[name] for name in given)
         num_given = len(points)
         counts["decimated_faces"] = found.num_whole - len(triangles)
     used, points, triangles = compact(points, triangles)
@@ -75,6 +69,29 @@ def clean_mesh(
         face_object=face_object,
         counts=counts,
     )
+
+
+def decimated(
+    points: Float,
+    triangles: Int,
+    face_object: Int,
+    target: int,
+    *,
+    label: str,
+    joined: Int | None = None,
+) -> tuple[Float, Int, Int]:
+    """Points, triangles and their objects (see ``decimate_objects``) of about ``target`` triangles
+    in all, made in a child; ``label`` as messages call the mesh."""
+    given = {"points": points, "triangles": triangles, "face_object": face_object}
+    none = np.zeros(0, np.int32)
+    reduced = run_child(
+        function="usdbrdf.geometry.mesh_filters:decimate_objects",
+        arrays={**given, "joined": none if joined is None else joined},
+        parameters={"target": target},
+        timeout_s=60 + len(triangles) / 2000,
+        label=f"{label}: reduction to {target} triangles",
+    )
+    return reduced["points"], reduced["triangles"], reduced["face_object"]
 
 
 class _Damage(NamedTuple):

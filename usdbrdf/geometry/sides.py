@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from usdbrdf.ahead import ahead
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel
@@ -88,13 +89,19 @@ def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sig
     """Of each face with its unit normal (F, 3)."""
     count = len(normals)
     pixels, frames = np.zeros((2, count, 2), np.int32)
-    for camera in cameras:
+
+    def look(camera: Camera) -> tuple[Long, Int]:
+        """Faces that a frame shows, and on how many pixels their front and back."""
         small = camera.at_width(min(camera.width, _MOST_ACROSS))
         face, point = visible_faces(rays, small)
         shown = np.zeros_like(pixels)
         _count_sides(face.reshape(-1), point.reshape(-1, 3), normals, small.eye, shown)
-        pixels += shown
-        frames += shown > 0
+        some = np.flatnonzero(shown.any(axis=1))
+        return some, shown[some]
+
+    for some, shown in ahead(look, cameras):
+        pixels[some] += shown
+        frames[some] += shown > 0
     return Sightings(pixels, frames)
 
 

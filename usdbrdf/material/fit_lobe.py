@@ -3,6 +3,7 @@ what the noise of the rays does to it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import pairwise
@@ -194,24 +195,47 @@ def _least(terms: Double) -> tuple[float, int, float]:
     return float(cost[best]), best, float(psi[best])
 
 
+def _log_cost(fits: Sequence[_Fit]) -> float:
+    """ln of the least cost over footprints and roughnesses of level 1, at the variances that the
+    model has now: kinds of lobe that share a model compare."""
+    return math.log(max(min(_least(fit.coarse())[0] for fit in fits), 1e-30))
+
+
+class FittedKind(NamedTuple):
+    """A kind of lobe fitted to samples; another may go on from it.
+
+    lobe       what was found
+    log_ratio  ln of its cost over the cost of the kind that was fitted before it, 0 if none was:
+               the mean of what the models of errors say that were found with either kind, since
+               each takes the side of its own
+    model      of the samples' errors, as it is now; fits: of each footprint
+    """
+
+    lobe: LobeEstimate
+    log_ratio: float
+    model: ViewModel
+    fits: Sequence[_Fit]
+
+
 def fit_lobe(
     samples: ViewSamples,
     candidates: Sequence[Candidate],
     repeats: int = 1,
-    known: ViewModel | None = None,
-) -> tuple[LobeEstimate, ViewModel]:
-    """The lobe that explains the samples best, averaged over the footprints that may be theirs,
-    and the model of the samples' errors. The lobe's errors are those of the mean of so many
-    ``repeats`` with rays of their own.
+    before: FittedKind | None = None,
+) -> FittedKind:
+    """The lobe that explains the samples best, averaged over the footprints that may be theirs.
+    Its errors are those of the mean of so many ``repeats`` with rays of their own.
 
-    The errors' variances are found with the first candidate, or improved from those that are
-    ``known`` of another kind of lobe, and again with the candidate that is best with these. With
-    them fixed all candidates are fitted and compared.
+    The variances of the samples' errors are found with the first candidate, or improved from those
+    of the kind of lobe that was fitted ``before``, and again with the candidate that is best with
+    these. With them fixed all candidates are fitted and compared.
     """
-    model = known or ViewModel(samples)
+    model = before.model if before else ViewModel(samples)
     fits = [_Fit(candidate, model, samples.radiance) for candidate in candidates]
-    for _ in range(_MORE if known else _UPDATES):
+    with_old = _log_cost(fits) - _log_cost(before.fits) if before else 0.0
+    for _ in range(_MORE if before else _UPDATES):
         fits[0].improve()
+    with_new = _log_cost(fits) - _log_cost(before.fits) if before else 0.0
     coarse = [fit.coarse() for fit in fits]
     best = int(np.argmin([_least(terms)[0] for terms in coarse]))
     if best > 0:
@@ -224,4 +248,5 @@ def fit_lobe(
         fit.estimate(terms, without, repeats) for fit, terms in zip(fits, coarse, strict=True)
     ]
     likely = [candidate.likely for candidate in candidates]
-    return averaged(estimates, model.degrees_of_freedom, likely), model
+    lobe = averaged(estimates, model.degrees_of_freedom, likely)
+    return FittedKind(lobe, (with_old + with_new) / 2, model, fits)

@@ -14,11 +14,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from usdbrdf import calibration
-from usdbrdf.files.frames import FramePixels, FrameReader, read_frames
+from usdbrdf.ahead import ahead
+from usdbrdf.files.frames import FramePixels, FrameReader
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_lobe import first_seed
 from usdbrdf.material.fit_target import (
+    FrameCounts,
     Residual,
     choose_target_frames,
     count_frame,
@@ -145,15 +147,19 @@ def survey_frames(
         by_views = options.method == "views"
         followed = usable & lit.texels.interior & by_views
         follower = Follower(lit, followed, len(own), options.seed)
-        counts = []
-        images = read_frames(reader.read, own)
-        for i, pixels in progress(images, total=len(own), label="fit: survey", unit="frames"):
+
+        def look(i: int) -> FrameCounts | None:
+            pixels = reader.read(i)
             if by_views:
-                noise_floor = float(frames.noise_floor_radiance[i])
-                follower.add(_view(frames, i, pixels), pixels.clipped, noise_floor)
-            else:
-                stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
-                counts.append(count_frame(lit, pixels.valid, frames.camera(i), stride))
+                view, noise_floor = _view(frames, i, pixels), float(frames.noise_floor_radiance[i])
+                follower.add(i - own.start, view, pixels.clipped, noise_floor)
+                return None
+            stride = max(1, round(math.sqrt(pixels.valid.size / _COUNTED_PIXELS)))
+            return count_frame(lit, pixels.valid, frames.camera(i), stride)
+
+        looks = ahead(look, own)
+        looked = progress(looks, total=len(own), label="fit: survey", unit="frames")
+        counts = [count for count in looked if count is not None]
         target, shown = follower.target_frames() if by_views else choose_target_frames(counts)
         observed = follower.chosen(options.seed)
         return {
@@ -176,17 +182,17 @@ def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
 
 class FirstLook(NamedTuple):
     """Of one object: a fit per kind of lobe that was asked, none where it has too few samples, and
-    how many it has."""
+    how many it has; and ln of the second kind's cost over the first's (see ``FittedKind``)."""
 
     lobes: dict[int, LobeEstimate]
     num_samples: int
+    log_ratio: float = 0.0
 
     def arrays(self) -> dict[str, Array]:
         """As checkpoints hold it."""
         flat = {_NAMES[kind]: [*one[:7], *one[7], *one[8:]] for kind, one in self.lobes.items()}
-        return {"num_samples": np.array(self.num_samples)} | {
-            k: np.array(v) for k, v in flat.items()
-        }
+        every = {"num_samples": self.num_samples, "log_ratio": self.log_ratio, **flat}
+        return {name: np.array(value) for name, value in every.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> FirstLook:
@@ -196,11 +202,12 @@ class FirstLook(NamedTuple):
             if name in arrays:
                 one = arrays[name].tolist()
                 lobes[kind] = LobeEstimate._make([*one[:7], (one[7], one[8]), *one[9:]])
-        return cls(lobes, int(arrays["num_samples"]))
+        return cls(lobes, int(arrays["num_samples"]), float(arrays["log_ratio"]))
 
 
 _NAMES = {PAPER: "paper", DIELECTRIC: "microfacet"}
-# Of the share that no lobe explains, summed over objects: what the two kinds must differ by.
+# Of the logarithms of what lobes leave unexplained, summed over objects: what the two kinds must
+# differ by.
 _PAPER_CLEARER = calibration.number("fit.paper_clearer")
 
 
@@ -223,7 +230,7 @@ def fitted_by_likelier_lobe(
     if options.method == "views":
         kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
         looks = list(first_looks(run, lightings, reader, kinds, options.seed))
-    clearer = sum(_paper_explains_more(look.lobes) for look in looks if look)
+    clearer = sum(look.log_ratio for look in looks if look)
     paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
     lobe = PAPER if paper else DIELECTRIC
 
@@ -247,19 +254,12 @@ def first_looks(
 
     def work(i: int) -> dict[str, Array]:
         sampled, number = _sampled(lightings, reader, i, MIXTURE)
-        lobes = fit_kinds(sampled, kinds, first_seed(seed)) if sampled else {}
-        return FirstLook(lobes, number).arrays()
+        fitted = fit_kinds(sampled, kinds, first_seed(seed)) if sampled else {}
+        lobes = {kind: one.lobe for kind, one in fitted.items()}
+        return FirstLook(lobes, number, sum(one.log_ratio for one in fitted.values())).arrays()
 
     found = _of_each_object(run, "look", _sizes(lightings), work, label="fit: first look")
     return [FirstLook.from_arrays(one) for one in found]
-
-
-def _paper_explains_more(lobes: Mapping[int, LobeEstimate]) -> float:
-    """By how much the logarithm of what is left unexplained is less; 0 where nothing shows."""
-    if len(lobes) < len(_NAMES):
-        return 0.0
-    left, right = (max(1 - min(lobes[kind].evidence, 1.0), 1e-3) for kind in _NAMES)
-    return math.log(right / left)
 
 
 def _of_each_object(

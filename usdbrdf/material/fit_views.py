@@ -16,10 +16,16 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.material.conductor import Conductor, conductor_of
-from usdbrdf.material.fit_lobe import Candidate, first_seed, fit_lobe, repeated_where_noisy
+from usdbrdf.material.fit_lobe import (
+    Candidate,
+    FittedKind,
+    first_seed,
+    fit_lobe,
+    repeated_where_noisy,
+)
 from usdbrdf.material.observations import Observations
 from usdbrdf.material.verdict import SOME_EVIDENCE, LobeEstimate
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
@@ -171,7 +177,7 @@ def sampled_object(
 
 def fit_kinds(
     sampled: SampledObject, kinds: Sequence[int], seed: int, repeats: int = 1
-) -> dict[int, LobeEstimate]:
+) -> dict[int, FittedKind]:
     """The lobe of the first kind, and where that shows, those of the others from the same rays."""
     bases = [
         [sampled.basis(width, number) for number in range(3 * seed, 3 * seed + 3)]
@@ -181,8 +187,8 @@ def fit_kinds(
         _deviation_of_normal(*(part.footprints[width] for part in sampled.parts))
         for width in range(len(sampled.widths))
     ]
-    found: dict[int, LobeEstimate] = {}
-    errors: ViewModel | None = None
+    found: dict[int, FittedKind] = {}
+    before: FittedKind | None = None
     for kind in kinds:
         of_kind = [[partial(basis, kind) for basis in three] for three in bases]
         candidates = [
@@ -191,8 +197,8 @@ def fit_kinds(
                 of_kind, blurs, sampled.likely, strict=True
             )
         ]
-        found[kind], errors = fit_lobe(sampled.samples, candidates, repeats, errors)
-        if not found[kind].evidence > SOME_EVIDENCE:
+        before = found[kind] = fit_lobe(sampled.samples, candidates, repeats, before)
+        if not before.lobe.evidence > SOME_EVIDENCE:
             break
     return found
 
@@ -213,7 +219,7 @@ def fit_views(
     """
 
     def fitted(own_seed: int, repeats: int) -> LobeEstimate:
-        return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe]
+        return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe].lobe
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
     bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE

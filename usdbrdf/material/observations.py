@@ -161,7 +161,8 @@ class Observations(NamedTuple):
 
 
 class Follower:
-    """Follows some texels of every object through the frames, one ``add`` per frame."""
+    """Follows some texels of every object through the frames, one ``add`` per frame, in any order
+    and from any thread."""
 
     def __init__(self, lit: LitScene, usable: Bool, frames: int, seed: int) -> None:
         """usable (T,): texels worth following (measured, not emissive)."""
@@ -186,21 +187,19 @@ class Follower:
         # Row of a frame in the tables; what was not seen there is zero.
         self._frame = np.linspace(0, max(frames - 1, 0), rows).round().astype(np.int64)
         self._row = {int(frame): row for row, frame in enumerate(self._frame)}
-        self._added = 0
         self._frames_per_noise = max(1, -(-frames // _FRAMES_OF_NOISE))
-        self._noise_in_windows: list[Double] = []
+        self._noise_in_windows: dict[int, Double] = {}
         cells = (rows, len(self._index))
         self._seen = np.zeros(cells, np.bool_)
         self._radiance = np.zeros((*cells, 3), np.float32)
         self._light = np.zeros(cells, np.float32)
         self._noise = np.zeros(rows, np.float32)
 
-    def add(self, view: View, clipped: Bool, noise_floor: float) -> None:
-        """Sample the followed texels in the next frame."""
-        row = self._row.get(self._added)
-        if len(self._index) and self._added % self._frames_per_noise == 0:
-            self._noise_in_windows.append(noise_correlation(self._lit, view))
-        self._added += 1
+    def add(self, frame: int, view: View, clipped: Bool, noise_floor: float) -> None:
+        """Sample the followed texels in the frame of this number."""
+        row = self._row.get(frame)
+        if len(self._index) and frame % self._frames_per_noise == 0:
+            self._noise_in_windows[frame] = noise_correlation(self._lit, view)
         if row is None or not len(self._index):
             return
         surfaces = first_surfaces(self._lit.rays, self._lit.scene.face_object, view.camera)
@@ -250,7 +249,7 @@ class Follower:
     @property
     def smoothing(self) -> float:
         """Standard deviation in pixels of what smoothed the pictures, NaN if they do not tell."""
-        return smoothing_of(self._noise_in_windows)
+        return smoothing_of([*self._noise_in_windows.values()])
 
     def target_frames(self) -> tuple[Int, Double]:
         """Per object, the frame in which its followed texels mirror most light beyond what each of

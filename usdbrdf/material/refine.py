@@ -20,7 +20,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.files.frames import FrameReader, read_frames
+from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
@@ -109,9 +109,10 @@ _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
 # is left of their noise is far below the other errors.
 _MOST_SAMPLES = 24
-# Bytes that a texel takes: its state (132) and its place among the blocks of texels while these are
-# sorted out; its mean; blurring and filling in, afterwards; and what it is lit by.
-_OF_REFINING = BytesPerTexel(grouped=170, result=28, after=150, always=24)
+# Bytes that a texel takes: its state (132), its place among the blocks of texels while these are
+# sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
+# and what it is lit by.
+_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=150, always=24)
 _RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 _DARKEST = calibration.number("refine.darkest")
@@ -288,7 +289,7 @@ def _means_without_lobes(
             start, observed = saved[0] + 1, MeanState(**saved[1])
         # The mean starts from its first samples, which must not all show one highlight.
         order = [own.start + i for i in spread_order(len(own))[start:]]
-        sampled = samples_from_frames(lit, frames, read_frames(reader.read, order), part)
+        sampled = samples_from_frames(lit, frames, reader.read, order, part)
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)

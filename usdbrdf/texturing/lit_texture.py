@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.frames import read_frame, read_frames
+from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
@@ -94,8 +94,8 @@ def lit_texture_from_frames(
         elif earlier is not None and observed.restore_earlier(earlier[1]):
             start = earlier[0]
             say(f"texture: goes on from the statistics of {start} frames")
-        images = read_frames(partial(read_frame, frames), range(start, len(frames)))
-        sampled = samples_from_frames(surface, frames, images, part)
+        read, order = partial(read_frame, frames), range(start, len(frames))
+        sampled = samples_from_frames(surface, frames, read, order, part)
         for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
             observed.add(some, quantile)
             run.save_latest_in_time(name, some.frame, observed.arrays)

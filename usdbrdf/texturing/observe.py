@@ -5,13 +5,14 @@ Bounds around tiles of texels let a frame pass over most of those that it cannot
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.files.frames import FramePixels
+from usdbrdf.ahead import ahead
+from usdbrdf.files.frames import Read
 from usdbrdf.geometry.unwrap import MAX_SIDE
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
@@ -295,24 +296,24 @@ class Observation:
 def samples_from_frames(
     surface: TexturedScene,
     frames: Frames,
-    images: Iterable[tuple[int, FramePixels]],
+    read: Read,
+    order: Sequence[int],
     part: slice | None = None,
 ) -> Iterator[FrameSamples]:
-    """What frames show of the texels of ``part`` (None: all), one by one.
-
-    images  numbers and pixels of the frames, see ``read_frames``
-    """
+    """What the frames of ``order`` show of the texels of ``part`` (None: all), one by one; that of
+    the next ones is found while one is used."""
     texels = surface.texels
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
-    for i, pixels in images:
-        camera = frames.camera(i)
+
+    def samples(i: int) -> FrameSamples:
+        pixels, camera = read(i), frames.camera(i)
         which = blocks.texels_in_view(camera, MIN_COSINE)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
         picture = Picture(pixels.radiance, pixels.valid, pixels.clipped, pixels.dark)
         kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
         sampled, dark = kind == SAMPLE, kind == DARK
-        yield FrameSamples(
+        return FrameSamples(
             frame=i,
             texel=which[sampled],
             radiance=radiance[sampled],
@@ -322,6 +323,8 @@ def samples_from_frames(
             darkness=radiance[dark],
             noise_floor=float(frames.noise_floor_radiance[i]),
         )
+
+    return ahead(samples, order)
 
 
 def spread_order(count: int) -> list[int]:

@@ -43,9 +43,9 @@ class BytesPerTexel(NamedTuple):
     always: int = 0
 
 
-# Running statistics (144) and a texel's place among the blocks of texels while these are sorted
-# out; then what becomes of the results while the maps are made.
-OF_TEXTURING = BytesPerTexel(grouped=200, result=48, after=200)
+# Running statistics (144), a texel's place among the blocks of texels while these are sorted out,
+# and what the next frames show of it; then what becomes of the results while the maps are made.
+OF_TEXTURING = BytesPerTexel(grouped=220, result=48, after=200)
 
 
 def in_passes(
