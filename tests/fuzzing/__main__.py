@@ -166,28 +166,42 @@ def findings(results: Path) -> list[str]:
 
 def table(results: Path) -> str:
     """Per reader: inputs, share past the form, lines, findings."""
-    rows = [
-        "| reader | inputs | past the form | accepted | lines | crashes in a child | findings |"
-    ]
-    rows.append("| --- | --- | --- | --- | --- | --- | --- |")
+    heads = (
+        "reader",
+        "inputs",
+        "past the form",
+        "accepted",
+        "lines",
+        "crashes in a child",
+        "found",
+    )
+    rows = [" | ".join(heads), " | ".join(["---"] * len(heads))]
+    states = sorted(path for path in results.iterdir() if path.is_dir() and path.name in READERS)
+    figures = {
+        state.name: [json.loads(file.read_text()) for file in state.glob("figures-*.json")]
+        for state in states
+    }
     totals = [0, 0]
-    for state in sorted(path for path in results.iterdir() if path.is_dir()):
-        figures = [json.loads(file.read_text()) for file in state.glob("figures-*.json")]
-        inputs = sum(each["inputs"] for each in figures)
-        past = sum(each["past"] for each in figures) / max(inputs, 1)
-        accepted = sum(each["accepted"] for each in figures) / max(inputs, 1)
-        lines = max((each["lines"] for each in figures), default=0.0)
+    for state in states:
+        own = figures[state.name]
+        inputs, past, accepted = (
+            sum(each[key] for each in own) for key in ("inputs", "past", "accepted")
+        )
+        # Readers of the same lines, such as those of pictures, reach them together.
+        alike = [n for n in figures if READERS[n].lines == READERS[state.name].lines]
+        together = [each for name in alike for each in figures[name]]
+        missed = set.intersection(*(set(each["missed"]) for each in together)) if together else {1}
+        lines = 1 - len(missed) / (together[0]["lines"] if together else 1)
         crashes, found = (
             len((state / kind).read_text().splitlines()) if (state / kind).is_file() else 0
             for kind in ("crashes", "found")
         )
         totals = [totals[0] + inputs, totals[1] + found]
-        rows.append(
-            f"| {state.name} | {inputs} | {past:.0%} | {accepted:.0%} | {lines:.0%} | {crashes} "
-            f"| {found} |"
-        )
-    rows.append(f"| all | {totals[0]} | | | | | {totals[1]} |")
-    return "\n".join(rows)
+        shares = (f"{number / max(inputs, 1):.0%}" for number in (past, accepted))
+        rows.append(" | ".join((state.name, str(inputs), *shares, f"{lines:.0%}", str(crashes),
+                                str(found))))  # fmt: skip
+    rows.append(f"all | {totals[0]} | | | | | {totals[1]}")
+    return "\n".join(f"| {row} |" for row in rows)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ Rng = np.random.Generator
 _TEXT = (".json", ".sur", ".xml", ".xmp", ".csv", ".txt", ".obj", ".mtl", ".usda", ".ply")
 # Where headers are, and where most of what a reader decides by stands.
 _HEAD = 512
+_MOST_BYTES = 1 << 20  # what grows beyond takes time and tells no more
 _INTEGERS = (0, 1, -1, 2, 3, 127, 128, 255, 256, 32767, 65535, 65536, 2**31 - 1, -(2**31),
              2**32 - 1, 2**33, 2**62, 2**63 - 1, -(2**63))  # fmt: skip
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, float("nan"), float("inf"), -float("inf"), 1e-40, 1e38,
@@ -59,7 +60,7 @@ def mutated(name: str, content: bytes, rng: Rng, others: Sequence[bytes] = ()) -
             content = _text(content, rng)
         else:
             content = _bytes(content, rng, others)
-    return content
+    return content[:_MOST_BYTES]
 
 
 # --- Bytes ---------------------------------------------------------------------------------------
@@ -314,7 +315,8 @@ def _e57(content: bytes, rng: Rng) -> bytes:
     end = payload.find(b"</e57Root>") + len(b"</e57Root>")
     if start > 0 and end > start and rng.random() < 0.7:
         document = payload[start:end]
-        changed = _text(document, rng)[: end - start].ljust(end - start)
+        changed = _number_of_xml(document, rng) if rng.random() < 0.7 else _text(document, rng)
+        changed = changed[: end - start].ljust(end - start)
         payload = payload[:start] + changed + payload[end:]
     else:
         payload = _bytes(payload, rng, ())
@@ -326,6 +328,17 @@ def _e57(content: bytes, rng: Rng) -> bytes:
             value = table[(value ^ byte) & 255] ^ value >> 8
         made += page + struct.pack(">I", value ^ 0xFFFFFFFF)
     return made
+
+
+def _number_of_xml(document: bytes, rng: Rng) -> bytes:
+    """Another number in one of the elements that hold one, as long as the first."""
+    found = list(re.finditer(rb">(-?[\d.]+(?:e[-+]?\d+)?)<", document))
+    match = found[int(rng.integers(len(found)))]
+    value = repr(_FLOATS[int(rng.integers(len(_FLOATS)))] * float(rng.choice([1, 7, 0.3])))
+    width = match.end(1) - match.start(1)
+    return (
+        document[: match.start(1)] + value.encode()[:width].ljust(width) + document[match.end(1) :]
+    )
 
 
 _STRUCTURED: dict[str, Callable[[bytes, Rng], bytes]] = {

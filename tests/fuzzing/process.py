@@ -145,10 +145,6 @@ class Lines:
                     self.all |= set(_lines_of(function))
         self._files = frozenset(file for file, _ in self.all)
 
-    @property
-    def share(self) -> float:
-        return len(self.seen) / max(len(self.all), 1)
-
     @contextmanager
     def traced(self) -> Iterator[None]:
         sys.settrace(self._calls)
@@ -257,6 +253,7 @@ class Process:
             with self.lines.traced():
                 problem = self._called(seed)
             assert not problem, f"{reader.name}: a sound file: {problem}"
+        assert self.accepted == len(self.inputs.seeds), f"{reader.name}: a sound file is refused"
         self.past_the_form = self.accepted = 0
         own = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (own + MEMORY_BYTES, most))
@@ -340,7 +337,7 @@ def _store(state: Path, process: Process, done: int, slowest: float) -> None:
     missed = sorted(f"{Path(f).name}:{n}" for f, n in process.lines.all - process.lines.seen)
     figures = {
         "inputs": done, "past": process.past_the_form, "accepted": process.accepted,
-        "lines": process.lines.share, "missed": missed, "slowest": slowest, "peak": peak,
+        "lines": len(process.lines.all), "missed": missed, "slowest": slowest, "peak": peak,
     }  # fmt: skip
     temporary = state / f"figures-{os.getpid()}.tmp"
     temporary.write_text(json.dumps(figures))

@@ -82,7 +82,8 @@ _NAMED = "usdbrdf.capture.formats.named_pictures"
 def _whole_picture(path: Path) -> object:
     """All that is ever asked of a picture. NaN is what a picture may hold, its size not."""
     told = (image_size(path), colour_tag(path), exif_exposure(path), stored_space(path))
-    return told, is_eight_bit(path), read_exr(path).shape, read_radiance(path).shape
+    shape = read_exr(path).shape
+    return told, is_eight_bit(path), shape, shape[2] < 3 or read_radiance(path).shape
 
 
 def _published(path: Path) -> object:
@@ -173,21 +174,18 @@ READERS = {
             Reader(name=kind, seeds=getattr(seeds, kind), read=_whole_picture, lines=(_IMAGES,))
             for kind in ("exr", "hdr", "png", "jpeg", "tiff")
         ),
-        *(
-            Reader(
-                name=f"published-{kind}",
-                seeds=getattr(seeds, kind),
-                read=_published,
-                lines=(
-                    "usdbrdf.files.published_images:copy_without_metadata,_tells_more,_plain_spec,"
-                    "_hdr_without_metadata,_check_same",
-                ),
-            )
-            for kind in ("jpeg", "hdr")
+        Reader(
+            name="published",
+            seeds=seeds.pictures,
+            read=_published,
+            lines=(
+                "usdbrdf.files.published_images:copy_without_metadata,_tells_more,_plain_spec,"
+                "_hdr_without_metadata,_check_same",
+            ),
         ),
         Reader(
             name="environment",
-            seeds=lambda folder: [*seeds.exr(folder), *seeds.hdr(folder)],
+            seeds=seeds.lights,
             read=_environment,
             lines=(
                 "usdbrdf.untrusted.pictures:read_here,picture_from_file",
@@ -225,15 +223,17 @@ READERS = {
             name="colmap-text",
             seeds=seeds.colmap_text,
             read=lambda path: colmap_models.read_here(path / "sparse" / "0" / "images.txt"),
-            lines=("usdbrdf.untrusted.colmap_models:read_here,model_files",),
+            lines=("usdbrdf.untrusted.colmap_models",),
             in_child=True,
+            unknown=frozenset(("parameters", "camera_from_world")),
         ),
         Reader(
             name="colmap-binary",
             seeds=seeds.colmap_binary,
             read=lambda path: colmap_models.read_here(path / "sparse" / "0" / "images.bin"),
-            lines=("usdbrdf.untrusted.colmap_models:read_here,model_files",),
+            lines=("usdbrdf.untrusted.colmap_models",),
             in_child=True,
+            unknown=frozenset(("parameters", "camera_from_world")),
         ),
         Reader(
             name="e57-file",
@@ -268,7 +268,7 @@ READERS = {
             seeds=seeds.objects,
             lines=("usdbrdf.capture.parts:label_table,segmentation,objects_with_faces",),
         ),
-        _of_capture("colmap", photographs=True, seeds=seeds.colmap_text),
+        _of_capture("colmap", photographs=True, seeds=seeds.colmap),
         _of_capture("scanner-app"),
         _of_capture("eyeful-tower"),
         _of_capture("fipt"),
@@ -310,9 +310,8 @@ READERS = {
         Reader(
             name="arrays",
             seeds=seeds.arrays,
-            read=load_arrays,
+            read=lambda path: [array.shape for array in load_arrays(path).values()],
             lines=("usdbrdf.files.documents:load_arrays",),
-            unknown=frozenset(("albedo", "n")),
         ),
         Reader(
             name="truth",

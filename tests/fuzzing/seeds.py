@@ -133,6 +133,17 @@ def dng(folder: Path) -> list[Seed]:
     return _alone(folder / "a.dng")
 
 
+def pictures(folder: Path) -> list[Seed]:
+    """Of every format, with metadata."""
+    made = [*exr(folder)[2:4], *hdr(folder), *png(folder), *jpeg(folder), *tiff(folder)]
+    return [*made, *_alone(_picture(folder / "told.png", "uint8", Artist="me", Software="it"))]
+
+
+def lights(folder: Path) -> list[Seed]:
+    """Pictures that hold radiance."""
+    return [seed for seed in (*exr(folder), *hdr(folder)) if "window" not in seed.entry.name]
+
+
 # --- Meshes --------------------------------------------------------------------------------------
 
 
@@ -213,7 +224,7 @@ def objects(folder: Path) -> list[Seed]:
     """objects.json beside a mesh with labels, with directives and with a label for each face."""
     made = make_capture(folder / "a", frames=8, size=(12, 10), subdivisions=1)
     document = json.loads((made.folder / "objects.json").read_text("utf-8"))
-    document["objects"][0]["directive"] = "mirror"
+    document["objects"][0]["directive"] = "metal"
     document["face_object_id"] = made.face_object.tolist()
     (made.folder / "objects.json").write_text(json.dumps(document))
     return _capture(made.folder, "objects.json")
@@ -240,6 +251,11 @@ def colmap_binary(folder: Path) -> list[Seed]:
         text.unlink()
     return _capture(seed.entry, "sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/rigs.bin",
                     "sparse/0/frames.bin")  # fmt: skip
+
+
+def colmap(folder: Path) -> list[Seed]:
+    """As text and as binary files."""
+    return [*colmap_text(folder / "text"), *colmap_binary(folder / "binary")]
 
 
 def scanner_app(folder: Path) -> list[Seed]:
@@ -368,7 +384,7 @@ def materials(folder: Path) -> list[Seed]:
     dome = UsdLux.DomeLight.Define(stage, "/dome")
     dome.CreateTextureFileAttr("glow.exr")
     stage.GetRootLayer().Save()
-    stage.Export(str(folder / "lights.usda"))
+    stage.GetRootLayer().Export(str(folder / "lights.usda"))
     return _alone(folder / "thing.usda", folder / "lights.usda", folder / "lights.usdc")
 
 
@@ -442,8 +458,10 @@ def matrices(folder: Path) -> list[Seed]:
     return _alone(folder / "matrix.txt")
 
 
-NEEDS = {"colmap_text": "pycolmap", "colmap_binary": "pycolmap", "scannetpp": "pycolmap",
-         "e57": "pye57", "dng": "rawpy"}  # fmt: skip
+NEEDS = {
+    **dict.fromkeys(("colmap", "colmap_text", "colmap_binary", "scannetpp"), "pycolmap"),
+    **{"e57": "pye57", "dng": "rawpy"},
+}
 
 
 def missing(seeds: str) -> str:

@@ -18,7 +18,7 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 # What starts fast comes every time; the others, whose sound files take seconds to read first, at
 # night with all the rest (.ci/nightly).
 _QUICK = (
-    "exr", "hdr", "png", "jpeg", "tiff", "published-jpeg", "ply", "obj", "glb", "labelled-ply",
+    "exr", "hdr", "png", "jpeg", "tiff", "published", "ply", "obj", "glb", "labelled-ply",
     "usd", "usd-materials", "review", "stamp", "manifest", "arrays", "truth", "matrix",
     "transforms", "objects", "eyeful-tower", "llff", "nice-slam", "metashape", "realityscan",
 )  # fmt: skip
