@@ -128,7 +128,8 @@ def _refuse_promises(file: Path) -> None:
                     raise EOFError("it ends within a record")
     except EOFError as error:
         raise InputRefused(
-            f"{file}: damaged, {error} in {size} bytes. Export the model again. [colmap.model]"
+            f"{file}: COLMAP cannot read this model: {error} in {size} bytes. Export it again. "
+            "[colmap.model]"
         ) from error
 
 
