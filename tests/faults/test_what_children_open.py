@@ -128,7 +128,8 @@ def _strangers(trace: str, capture: Path) -> set[str]:
         if call.startswith("execve(") and process != first and "child import main" in call:
             children.add(process)
             continue
-        if process not in children or " = -1 " in call:
+        told = not call.startswith(("<...", "+++", "---"))  # where a call ends, and signals
+        if process not in children or " = -1 " in call or not told:
             continue
         if begun := re.match(r"(?:clone3?|v?fork)\(.* = (\d+)$", call):
             children.add(begun[1])  # a thread of it, or what it starts
@@ -144,7 +145,7 @@ def _strangers(trace: str, capture: Path) -> set[str]:
         elif writes:
             allowed = relative or path.startswith((scratch, "/dev/null"))
         else:
-            allowed = relative or path.startswith((scratch, *readable))
+            allowed = relative or any(p.startswith((scratch, *readable)) for p in (path, name[1]))
         if not allowed:
             found.add(call)
     assert children, "no child was seen"

@@ -345,7 +345,7 @@ def scan_from_parts(
     if options.encoding is None and encoding in ("lin_rec709_scene", PHOTOGRAPH_ENCODING):
         encoding = tagged_encoding(records, encoding, findings, source)
     for record in records:
-        if max(record.resolution) > MAX_SIDE:
+        if max(map(abs, record.resolution)) > MAX_SIDE:
             raise InputRefused(
                 f"{source}: the camera of {record.name!r} has {record.resolution[0]} x "
                 f"{record.resolution[1]} pixels (limit {MAX_SIDE} a side). Export the cameras "
