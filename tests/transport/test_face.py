@@ -10,7 +10,7 @@ import usdbrdf
 PACKAGE = Path(usdbrdf.__file__).parent
 FACE = {
     "rays", "lit_scene", "surface_texture", "environment", "lights", "irradiance",
-    "lobe_radiance", "renderer_match", "sunlight", "brdf", "warps", "denoise",
+    "lobe_radiance", "let_through", "renderer_match", "sunlight", "brdf", "warps", "denoise",
 }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions, Surroundings
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
+from usdbrdf.transport.let_through import share_let_through
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
@@ -326,8 +327,10 @@ def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int)
     owner = seen.lit.owner(points.face)
     known = np.isfinite(seen.phi) & np.isfinite(seen.psi).all(axis=1)
     reflects = np.flatnonzero(hit & ~lamp & known[owner])
-    owner = owner[reflects]
-    values[reflects, 3:6] += lobe_radiance(
-        seen.lit, points.take(reflects), seen.phi[owner], seen.psi[owner], rays, seed
-    )
+    owner, shown = owner[reflects], points.take(reflects)
+    phi, psi = seen.phi[owner], seen.psi[owner]
+    if seen.lit.lobe == DIELECTRIC:
+        cosine = (shown.normal * shown.to_camera).sum(axis=1)
+        values[reflects, 3:6] *= share_let_through(phi, psi, cosine)[:, None]
+    values[reflects, 3:6] += lobe_radiance(seen.lit, shown, phi, psi, rays, seed)
     return values

@@ -40,10 +40,11 @@ from usdbrdf.texturing.passes import (
     smallest_groups,
 )
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
-from usdbrdf.transport.brdf import F0_OF_PSI
+from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at
+from usdbrdf.transport.let_through import share_let_through
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
@@ -114,6 +115,7 @@ _MOST_SAMPLES = 24
 # and what it is lit by.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=150, always=24)
 _RELATIVE_ERROR = calibration.number("refine.relative_error")
+_OF_LOBE = calibration.number("refine.of_lobe")
 _OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
 _DARKEST = calibration.number("refine.darkest")
 
@@ -297,11 +299,14 @@ def _means_without_lobes(
             of_texel = lobes.take(owner[texel])
             own_seed = seed + len(frames) + some.frame
             specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
-            unit, covered = level[texel], footprints(texels, texel, camera)
+            covered = footprints(texels, texel, camera)
+            unit = level[texel] * _let_through(lit, of_texel, texel, camera.eye)
             noise = np.float32(_OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
+            of_lobe = _OF_LOBE * np.abs(specular).mean(axis=1) / unit
             # A wide view of a texel says less of it than its noise tells.
             wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-            deviation = np.asarray(np.hypot(_RELATIVE_ERROR, noise) * wide, np.float32)
+            error = np.sqrt(_RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
+            deviation = np.asarray(error * wide, np.float32)
             values = (some.radiance[taken] - specular) / unit[:, None]
             update(observed, texel - np.int32(part.start), values, deviation, covered)
             run.save_latest_in_time(name, done, observed._asdict)
@@ -341,6 +346,16 @@ def _subsample(texel: Int, samples: Float, frame: int, seed: int) -> Bool:
     chance = shifts_of(texel[many].astype(np.int64), 1, seed + frame)[:, 0]
     taken[many] = chance * samples[many] < _MOST_SAMPLES
     return taken
+
+
+def _let_through(lit: LitScene, lobes: Lobes, texel: Int, eye: Double) -> Float:
+    """By how much the diffuse part of texels (M,), each with a lobe of its own, is brighter towards
+    ``eye`` than on the mean; see ``share_let_through``."""
+    if lit.lobe != DIELECTRIC:
+        return np.ones(len(texel), np.float32)
+    to_eye = eye - lit.texels.position[texel]
+    cosine = (lit.texels.normal[texel] * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
+    return np.where(lobes.conducts, 1, share_let_through(lobes.phi, lobes.psi, cosine))
 
 
 def _specular(

@@ -157,11 +157,21 @@ def fitted_albedo(
     phi: float, f0: Double, cosines: Double | None = None, *, kind: int = PAPER
 ) -> Double:
     """(V, N) directional albedo of a fitted kind of lobe for reflectances F0 (N,)."""
+    base, rise, _ = albedo_of_parts(phi, cosines, kind=kind)
+    return np.asarray(share_of_base(f0, kind) * base[:, None] + f0 * rise[:, None])
+
+
+def albedo_of_parts(
+    phi: float, cosines: Double | None = None, *, kind: int = PAPER
+) -> tuple[Double, Double, Double]:
+    """(V,) each: what the parts ``base`` and ``rise`` of F (see ``brdf.reflectance``) reflect, and
+    what F = 1 would."""
     lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
     y = width_of_masking(phi, kind)
     g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
-    base, rise = reflectance(_WH[:, None], kind)
-    return np.asarray(_over_cosines(lobe, g) @ (share_of_base(f0, kind) * base + f0 * rise))
+    weights = _over_cosines(lobe, g)
+    base, rise = reflectance(_WH, kind)
+    return weights @ base, weights @ rise, weights.sum(axis=1)
 
 
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:

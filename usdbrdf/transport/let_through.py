@@ -1,0 +1,71 @@
+"""What the surface of a dielectric lets through: light that comes out of it after it was scattered
+below has to pass it, and at grazing angles most does not.
+
+Of light from direction v the facets that are seen from there reflect the share A(v), the mean of F
+over them, and let 1 - A(v) through, either way. Seen from v the diffuse part is therefore brighter
+than its mean over the hemisphere, the one that lights other surfaces, by
+
+    t(v) = (1 - A(v)) / (2 integral of (1 - A) cos dcos).
+
+So it is of the renderers' lobe (DIELECTRIC). The paper's diffuse part is the same from everywhere.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf.model.arrays import Double, Float, Long
+from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI, share_of_base
+from usdbrdf.transport.renderer_match import albedo_of_parts, view_cosines
+
+# Knots of the table; the square root of phi and the cosine are even.
+_PHIS, _COSINES = 17, 33
+_LEAST_COSINE = 1e-3
+
+
+class _Table(NamedTuple):
+    """A = share_of_base base + F0 rise at knots (phi, cosine), and the means of both over the
+    hemisphere, (phi, 1)."""
+
+    base: Double
+    rise: Double
+    base_mean: Double
+    rise_mean: Double
+
+
+@cache
+def _table() -> _Table:
+    phis = (np.linspace(0, 1, _PHIS) ** 2).tolist()
+
+    def of_facets(cosines: Double) -> tuple[Double, Double]:
+        parts = np.array([albedo_of_parts(phi, cosines, kind=DIELECTRIC) for phi in phis])
+        base, rise, white = np.moveaxis(parts, 1, 0)
+        return base / white, rise / white
+
+    base, rise = of_facets(np.maximum(np.linspace(0, 1, _COSINES), _LEAST_COSINE))
+    means = (part.mean(axis=1, keepdims=True) for part in of_facets(view_cosines()))
+    return _Table(base, rise, *means)
+
+
+def share_let_through(phi: Float, psi: Float, cosine: Float | Double) -> Float:
+    """t (N,) of lobes phi, psi (N,), or psi (N, 3) of which the mean counts, seen at the ``cosine``
+    (N,) from the normal; bilinear in a table."""
+    row = np.sqrt(np.clip(phi, 0, 1), dtype=np.float64) * (_PHIS - 1)
+    column = np.clip(cosine, 0, 1, dtype=np.float64) * (_COSINES - 1)
+    i, j = (np.minimum(x.astype(np.intp), n - 2) for x, n in ((row, _PHIS), (column, _COSINES)))
+    table, up, across = _table(), row - i, column - j
+
+    def along_phi(values: Double, k: Long | int) -> Double:
+        return np.asarray((1 - up) * values[i, k] + up * values[i + 1, k])
+
+    def looked_up(values: Double) -> Double:
+        return np.asarray((1 - across) * along_phi(values, j) + across * along_phi(values, j + 1))
+
+    f0 = F0_OF_PSI * np.clip(psi.mean(axis=1) if psi.ndim == 2 else psi, 0, 1, dtype=np.float64)
+    share = share_of_base(f0, DIELECTRIC)
+    own = share * looked_up(table.base) + f0 * looked_up(table.rise)
+    mean = share * along_phi(table.base_mean, 0) + f0 * along_phi(table.rise_mean, 0)
+    return np.asarray((1 - own) / (1 - mean), np.float32)
