@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.transport.brdf import F0_OF_PSI, dielectric_fresnel
-from usdbrdf.transport.let_through import share_let_through
+from usdbrdf.transport.let_through import kept_below, share_let_through
 
 # Cosines that weigh alike under uniform light.
 EVEN = np.sqrt((np.arange(4000) + 0.5) / 4000)
@@ -48,3 +48,12 @@ def test_of_a_lobe_with_colours_the_mean_counts():
     phi, cosine = np.full(1, 0.1, np.float32), np.full(1, 0.3)
     coloured = share_let_through(phi, np.array([[0.2, 0.5, 0.8]], np.float32), cosine)
     np.testing.assert_allclose(coloured, share_let_through(phi, np.array([0.5]), cosine))
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.15, 0.6])
+def test_what_the_fit_takes_off_is_the_same_to_first_order(phi: float):
+    cosine = np.cos(np.radians([0, 20, 40, 60, 70, 75])).astype(np.float32)
+    base, slope = (part[:, 1] for part in kept_below([0.9, phi], cosine))
+    for psi in (0.4, 0.8):
+        found = 1 - (base + psi * slope)
+        np.testing.assert_allclose(found, _let_through(phi, psi, cosine), atol=0.025)

@@ -29,7 +29,8 @@ from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import CONDUCTOR, PAPER
+from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
+from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
 
@@ -87,14 +88,34 @@ class SampledObject(NamedTuple):
             lobe_basis(part.lit, part.footprints[width], len(stream), seed, self.mixture, stream)
             for part, stream in zip(self.parts, streams, strict=True)
         ]
-        if len(of_parts) == 1:
-            return of_parts[0]
 
         def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
             bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
-            return np.concatenate(bases), np.concatenate(slopes)
+            base, slope = np.concatenate(bases), np.concatenate(slopes)
+            if kind != DIELECTRIC:
+                return base, slope
+            kept = kept_below(phis, self._cosine(width))
+            taken = self._mean_of_texel[..., None] * np.stack(kept)[:, :, None]
+            return base - taken[0], slope - taken[1]
 
         return basis
+
+    def _cosine(self, width: int) -> Float:
+        """(P,): of the angle between the normal and the camera, the mean over the footprint."""
+        found = []
+        for part in self.parts:
+            points = part.footprints[width]
+            cosine = (points.normal * points.to_camera).sum(axis=1)
+            found.append(cosine.reshape(len(part.observed.texel), -1).mean(axis=1))
+        return np.concatenate(found)
+
+    @property
+    def _mean_of_texel(self) -> Float:
+        """(P, 3) W/(m^2 sr): about its diffuse radiance, what the lobe adds being much less."""
+        texel, radiance = self.samples.texel, self.samples.radiance
+        sums = np.stack([np.bincount(texel, channel) for channel in radiance.T], axis=1)
+        means: Float = (sums / np.bincount(texel)[:, None])[texel].astype(np.float32)
+        return means
 
     @property
     def irradiance(self) -> Float | None:

@@ -12,6 +12,7 @@ So it is of the renderers' lobe (DIELECTRIC). The paper's diffuse part is the sa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -48,6 +49,26 @@ def _table() -> _Table:
     base, rise = of_facets(np.maximum(np.linspace(0, 1, _COSINES), _LEAST_COSINE))
     means = (part.mean(axis=1, keepdims=True) for part in of_facets(view_cosines()))
     return _Table(base, rise, *means)
+
+
+def kept_below(phis: Sequence[float], cosine: Float) -> tuple[Float, Float]:
+    """(base, slope), (P, K) each, for K roughnesses and P cosines: 1 - t is base + psi slope, to
+    first order in A, where psi is not next to 0."""
+    table = _table()
+    place = np.clip(cosine, 0, 1, dtype=np.float64) * (_COSINES - 1)
+    rows = np.sqrt(np.clip(phis, 0, 1)) * (_PHIS - 1)
+
+    def beyond_mean(values: Double, mean: Double) -> Float:
+        beyond = values - mean
+        of_phi = [[np.interp(row, range(_PHIS), column) for column in beyond.T] for row in rows]
+        found = [np.interp(place, range(_COSINES), curve) for curve in of_phi]
+        return np.stack(found, axis=1).astype(np.float32)
+
+    base, rise = (
+        beyond_mean(values, mean)
+        for values, mean in ((table.base, table.base_mean), (table.rise, table.rise_mean))
+    )
+    return base, np.float32(F0_OF_PSI) * rise
 
 
 def share_let_through(phi: Float, psi: Float, cosine: Float | Double) -> Float:
