@@ -27,8 +27,11 @@ SLOW = (
     "evaluation",
     "faults/test_bad_captures.py",
     "faults/test_frames_that_disagree.py",
+    "faults/test_hostile_files.py",
     "faults/test_kill_resume.py",
     "faults/test_two_at_once.py",
+    "faults/test_what_children_open.py",
+    "fuzzing",
     "job/test_child.py",
     "job/test_disturbed.py",
     "job/test_kill_resume.py",
@@ -59,6 +62,8 @@ SLOW = (
 
 # Sweeps whose cases take seconds each: every third runs for each change, the others at night.
 SWEEPS = (
+    "faults/test_hostile_files.py::test_a_promise_is_refused_and_not_made_room_for",
+    "faults/test_hostile_files.py::test_a_stage_that_leads_out_is_refused",
     "faults/test_kill_resume.py::test_killed_step_resumes_to_the_same_bytes",
     "job/test_kill_resume.py::test_killed_run_resumes_to_the_same_bytes",
     "job/test_kill_resume.py::test_full_disk_keeps_the_previous_asset_and_resumes",
@@ -76,6 +81,8 @@ SWEEPS = (
 NIGHTLY = (
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
     "faults/test_two_at_once.py::test_nobody_sees_half_a_run_and_an_artist_may_save",
+    "faults/test_what_children_open.py::"
+    "test_children_open_the_capture_and_their_own_libraries_alone",
     "job/test_first_run.py::test_what_a_run_needs_was_compiled",
     "material/test_fit_lobe.py::test_errors_that_frames_share_are_no_lobe",
     "material/test_fit_lobe.py::test_the_footprint_that_fits_is_the_one_that_is_used",

@@ -125,8 +125,6 @@ OPENERS: dict[str, str] = {
     "identity.py": "hashes the sources",
     "kernel.py": "compiled code",
     "page/": "the page's own parts",
-    "evaluation/metrics.py": "truth comes as .npz",
-    "command_parser.py": "a matrix comes as a text file",
     "validation/validate.py": "the layer of cures is an artist's file",
 }
 _OPEN = {

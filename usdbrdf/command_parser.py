@@ -218,12 +218,14 @@ def _matrix(text: str) -> Any:
     """(4, 4) float64, world from model."""
     import numpy as np
 
+    from usdbrdf.files.tables import number_rows
+
     path = Path(text)
     if not path.is_file():
         raise InputRefused(f"{path}: no such file. Check the path. [usage.file]")
     try:
-        matrix = np.loadtxt(path).reshape(4, 4)
-    except (ValueError, UnicodeDecodeError) as error:
+        matrix = np.array(number_rows(path)).reshape(4, 4)
+    except (ValueError, InputRefused) as error:
         raise InputRefused(
             f"{path}: expected 4 rows of 4 numbers, world from model. Correct it. [relight.matrix]"
         ) from error

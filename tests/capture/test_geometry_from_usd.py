@@ -400,3 +400,29 @@ def test_a_compressed_package_is_no_usdz_and_is_not_blown_up(tmp_path):
     assert (tmp_path / "a.usdz").stat().st_size < 2 << 20
     with pytest.raises(InputRefused, match=r"a\.usdz: .*\[(stage|mesh)\.\w+\]$"):
         meshes_from_usd(tmp_path / "a.usdz")
+
+
+def test_subsets_of_several_meshes_stay_with_their_mesh(tmp_path):
+    """Two meshes of four triangles; the first one of the first, the last three of the second."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scan").GetPrim())
+    for name, own in (("a", [0]), ("b", [1, 2, 3])):
+        mesh = UsdGeom.Mesh.Define(stage, f"/scan/{name}")
+        mesh.CreatePointsAttr([(i % 3, i // 3, 0) for i in range(6)])
+        mesh.CreateFaceVertexCountsAttr([3] * 4)
+        mesh.CreateFaceVertexIndicesAttr([0, 1, 3, 1, 4, 3, 1, 2, 4, 2, 5, 4])
+        mesh.CreateSubdivisionSchemeAttr("none")
+        UsdGeom.Subset.CreateGeomSubset(mesh, f"part_of_{name}", "face", own, "objects")
+    stage.Save()
+    found = meshes_from_usd(tmp_path / "a.usda", subsets=True)
+    names = [found.objects[i].label for i in found.mesh.face_object]
+    assert names == ["part_of_a", "a", "a", "a", "b", "part_of_b", "part_of_b", "part_of_b"]
+
+
+@pytest.mark.fault("S4")
+def test_text_that_is_not_utf_8_ends_in_a_sentence(tmp_path):
+    """USD hands bytes on as they are, also in what it says of them."""
+    for i, text in enumerate((b'#usda 1.0\ndef "\xff" {}\n', b'#usda 1.0\n(\n doc = "\xb7\n)\n')):
+        (tmp_path / f"{i}.usda").write_bytes(text)
+        with pytest.raises(InputRefused, match=r"\.usda: .*\[(stage\.\w+|mesh\.empty)\]$"):
+            meshes_from_usd(tmp_path / f"{i}.usda")

@@ -25,7 +25,7 @@ PATCHES = np.array([[0.3, 0.3, 0.3], [0.4, 0.2, 0.15], [0.1, 0.25, 0.12], [0.12,
 SIDE = 32
 
 
-def _dng(path, exposure_s, *, light=1.0, neutral=None, clipped=False):
+def write_dng(path, exposure_s, *, light=1.0, neutral=None, clipped=False):
     """Patches in a row, RGGB, exposed so that at 1/50 s a radiance of 1 is half of the range."""
     white = CAMERA @ XYZ @ np.ones(3)
     neutral = white / white.max() if neutral is None else neutral
@@ -71,9 +71,9 @@ def capture(tmp_path):
     made = make_capture(tmp_path / "capture", frames=3, size=(4 * SIDE, SIDE))
     white = CAMERA @ XYZ @ np.ones(3)
     warm = white / white.max() * (1.0, 1.0, 0.8)
-    _dng(made.folder / "frames/0000.dng", 1 / 50)
-    _dng(made.folder / "frames/0001.dng", 1 / 200, neutral=warm)
-    _dng(made.folder / "frames/0002.dng", 1 / 50, clipped=True)
+    write_dng(made.folder / "frames/0000.dng", 1 / 50)
+    write_dng(made.folder / "frames/0001.dng", 1 / 200, neutral=warm)
+    write_dng(made.folder / "frames/0002.dng", 1 / 50, clipped=True)
     with edited(made.folder / "transforms.json") as document:
         for i, frame in enumerate(document["frames"]):
             frame["file_path"] = f"frames/{i:04d}.dng"

@@ -216,15 +216,23 @@ def _outside(made):
     write_model(made.folder / "sparse/0", reconstruction(made, [camera_of("PINHOLE")], names))
 
 
+def _wide(made):
+    camera = camera_of("PINHOLE")
+    camera.width = 1 << 40
+    names = [f"{i:04d}.exr" for i in range(10)]
+    write_model(made.folder / "sparse/0", reconstruction(made, [camera], names))
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
+        (_wide, ["1099511627776 x 36 pixels", "[capture.camera]"]),
         (_cut, ["sparse/0", "cannot read this model", "[colmap.model]"]),
         (_outside, ["x.exr", "[paths.outside]"]),
         (lambda made: shutil.rmtree(made.folder / "images"), ["none of", "[colmap.images]"]),
         (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[mesh.missing]"]),
     ],
-    ids=["cut off", "outside", "no images", "no mesh"],
+    ids=["wide", "cut off", "outside", "no images", "no mesh"],
 )
 def test_what_is_refused(tmp_path, edit, words):
     made = colmap_capture(tmp_path / "room", "PINHOLE")

@@ -74,8 +74,12 @@ def room():
 
 @pytest.fixture
 def survey(tmp_path, room):
-    folder = tmp_path / "survey"
-    folder.mkdir()
+    return write_survey(tmp_path / "survey", room)
+
+
+def write_survey(folder, room):
+    """Stations with pinhole pictures, and a mesh beside them; returns the folder."""
+    folder.mkdir(parents=True)
     _write(folder / "scan.e57", _pinholes(room))
     for i, image in enumerate(room.images):
         write_image(folder / "images" / f"station {i}.jpg", image)

@@ -28,7 +28,12 @@ def room():
 
 @pytest.fixture
 def capture(tmp_path, room):
-    folder, rows = tmp_path / "office1a", []
+    return write_rig(tmp_path / "office1a", room)
+
+
+def write_rig(folder, room):
+    """The room as this data set has its own; returns the folder."""
+    rows = []
     for i, pose in enumerate(room.opencv):
         name = f"{i % 2}/{i % 2}_REN{i:04d}"
         fx, fy, cx, cy = room.intrinsics[i] * _FULL

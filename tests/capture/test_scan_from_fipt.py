@@ -37,7 +37,11 @@ def room():
 
 @pytest.fixture
 def photographed(tmp_path, room):
-    folder = tmp_path / "classroom"
+    return write_photographed(tmp_path / "classroom", room)
+
+
+def write_photographed(folder, room):
+    """Cameras as tables of numbers; returns the folder."""
     cameras, lenses = [str(FRAMES)], [str(FRAMES)]
     for i, pose in enumerate(room.world_from_camera):
         origin, up, ahead = pose[:3, 3], pose[:3, 1], -pose[:3, 2]
@@ -55,8 +59,12 @@ def photographed(tmp_path, room):
 
 @pytest.fixture
 def rendered(tmp_path, room):
-    """Eight frames to train and two to validate; x left, y up, looking down +z."""
-    folder = tmp_path / "kitchen"
+    return write_rendered(tmp_path / "kitchen", room)
+
+
+def write_rendered(folder, room):
+    """Eight frames to train and two to validate; x left, y up, looking down +z. Returns the
+    folder."""
     centred = room.centred()
     for split, numbers in (("train", range(8)), ("val", range(8, FRAMES))):
         frames = []

@@ -21,7 +21,11 @@ def room():
 
 @pytest.fixture
 def capture(tmp_path, room):
-    folder = tmp_path / "head"
+    return write_llff(tmp_path / "head", room)
+
+
+def write_llff(folder, room):
+    """Poses as LLFF's own writer stores them; returns the folder."""
     rows = []
     for pose, lens in zip(room.opencv, room.intrinsics, strict=True):
         hwf = np.array([[HEIGHT], [WIDTH], [lens[0]]])
@@ -30,7 +34,7 @@ def capture(tmp_path, room):
             [pose[:3, 1:2], pose[:3, 0:1], -pose[:3, 2:3], pose[:3, 3:], hwf], 1
         )
         rows.append([*matrix.ravel(), 0.5, 9.0])
-    folder.mkdir()
+    folder.mkdir(parents=True)
     np.save(folder / "poses_bounds.npy", np.array(rows))
     for i, image in enumerate(room.images):
         write_image(folder / "images" / f"IMG_{i:04d}.jpg", image)

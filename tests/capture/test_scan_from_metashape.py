@@ -90,6 +90,11 @@ def _write(folder, document, room, suffix=".jpg"):
 
 @pytest.fixture
 def project(tmp_path, room):
+    return write_project(tmp_path / "project", room)
+
+
+def write_project(folder, room):
+    """One sensor, cameras in a group and beside it; returns the folder."""
     document, sensors, cameras = _chunk()
     _sensor(sensors, 0, **_lens(room))
     group = _child(cameras, "group", id="0", label="walk", type="folder")
@@ -99,7 +104,7 @@ def project(tmp_path, room):
         parent = group if i > 5 else cameras
         camera = _child(parent, "camera", id=str(i), sensor_id="0", label=label)
         _child(camera, "transform", _text(_in_chunk(pose)))
-    return _write(tmp_path / "project", document, room)
+    return _write(folder, document, room)
 
 
 def test_cameras_of_a_chunk(project, room):

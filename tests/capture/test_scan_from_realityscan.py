@@ -24,7 +24,7 @@ def room():
     return truth().square()
 
 
-def _pictures(folder, room):
+def write_pictures(folder, room):
     for i, image in enumerate(room.images):
         write_image(folder / "images" / f"IMG_{i:04d}.jpg", image)
     write_obj(folder / "model.obj", room)
@@ -37,7 +37,7 @@ def _lens(room):
     return fx / WIDTH * 36, (cx - WIDTH / 2) / WIDTH, (cy - HEIGHT / 2) / WIDTH
 
 
-def _write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=","):
+def write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=","):
     f, px, py = _lens(room)
     rows = [header]
     for i, pose in enumerate(room.world_from_camera):
@@ -53,7 +53,7 @@ def _write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=",
 
 @pytest.mark.parametrize(("header", "separator"), [(_COLUMNS, ","), (_NEWER, ";")])
 def test_cameras_of_the_table(tmp_path, room, header, separator):
-    folder = _write_table(_pictures(tmp_path / "scan", room), room, header, separator=separator)
+    folder = write_table(write_pictures(tmp_path / "scan", room), room, header, separator=separator)
     assert choose_adapter(folder).name == "realityscan"
     scan = read_scan(folder, OPTIONS)
     assert_same(scan, room, names=room.names)
@@ -62,7 +62,14 @@ def test_cameras_of_the_table(tmp_path, room, header, separator):
 
 @pytest.mark.parametrize("as_attributes", [False, True])
 def test_cameras_of_sidecars(tmp_path, room, as_attributes):
-    folder = _pictures(tmp_path / "scan", room)
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=as_attributes)
+    assert choose_adapter(folder).name == "realityscan"
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def write_sidecars(folder, room, *, as_attributes):
+    """XMP beside each picture, its values as attributes or as elements; returns the folder."""
+    write_pictures(folder, room)
     f, u, v = _lens(room)
     for i, pose in enumerate(room.opencv):
         # x_camera = R (X - position)
@@ -84,13 +91,12 @@ def test_cameras_of_sidecars(tmp_path, room, as_attributes):
             f'xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">{elements}'
             "</rdf:Description></rdf:RDF></x:xmpmeta>"
         )
-    assert choose_adapter(folder).name == "realityscan"
-    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+    return folder
 
 
 def test_the_lens_is_a_polynomial_of_the_ray(tmp_path, room):
-    folder = _pictures(tmp_path / "scan", room)
-    _write_table(folder, room, bent="-0.1,0.06,-0.01,0.002,0.003,0.004")
+    folder = write_pictures(tmp_path / "scan", room)
+    write_table(folder, room, bent="-0.1,0.06,-0.01,0.002,0.003,0.004")
     pictures = pictures_of(folder, OPTIONS)
     record, *_ = records_of_table(folder / "registration.csv", pictures, Findings())
     points = np.random.default_rng(0).uniform((-0.6, -0.5, -1.2), (0.6, 0.5, -1), (50, 3))
@@ -153,7 +159,7 @@ def _degrees(folder):
     ],
 )
 def test_refusals(tmp_path, room, damage, sentence):
-    folder = _write_table(_pictures(tmp_path / "scan", room), room)
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
     damage(folder)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(folder, OPTIONS)

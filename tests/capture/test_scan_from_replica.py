@@ -26,8 +26,12 @@ def room():
 
 @pytest.fixture
 def scene(tmp_path, room):
-    """<dataset>/room0 with traj.txt and results/, the mesh and the camera beside it."""
-    folder = tmp_path / "Replica" / "room0"
+    return write_scene(tmp_path / "Replica" / "room0", room)
+
+
+def write_scene(folder, room):
+    """<dataset>/room0 with traj.txt and results/, the mesh and the camera beside it; returns the
+    folder."""
     (folder / "results").mkdir(parents=True)
     # The loader makes its own camera of these: columns 1 and 2 negated, -z ahead.
     rows = [" ".join(f"{number:.18e}" for number in pose.ravel()) for pose in room.opencv]
@@ -60,7 +64,7 @@ def _write_semantic_ply(path, polygons, points, object_id):
     path.write_bytes(header.encode() + body)
 
 
-def _write_semantics(folder, room):
+def write_semantics(folder, room):
     """Other polygons than the mesh's: each square once whole and the box in triangles."""
     (folder / "habitat").mkdir()
     box = room.names.index("box")
@@ -105,7 +109,7 @@ def test_the_other_frames_keep_their_poses(scene, room):
 
 def test_labels_come_by_the_nearest_face_and_panes_are_objects(scene, room):
     write_ply(scene / "mesh.ply", room.points, room.triangles)
-    _write_semantics(scene, room)
+    write_semantics(scene, room)
     # A window in the wall y = 0, over the lower half of it.
     border = [[0, 0, 0], [4, 0, 0], [4, 0, 1.25], [0, 0, 1.25]]
     pane = {"plane_w": [0, 1, 0, 0], "boundary_w": border, "centroid_w": [2, 0, 0.625]}
@@ -125,7 +129,7 @@ def test_labels_come_by_the_nearest_face_and_panes_are_objects(scene, room):
 
 def test_replica_without_frames_is_refused_with_the_way_out(scene, room):
     write_ply(scene / "mesh.ply", room.points, room.triangles)
-    _write_semantics(scene, room)
+    write_semantics(scene, room)
     (scene / "traj.txt").unlink()
     assert choose_adapter(scene).name == "replica"
     with pytest.raises(InputRefused, match=r"no photographs.*traj.txt.*\[capture.frames\]"):
@@ -173,7 +177,7 @@ def test_refusals(scene, damage, sentence):
 
 def test_damaged_labels_are_refused(scene, room):
     write_ply(scene / "mesh.ply", room.points, room.triangles)
-    _write_semantics(scene, room)
+    write_semantics(scene, room)
     path = scene / "habitat" / "mesh_semantic.ply"
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputRefused, match=r"ends within its faces.*\[objects.format\]"):

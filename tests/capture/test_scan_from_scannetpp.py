@@ -25,7 +25,11 @@ def room():
 
 @pytest.fixture
 def scene(tmp_path, room):
-    folder = tmp_path / "0a5c013435"
+    return write_scene(tmp_path / "0a5c013435", room)
+
+
+def write_scene(folder, room):
+    """A scene with a COLMAP model of text, a scan and its annotations; returns the folder."""
     model = folder / "dslr" / "colmap"
     model.mkdir(parents=True)
     lens = " ".join(str(number) for number in room.intrinsics[0])

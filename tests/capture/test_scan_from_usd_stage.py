@@ -22,9 +22,9 @@ def room():
     return truth()
 
 
-def _stage(path, room, *, parts=True, unit=1.0):
+def make_stage(path, room, *, parts=True, unit=1.0):
     """The room's meshes below /room; ``parts`` as prims, or else as subsets of one mesh."""
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, "Z")
     UsdGeom.SetStageMetersPerUnit(stage, unit)
@@ -61,7 +61,7 @@ def _set_lens(camera, lens, *, time=None, aperture=36.0):
     camera.CreateVerticalApertureOffsetAttr().Set(made.verticalApertureOffset, code)
 
 
-def _many_cameras(stage, room, *, unit=1.0, parent="/shots"):
+def many_cameras(stage, room, *, unit=1.0, parent="/shots"):
     """Static cameras below a transform that scales, as scenes in centimetres have them."""
     group = UsdGeom.Xform.Define(stage, parent)
     group.AddScaleOp().Set(Gf.Vec3f(1 / unit))
@@ -72,8 +72,8 @@ def _many_cameras(stage, room, *, unit=1.0, parent="/shots"):
 
 
 def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room, unit=0.01)
-    _many_cameras(stage, room, unit=0.01)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room, unit=0.01)
+    many_cameras(stage, room, unit=0.01)
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "shot" / "images" / f"IMG-{i:03d}.exr", image)
@@ -87,7 +87,7 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
 
 
-def _moving_camera(stage, room, names=None):
+def moving_camera(stage, room, names=None):
     camera = UsdGeom.Camera.Define(stage, "/room/camera")
     op = camera.AddTransformOp()
     prim = camera.GetPrim()
@@ -102,8 +102,8 @@ def _moving_camera(stage, room, names=None):
 
 
 def test_a_moving_camera_has_its_back_plates(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usdc", room)
-    _moving_camera(stage, room, [f"./plates/{9 - i}.exr" for i in range(10)])
+    stage = make_stage(tmp_path / "shot" / "room.usdc", room)
+    moving_camera(stage, room, [f"./plates/{9 - i}.exr" for i in range(10)])
     for i in range(5):
         UsdGeom.Camera.Define(stage, f"/cameras/view_{i}")  # of the artist
     stage.Save()
@@ -114,8 +114,8 @@ def test_a_moving_camera_has_its_back_plates(tmp_path, room):
 
 @pytest.mark.parametrize("plate", ["plates/p.####.exr", "plates/p.%04d.exr"])
 def test_a_sequence_is_one_name_for_all_plates(tmp_path, room, plate):
-    stage = _stage(tmp_path / "shot" / "room.usda", room)
-    _moving_camera(stage, room)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
     prim = stage.GetPrimAtPath("/room/camera")
     image = prim.CreateAttribute("houdini:backgroundimage", Sdf.ValueTypeNames.Asset)
     image.Set(Sdf.AssetPath(plate))
@@ -126,8 +126,8 @@ def test_a_sequence_is_one_name_for_all_plates(tmp_path, room, plate):
 
 
 def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room)
-    _moving_camera(stage, room)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
     stage.Save()
     for i, image in enumerate(room.images[:-1]):
         write_image(tmp_path / "plates" / f"plate.{101 + i:04d}.exr", image)
@@ -137,7 +137,7 @@ def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, roo
 
 
 def test_cameras_of_a_rig_have_pictures_by_their_names_and_numbers(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
     rig = UsdGeom.Xform.Define(stage, "/rig")
     moves = rig.AddTransformOp()
     for i in range(5):
@@ -159,7 +159,7 @@ def test_cameras_of_a_rig_have_pictures_by_their_names_and_numbers(tmp_path, roo
 
 
 def test_subsets_with_labels_are_objects(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room, parts=False)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room, parts=False)
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/room/all"))
     for i, name in enumerate(room.names[:-1]):
         faces = np.flatnonzero(room.face_object == i).tolist()
@@ -167,7 +167,7 @@ def test_subsets_with_labels_are_objects(tmp_path, room):
         UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([f"a {name}"])
     # Another division of the same faces, which says nothing of objects.
     UsdGeom.Subset.CreateGeomSubset(mesh, "red", "face", [0, 1], "materialBind")
-    _many_cameras(stage, room)
+    many_cameras(stage, room)
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
@@ -186,13 +186,13 @@ def test_subsets_with_labels_are_objects(tmp_path, room):
 
 
 def test_labels_of_a_group_are_the_classes_of_its_meshes(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
     UsdSemantics.LabelsAPI.Apply(stage.GetPrimAtPath("/room"), "category").CreateLabelsAttr(["hut"])
     lamp = stage.GetPrimAtPath("/room/lamp")
     lamp.CreateAttribute("semantic:Semantics:params:semanticData", Sdf.ValueTypeNames.String).Set(
         "light"
     )
-    _many_cameras(stage, room)
+    many_cameras(stage, room)
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
@@ -205,7 +205,7 @@ def test_a_mesh_from_elsewhere_has_the_unit_of_the_stage(tmp_path, room):
     stage = Usd.Stage.CreateNew(str(tmp_path / "room.usda"))
     UsdGeom.SetStageUpAxis(stage, "Y")
     UsdGeom.SetStageMetersPerUnit(stage, 0.1)
-    _many_cameras(stage, room)
+    many_cameras(stage, room)
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "pictures" / f"IMG_{i:03d}.png", image)
@@ -271,8 +271,8 @@ def _opencv_axes(stage, room, folder):
 )
 def test_refusals(tmp_path, room, damage, sentence):
     folder = tmp_path / "shot"
-    stage = _stage(folder / "room.usda", room)
-    _many_cameras(stage, room)
+    stage = make_stage(folder / "room.usda", room)
+    many_cameras(stage, room)
     for i, image in enumerate(room.images):
         write_image(folder / "images" / f"IMG_{i:03d}.exr", image)
     damage(stage, room, folder)
@@ -282,8 +282,8 @@ def test_refusals(tmp_path, room, damage, sentence):
 
 
 def test_pictures_in_another_place_are_inputs_and_the_stage_is_referenced(tmp_path, room):
-    stage = _stage(tmp_path / "shot" / "room.usda", room)
-    _moving_camera(stage, room)
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
     stage.Save()
     for i, image in enumerate(room.images):
         write_image(tmp_path / "plates" / f"plate.{101 + i}.exr", image)

@@ -14,7 +14,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.manifest import changes
+from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
@@ -309,6 +309,17 @@ def test_textures_have_their_smaller_copies_and_the_same_pixels(room, tmp_path):
     image.seek_subimage(0, 1)
     half = read_exr(here).reshape(4, 2, 3, 2, 3).mean(axis=(1, 3))
     assert image.read_image(0, 1, 0, 3, "float") == pytest.approx(half, rel=2e-3)
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "..", "../room.usda"])
+def test_a_manifest_that_lists_what_lies_elsewhere_is_none(tmp_path, path):
+    manifest = Manifest(
+        name="room", version="1", identifier="room", texture_space="lin_rec709_scene",
+        photographs=False, content="0" * 64, files={path: "1" * 64},
+    )  # fmt: skip
+    write_manifest(tmp_path, manifest)
+    with pytest.raises(InputRefused, match=r"\[publish\.manifest\]$"):
+        read_manifest(tmp_path)
 
 
 def dense_grid(room, side=20):

@@ -274,6 +274,11 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.camera",
         ["VR180_L", "OPENCV_FISHEYE", "Undistort"],
     ),
+    "a list as camera model": (
+        _manifest(lambda d: d.update(camera_model=[])),
+        "capture.camera",
+        ["camera model []", "OPENCV_FISHEYE"],
+    ),
     "distortion": (
         _frame(2, distortion_params=[0.01, "x"]),
         "capture.camera",
@@ -371,7 +376,7 @@ def test_the_capture_is_good_without_a_fault(capture):
 @pytest.mark.fault("C7", "rays miss")
 @pytest.mark.fault("C10", "all saturated")
 @pytest.mark.fault("C11", "all black")
-@pytest.mark.fault("C12", "fisheye", "distortion")
+@pytest.mark.fault("C12", "fisheye", "a list as camera model", "distortion")
 @pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
 @pytest.mark.fault("G1", "missing mesh", "empty mesh")
 @pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")

@@ -169,14 +169,14 @@ def calls(monkeypatch):
 
         def counting(*arguments, **options):
             counted[name] += 1
-            if name == "read_frames":
-                counted["first frame"] = arguments[-1][0]
+            if name == "samples_from_frames":
+                counted["first frame"] = arguments[3][0]
             return function(*arguments, **options)
 
         monkeypatch.setattr(module, name, counting)
 
     count(usdbrdf.geometry.unwrap, "unwrap")
-    count(usdbrdf.texturing.lit_texture, "read_frames")
+    count(usdbrdf.texturing.lit_texture, "samples_from_frames")
     count(usdbrdf.shading.shaded, "irradiance_at")
     count(usdbrdf.material.fit_objects, "choose_target_frames")
     count(usdbrdf.material.fit_objects, "fit_object")
@@ -201,7 +201,7 @@ def resumed(base, undisturbed, case, calls):
 
 def test_texturing_goes_on_after_the_last_saved_frame(resumed):
     found = resumed("texture", "checkpoint:2")  # the first are the charts; then the first frame
-    assert found == {"read_frames": 1, "first frame": 1}
+    assert found == {"samples_from_frames": 1, "first frame": 1}
 
 
 @pytest.mark.fault("R2")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import load_arrays, save_arrays
+from usdbrdf.files.tables import read_array
 
 
 def test_equal_arrays_give_equal_bytes(tmp_path):
@@ -33,3 +36,28 @@ def test_pickles_and_damage_are_refused(tmp_path):
             load_arrays(path)
     with pytest.raises(InputRefused):
         load_arrays(tmp_path / "none.npz")
+
+
+@pytest.mark.fault("S7")
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999, 17), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999999999999, ), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (5, ",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-5, ), }",
+        "({" * 60,
+    ],
+    ids=["more than it holds", "no whole number", "cut short", "less than nothing", "nested"],
+)
+def test_a_header_that_lies_is_refused_in_one_line(tmp_path, header):
+    text = header.encode().ljust(127) + b"\n"
+    content = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(40)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("x.npy", content)
+    (tmp_path / "a.npy").write_bytes(content)
+    for read, name in ((load_arrays, "a.npz"), (read_array, "a.npy")):
+        with pytest.raises(InputRefused) as refused:
+            read(tmp_path / name)
+        assert "\n" not in str(refused.value)
+        assert str(refused.value).endswith("[arrays.damaged]")

@@ -598,3 +598,23 @@ def test_a_disk_that_fails_is_no_damage_of_a_frame(tmp_path, radiance):
     assert done.returncode == 0, done.stderr
     found = {tuple(line.split()) for line in done.stdout.splitlines()}
     assert found == {("1", "0"), ("1000000000", "4")}
+
+
+@pytest.mark.fault("I12")
+def test_a_header_that_asks_for_memory_is_the_file_s_fault(tmp_path):
+    """Of a tag with 2,000,000,000 values in a file of some kilobytes the decoder says that memory
+    is short; nothing is wrong with the machine."""
+    path = tmp_path / "a.tif"
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), oiio.ImageSpec(24, 16, 3, "uint8"))
+    assert output.write_image(np.zeros((16, 24, 3), np.uint8))
+    assert output.close()
+    content = bytearray(path.read_bytes())
+    (at,) = struct.unpack_from("<I", content, 4)
+    for i in range(struct.unpack_from("<H", content, at)[0]):
+        entry = at + 2 + 12 * i
+        if struct.unpack_from("<H", content, entry)[0] == 259:  # Compression
+            struct.pack_into("<I", content, entry + 4, 2_000_000_000)
+    path.write_bytes(content)
+    with pytest.raises(ImageRefused, match=r"\[image\.\w+\]$"):
+        read_radiance(path)

@@ -103,3 +103,17 @@ def test_a_texture_keeps_floats_and_all_channels(tmp_path):
     assert np.array_equal(read_exr(target), pixels)
     write_texture(target, target)
     assert np.array_equal(read_exr(target), pixels)
+
+
+@pytest.mark.parametrize("name", [b"ow\xf2er", b"ow(er", b"o.n[r"])
+def test_names_of_attributes_that_are_no_words_go_too(tmp_path, name):
+    """Nothing of the file is refused for them, and nothing of it stays."""
+    image = oiio.ImageBuf(oiio.ImageSpec(8, 8, 3, "half"))
+    image.specmod().attribute("owner", "me")
+    assert image.write(str(tmp_path / "a.exr"))
+    content = (tmp_path / "a.exr").read_bytes()
+    assert content.count(b"owner\0") == 1
+    (tmp_path / "a.exr").write_bytes(content.replace(b"owner\0", name + b"\0"))
+    copy_without_metadata(tmp_path / "a.exr", tmp_path / "b.exr")
+    assert name + b"\0" not in (tmp_path / "b.exr").read_bytes()
+    assert read_exr(tmp_path / "b.exr").shape == (8, 8, 3)

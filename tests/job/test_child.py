@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.job import child as module
 from usdbrdf.job.child import run_child
 
 CHILDREN = """
-import os, signal, sys, time
+import os, signal, sys, tempfile, time
 import numpy as np
 from usdbrdf.errors import InputRefused, UsageError
 
@@ -61,6 +61,11 @@ def refuse(arrays, parameters):
 
 def broken(arrays, parameters):
     return {"x": 1 / 0}
+
+def litter(arrays, parameters):
+    with open(os.path.join(tempfile.gettempdir(), "crash-report"), "w") as file:
+        file.write("of a library")
+    os.abort()
 
 def hungry(arrays, parameters):
     return {"x": np.ones(1 << 32)}
@@ -108,6 +113,13 @@ def test_crash_is_a_refused_input(child, name):
 def test_kill_from_outside_is_the_environment(child):
     with pytest.raises(EnvironmentFailure, match=r"out of memory.+\[child\.killed\]"):
         child("die", signal="SIGKILL")
+
+
+def test_what_a_crash_leaves_among_temporary_files_goes_too(child, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(CrashedChild):
+        child("litter")
+    assert list(tmp_path.rglob("crash-report")) == []
 
 
 def test_a_crash_without_words_has_none(child):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -143,7 +146,7 @@ def test_usd_of_others_is_read_behind_the_boundary(tmp_path: Path, stage: Render
     write_exr(tmp_path / "lib" / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
     (tmp_path / "in").mkdir()
     thing = tmp_path / "in" / "thing.usda"
-    thing.write_text(_USD.replace("@glow.exr@", "@../lib/glow.exr@"))
+    thing.write_text(STAGE_OF_MATERIALS.replace("@glow.exr@", "@../lib/glow.exr@"))
     with pytest.raises(InputRefused, match=r"'\.\./lib/glow\.exr' leads out.*\[paths\.outside\]$"):
         _inserted(thing, stage)
     options = RelightOptions(
@@ -152,7 +155,7 @@ def test_usd_of_others_is_read_behind_the_boundary(tmp_path: Path, stage: Render
     found = relit_scene(stage, options, 2.0).surfaces[len(stage.surfaces) :]
     assert [surface.material.emits for surface in found].count(True) == 2
     for good, bad in (("= 0.1", "= nan"), ("= 0.1", "= -1"), ('"Y"', '"X"')):
-        thing.write_text(_USD.replace(good, bad, 1))
+        thing.write_text(STAGE_OF_MATERIALS.replace(good, bad, 1))
         with pytest.raises(InputRefused, match=r"thing\.usda: .*\[stage\.units\]$"):
             _inserted(thing, stage)
 
@@ -183,7 +186,7 @@ def test_axes_and_units_of_models(tmp_path: Path, stage: RenderScene) -> None:
     assert np.ptp(turned.bounds, axis=0) == pytest.approx([0.2, 0.6, 0.4])
 
 
-_USD = """#usda 1.0
+STAGE_OF_MATERIALS = """#usda 1.0
 (
     defaultPrim = "thing"
     metersPerUnit = 0.1
@@ -252,7 +255,7 @@ def Scope "mtl"
 
 def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: RenderScene) -> None:
     write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
-    (tmp_path / "thing.usda").write_text(_USD)
+    (tmp_path / "thing.usda").write_text(STAGE_OF_MATERIALS)
     found = _inserted(tmp_path / "thing.usda", stage)
     glow, plain = sorted(found, key=lambda surface: not surface.material.emits)
     assert plain.material.diffuse.ravel() == pytest.approx([0.1, 0.3, 0.5])
@@ -266,7 +269,9 @@ def test_usd_with_subsets_interfaces_and_maps(tmp_path: Path, stage: RenderScene
 
 
 def test_an_input_of_another_type_is_told_and_left(tmp_path: Path) -> None:
-    text = _USD.replace("float inputs:roughness = 0.7", "color3f inputs:roughness = (1, 1, 1)")
+    text = STAGE_OF_MATERIALS.replace(
+        "float inputs:roughness = 0.7", "color3f inputs:roughness = (1, 1, 1)"
+    )
     text = text.replace("float4 inputs:scale = (2, 2, 2, 1)", "string inputs:scale = 'wide'")
     (tmp_path / "thing.usda").write_text(text)
     write_exr(tmp_path / "glow.exr", np.full((2, 3, 3), 1.5, np.float32))
@@ -281,7 +286,7 @@ def test_an_input_of_another_type_is_told_and_left(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["repeat", "clamp", "mirror"])
 def test_textures_are_wrapped_as_the_stage_says(tmp_path: Path, mode: str) -> None:
     wraps = f'token inputs:wrapS = "{mode}"\ntoken inputs:wrapT = "{mode}"\nasset inputs:file'
-    (tmp_path / "thing.usda").write_text(_USD.replace("asset inputs:file", wraps))
+    (tmp_path / "thing.usda").write_text(STAGE_OF_MATERIALS.replace("asset inputs:file", wraps))
     write_exr(tmp_path / "glow.exr", np.ones((2, 3, 3), np.float32))
     found = render_scene_from_file(tmp_path / "thing.usda", pytest.fail).surfaces
     assert sorted(surface.material.wrap for surface in found) == sorted([mode, "clamp"])
@@ -312,3 +317,44 @@ def test_a_model_that_fell_is_in_the_picture(room: Path, tmp_path: Path) -> None
     middle = read_radiance(target)[4, 4]
     assert middle[0] < 0.05 * middle[1]  # green, where the floor is bluish
     assert middle[2] < 0.05 * middle[1]
+
+
+def _changed_glb(path: Path, change: Callable[[dict[str, Any]], None], box: Any = None) -> Path:
+    """A box as GLB whose document was changed."""
+    content = (box or _box()).export(file_type="glb")
+    length = int.from_bytes(content[12:16], "little")
+    document = json.loads(content[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
+    path.write_bytes(head + text + content[20 + length :])
+    return path
+
+
+def test_a_flattened_node_is_a_flat_surface(tmp_path: Path) -> None:
+    flat = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1]
+    path = _changed_glb(
+        tmp_path / "a.glb", lambda document: document["nodes"][-1].update(matrix=flat)
+    )
+    (found,) = surfaces_from_model(path)
+    assert np.ptp(found.points, axis=0) == pytest.approx([0.2, 0.4, 0.0])
+
+
+def test_a_texture_that_the_file_does_not_hold_is_left_out(tmp_path: Path) -> None:
+    box = _box()
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=PBRMaterial())
+    texture = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 7}}}
+    _changed_glb(tmp_path / "a.glb", lambda d: d.update(materials=[texture]), box)
+    (found,) = surfaces_from_model(tmp_path / "a.glb")
+    assert len(found.triangles) == 12
+
+
+def test_a_part_that_ends_after_the_file_is_refused(tmp_path: Path) -> None:
+    """Room would be made for all of it."""
+    content = bytearray(_box().export(file_type="glb"))
+    length = int.from_bytes(content[12:16], "little")
+    content[20 + length : 24 + length] = (2**32 - 4).to_bytes(4, "little")
+    (tmp_path / "a.glb").write_bytes(content)
+    with pytest.raises(InputRefused, match=r"ends \d+ bytes after the file.*\[mesh\.read\]$"):
+        surfaces_from_model(tmp_path / "a.glb")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.documents import json_text, read_json, write_json
@@ -61,7 +61,9 @@ def read_manifest(folder: Path) -> Manifest:
         manifest = Manifest(**record)
         for path in manifest.files:
             check_relative(path)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except InputRefused:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError, UsdBrdfError) as error:
         raise InputRefused(
             f"{file}: this is not the manifest that was published. Bring it back from a copy. "
             "[publish.manifest]"

@@ -34,7 +34,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
-from usdbrdf.files.images import exif_exposure
+from usdbrdf.files.images import MAX_SIDE, exif_exposure
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
@@ -344,6 +344,13 @@ def scan_from_parts(
     total = len(records) + len(findings.dropped)
     if options.encoding is None and encoding in ("lin_rec709_scene", PHOTOGRAPH_ENCODING):
         encoding = tagged_encoding(records, encoding, findings, source)
+    for record in records:
+        if max(map(abs, record.resolution)) > MAX_SIDE:
+            raise InputRefused(
+                f"{source}: the camera of {record.name!r} has {record.resolution[0]} x "
+                f"{record.resolution[1]} pixels (limit {MAX_SIDE} a side). Export the cameras "
+                "again. [capture.camera]"
+            )
     findings.frames = frames_from_records(records, encoding=encoding, radiometric=radiometric)
     known: set[Path] = set()
     for record in records:

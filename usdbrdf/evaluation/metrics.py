@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.documents import read_json
+from usdbrdf.files.documents import load_arrays, read_json
 from usdbrdf.job.child import run_child
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.untrusted.mesh_files import mesh_from_file
@@ -233,9 +233,8 @@ def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
         )
     path = folder / "albedo_vertex.npz"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            per_vertex = np.asarray(file["albedo"], np.float32)
-    except (OSError, KeyError, ValueError) as error:
+        per_vertex = np.asarray(load_arrays(path)["albedo"], np.float32)
+    except (KeyError, ValueError, InputRefused) as error:
         raise InputRefused(
             f"{path}: no array 'albedo' can be read from it ({error}). Check --truth. "
             "[evaluate.truth]"

@@ -8,7 +8,9 @@ import json
 import math
 import os
 import re
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -206,12 +208,44 @@ def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, Array]:
-    """Read all arrays of a file; a damaged one or one that holds pickles is refused."""
+    """Read all arrays of a file; a damaged one or one that holds pickles is refused, and one that
+    says of itself that it is larger than what is there."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        raise InputRefused(
-            f"{path}: not a readable array file ({error}); pickled data is refused. Write it "
-            "again. [arrays.damaged]"
-        ) from error
+        if not path.is_file():
+            raise FileNotFoundError("no such file, or not a regular one")
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            return {
+                item.filename.removesuffix(".npy"): _array_of(archive, item)
+                for item in archive.infolist()
+            }
+    except DAMAGED_ARRAYS as error:
+        raise refusal_of_arrays(path, error) from error
+
+
+# What NumPy and zipfile stumble over: a header is parsed as Python, parts of a file are inflated.
+DAMAGED_ARRAYS = (
+    OSError, ValueError, EOFError, AttributeError, TypeError, SyntaxError, OverflowError,
+    RuntimeError, tokenize.TokenError, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
+
+
+def refusal_of_arrays(path: Path, error: Exception) -> InputRefused:
+    """The sentence about a file of arrays that cannot be read, in one line."""
+    said = " ".join(str(error).split())[:200]
+    return InputRefused(
+        f"{path}: not a readable array file ({said}); pickled data is refused. Write it again. "
+        "[arrays.damaged]"
+    )
+
+
+def _array_of(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> Array:
+    """One array, once its header is known to announce no more than its part holds."""
+    if item.file_size > max(MAX_BYTES, item.compress_size):
+        raise ValueError(f"{item.compress_size} bytes are to become {item.file_size}")
+    reads = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    with archive.open(item) as stream:
+        shape, _, dtype = reads[np.lib.format.read_magic(stream)[0] > 1](stream)
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize > item.file_size:
+        raise ValueError(f"{item.file_size} bytes are to hold an array of {shape} {dtype}")
+    with archive.open(item) as stream:
+        return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))

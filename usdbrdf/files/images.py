@@ -30,7 +30,8 @@ MAX_PIXELS = 1 << 28
 MAX_CHANNELS = 64
 _MAX_PARTS = 64  # of one file, which are searched for R, G and B
 MAX_DECLARED_BYTES = 4 << 30
-MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above 1 GiB
+MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above so many bytes
+_ANY_INFLATION = 1 << 28
 # A display window may be larger than what the file holds; beyond this many bytes not by any factor.
 MAX_UNKNOWN_BYTES, MAX_UNKNOWN_SHARE = 64 << 20, 63 / 64
 HALF_MAX = 65_504.0
@@ -46,6 +47,7 @@ RAW_SUFFIXES = frozenset((
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
+_FOR_A_HEADER = 16 << 20  # bytes
 # As OpenImageIO and the libraries below it put it.
 _WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
 # Process-wide guards of the decoders themselves, before anything is allocated.
@@ -321,15 +323,17 @@ def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0
     """ImageRefused for whatever the decoder stumbles over, in its own words: a damaged file can
     make it raise anything. But too little memory is no fault of the file.
 
-    making  bytes that are to be made of the file
+    making  bytes that are to be made of the file; 0 of its header, which needs few: a decoder that
+            wants more has been told a lie
     """
     try:
         yield
     except Exception as error:
         said = _message(decoder)
-        scarce = isinstance(error, MemoryError) or _WANT_OF_MEMORY.search(said)
+        scarce = isinstance(error, MemoryError) or (making and _WANT_OF_MEMORY.search(said))
         try:
-            np.zeros(2 * making, np.uint8)  # twice: the decoder has buffers of its own
+            # Twice: the decoder has buffers of its own.
+            np.zeros(max(2 * making, _FOR_A_HEADER), np.uint8)
         except MemoryError:
             scarce = True
         if scarce:
@@ -359,7 +363,7 @@ def _check_limits(path: Path, spec: Any, size: int, max_side: int) -> None:
             f"{declared / shown:.2g} of it. Crop it, or export all of it. [image.limits]"
         )
     inflation = declared / size
-    if declared > MAX_DECLARED_BYTES or (declared > 1 << 30 and inflation > MAX_INFLATION):
+    if declared > MAX_DECLARED_BYTES or (declared > _ANY_INFLATION and inflation > MAX_INFLATION):
         raise ImageRefused(
             f"{path}: {size} bytes claim to hold {declared} ({inflation:.0f} times as many), the "
             f"limits are {MAX_DECLARED_BYTES} and {MAX_INFLATION} times. Export it again. "

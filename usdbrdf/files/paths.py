@@ -64,7 +64,7 @@ def inside(root: Path, place: Path) -> Path:
 def refuse_nameless(path: Path | None) -> None:
     """InputRefused where the absolute path is not UTF-8, as every path in a layer of USD is."""
     try:
-        str(path and path.resolve()).encode()
+        (os.path.realpath(path) if path else "").encode()
     except UnicodeEncodeError as error:
         raise InputRefused(
             f"{str(path)!r}: this name, or that of a folder above, is not UTF-8, so that USD "

@@ -111,11 +111,13 @@ def _tells_more(spec: Any) -> bool:
 
 def _plain_spec(spec: Any, encoding: str) -> Any:
     """Size, windows, channels, numbers and colour space of an image, and nothing else."""
-    plain = oiio.ImageSpec(spec)
+    plain = oiio.ImageSpec()
+    plain.copy_dimensions(spec)
     plain.channelformats = ()
+    # What is left out cannot be erased instead: names need not be text.
     for item in spec.extra_attribs:
-        if not _ABOUT_PIXELS.fullmatch(item.name):
-            plain.erase_attribute(item.name)
+        if _ABOUT_PIXELS.fullmatch(item.name):
+            plain.attribute(item.name, item.type, item.value)
     plain.attribute("DateTime", _PINNED_DATE)
     plain.tile_width = plain.tile_height = plain.tile_depth = 0
     if encoding:

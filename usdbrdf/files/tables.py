@@ -13,7 +13,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.documents import MAX_BYTES, MAX_DEPTH, read_text
+from usdbrdf.files.documents import (
+    DAMAGED_ARRAYS,
+    MAX_BYTES,
+    MAX_DEPTH,
+    read_text,
+    refusal_of_arrays,
+)
 from usdbrdf.model.arrays import Array, Double
 
 Element = ElementTree.Element
@@ -126,8 +132,5 @@ def read_array(path: Path) -> Array:
             )
         # Mapped: a header may announce any size, and only what the file holds can be mapped.
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError, TypeError, AttributeError) as error:
-        raise InputRefused(
-            f"{path}: not a readable array file ({error}); pickled data is refused. Write it "
-            "again. [arrays.damaged]"
-        ) from error
+    except DAMAGED_ARRAYS as error:
+        raise refusal_of_arrays(path, error) from error

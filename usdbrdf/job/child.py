@@ -149,7 +149,8 @@ def _started(folder: Path, label: str) -> Iterator[subprocess.Popen[bytes]]:
         process = subprocess.Popen(
             [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": search},
+            # What a crash leaves in the folder of temporary files goes with ours.
+            env={**os.environ, "PYTHONPATH": search, "TMPDIR": str(folder)},
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=said,

@@ -91,7 +91,10 @@ class Surface:
             name: getattr(self, name)
             for name in ("triangles", "corner_normals", "corner_uv", "corner_colour", "corner_f0")
         }
-        normals = self.corner_normals @ np.linalg.inv(linear)
+        # The cofactors are the inverse's transpose times the determinant, and are there where a
+        # surface is flattened, too.
+        cofactors = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
+        normals = self.corner_normals @ cofactors.T * (-1 if np.linalg.det(linear) < 0 else 1)
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         turned["corner_normals"] = np.asarray(normals / np.maximum(length, 1e-30), np.float32)
         if np.linalg.det(linear) < 0:

@@ -86,6 +86,11 @@ class ScanGeometry:
     label_source: str = "capture"
 
 
+# What a value of a primvar belongs to: a polygon's corner, a point, a point of the surface, a
+# polygon, the whole mesh.
+INTERPOLATIONS = ("faceVarying", "vertex", "varying", "uniform", "constant")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Triangulation:
     """T triangles of P polygons with C corners in all.
@@ -101,14 +106,14 @@ class Triangulation:
 
     def element_of_corner(self, interpolation: str) -> Int:
         """(T, 3) int32: which value of a primvar of this interpolation each corner has."""
-        by_interpolation: dict[str, Int] = {
-            "faceVarying": self.corners,
-            "vertex": self.triangles,
-            "varying": self.triangles,
-            "uniform": np.repeat(self.polygon[:, None], 3, axis=1),
-            "constant": np.zeros_like(self.triangles),
-        }
-        return by_interpolation[interpolation]
+        by_interpolation: tuple[Int, ...] = (
+            self.corners,
+            self.triangles,
+            self.triangles,
+            np.repeat(self.polygon[:, None], 3, axis=1),
+            np.zeros_like(self.triangles),
+        )
+        return by_interpolation[INTERPOLATIONS.index(interpolation)]
 
 
 def triangulate(

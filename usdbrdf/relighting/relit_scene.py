@@ -27,7 +27,7 @@ from usdbrdf.options import Insert, RelightOptions
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import model_from_file
 from usdbrdf.untrusted.pictures import picture_from_file
-from usdbrdf.untrusted.usd_files import render_scene_of_usd
+from usdbrdf.untrusted.usd_files import refuse_broken_meshes, render_scene_of_usd
 
 USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
 SKY_SUFFIXES = frozenset({".exr", ".hdr"})
@@ -155,6 +155,7 @@ def _scene_of_others(path: Path, allow: Sequence[Path]) -> RenderScene:
 def read_published_here(path: Path) -> tuple[RenderScene, list[str]]:
     """A file of others in this process, which is to be a child, and its warnings."""
     warnings: list[str] = []
+    refuse_broken_meshes(path)
     return render_scene_from_file(path, warnings.append), warnings
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -70,6 +72,9 @@ def read_here(images: Path) -> ColmapModel:
     import pycolmap
 
     folder = images.parent
+    for file in model_files(folder):
+        if file.suffix == ".bin":
+            _refuse_promises(file)
     with scratch_folder() as scratch:
         # The points may be many, and are not there in all captures.
         for file in model_files(folder):
@@ -104,3 +109,56 @@ def read_here(images: Path) -> ColmapModel:
         camera_from_world=np.array(poses, np.float64).reshape(-1, 3, 4),
         cameras=cameras,
     )
+
+
+def _refuse_promises(file: Path) -> None:
+    """InputRefused where a binary file announces more than it holds: COLMAP would go on counting
+    after its end, up to 2^64."""
+    walk = {"images": _after_image, "rigs": _after_rig, "frames": _after_frame}.get(file.stem)
+    size = file.stat().st_size
+    try:
+        with file.open("rb") as stored:
+            (count,) = _numbers(stored, "<Q")
+            if count > size:
+                raise EOFError(f"it announces {count} records")
+            for _ in range(count if walk else 0):
+                assert walk is not None
+                walk(stored)
+                if stored.tell() > size:
+                    raise EOFError("it ends within a record")
+    except EOFError as error:
+        raise InputRefused(
+            f"{file}: COLMAP cannot read this model: {error} in {size} bytes. Export it again. "
+            "[colmap.model]"
+        ) from error
+
+
+def _numbers(stored: BinaryIO, layout: str) -> tuple[int, ...]:
+    content = stored.read(struct.calcsize(layout))
+    if len(content) < struct.calcsize(layout):
+        raise EOFError("it ends within a record")
+    return struct.unpack(layout, content)
+
+
+def _after_image(stored: BinaryIO) -> None:
+    """Number, pose and camera, a name that ends with 0, and points of 24 bytes."""
+    _numbers(stored, "<I7dI")
+    while _numbers(stored, "<B") != (0,):
+        pass
+    (points,) = _numbers(stored, "<Q")
+    stored.seek(min(24 * points, 1 << 40), os.SEEK_CUR)
+
+
+def _after_rig(stored: BinaryIO) -> None:
+    """Number, and sensors of type and number; all but the first may have a pose."""
+    _, sensors = _numbers(stored, "<II")
+    for i in range(sensors):
+        _numbers(stored, "<iI")
+        if i and _numbers(stored, "<B") != (0,):
+            _numbers(stored, "<7d")
+
+
+def _after_frame(stored: BinaryIO) -> None:
+    """Number, rig and pose, and 16 bytes for what each sensor took."""
+    *_, taken = _numbers(stored, "<II7dI")
+    stored.seek(16 * taken, os.SEEK_CUR)

@@ -3,6 +3,9 @@ and what is put into a scene with its materials."""
 
 from __future__ import annotations
 
+import errno
+import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,10 +95,11 @@ def _parsed(path: Path, read: Callable[[BinaryIO], Any]) -> Any:
             return read(file)
     except (InputRefused, MemoryError):
         raise
-    except OSError as error:
-        raise EnvironmentFailure(f"{path}: cannot be read ({error}). [mesh.read]") from error
-    # The readers raise whatever a damaged file makes them stumble over.
+    # The readers raise whatever a damaged file makes them stumble over; EINVAL is a place before
+    # the file's beginning that they were sent to, and pictures in it raise OSErrors without number.
     except Exception as error:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+            raise EnvironmentFailure(f"{path}: cannot be read ({error}). [mesh.read]") from error
         raise InputRefused(
             f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({type(error).__name__}: "
             f"{' '.join(str(error).split())[:160]}). Export it again; a face must have three or "
@@ -183,7 +187,26 @@ def _mesh_from_obj(file: BinaryIO) -> FileMesh:
     return _joined([(name, p["vertices"], p["faces"]) for name, p in parts.items()])
 
 
+def _refuse_promises(file: BinaryIO) -> None:
+    """ValueError where a GLB announces more than it holds, for which room would be made before
+    anybody looks: longer parts, or elements without bytes, which are zeros."""
+    size = file.seek(0, os.SEEK_END)
+    starts = [12]
+    while starts[-1] + 8 <= size:
+        file.seek(starts[-1])
+        starts.append(starts[-1] + 8 + int.from_bytes(file.read(4), "little"))
+    if starts[-1] > size:
+        raise ValueError(f"a part ends {starts[-1] - size} bytes after the file")
+    file.seek(20)
+    document = json.loads(file.read(starts[1] - 20)) if len(starts) > 1 else {}
+    file.seek(0)
+    promised = [int(a["count"]) for a in document.get("accessors", ()) if "bufferView" not in a]
+    if sum(map(abs, promised)) > size:
+        raise ValueError(f"{size} bytes are to hold {sum(promised)} elements")
+
+
 def _mesh_from_glb(file: BinaryIO) -> FileMesh:
+    _refuse_promises(file)
     scene = trimesh.load_scene(file, file_type="glb", process=False)
     parts = []
     for node in sorted(scene.graph.nodes_geometry):
@@ -243,9 +266,13 @@ def read_model_here(path: Path) -> tuple[Surface, ...]:
             f"{path}: faces of it have NaN corners or vertices that do not exist. Export it again. "
             "[relight.model]"
         )
+    return tuple(_parsed(path, lambda file: _surfaces(path, file)))
+
+
+def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
     beside = _FilesBeside(path)
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
-    stored = _parsed(path, lambda file: load(file, resolver=beside))
+    stored = load(file, resolver=beside)
     if beside.refused:
         raise beside.refused[0]
     # Normals are kept apart: a mesh of trimesh makes them up where there are none.
@@ -262,7 +289,7 @@ def read_model_here(path: Path) -> tuple[Surface, ...]:
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
             surface = _surface(f"{path.name}:{node}", mesh, normals_of[name])
             found.append(surface.moved(np.asarray(world_from_node)))
-    return tuple(found)
+    return found
 
 
 class _FilesBeside:
@@ -363,7 +390,8 @@ def _factor(value: Any, channels: int, fallback: float) -> Float:
 
 
 def _image(picture: Any) -> Float | None:
-    """(H, W, 3) float32 in [0, 1] of a PIL image."""
-    if picture is None:
+    """(H, W, 3) float32 in [0, 1] of a PIL image; None for a number, which is all that is left of a
+    texture that the file does not hold."""
+    if not hasattr(picture, "convert"):
         return None
     return np.asarray(picture.convert("RGB"), np.float32) / np.float32(255)

@@ -48,6 +48,8 @@ def read_here(path: Path) -> tuple[Double, Long]:
     first_face = end + stride * num_vertices
     if not all(widths) or stride < 12 or len(stored) < first_face:
         raise _refusal(path, "it ends within its vertices")
+    if num_faces > len(stored) - first_face:  # before anything is made room for
+        raise _refusal(path, "it ends within its faces")
     table = np.frombuffer(stored, np.uint8, stride * num_vertices, end).reshape(-1, stride)
     points = np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)
     size_of_id = _SIZES.get(ids[1], 0)
@@ -80,6 +82,8 @@ def _centres_and_ids(
             raise _refusal(path, "faces have less than three corners or none that exist")
         centre[own] = points[index].mean(axis=1)
         number[own] = np.ascontiguousarray(rows[:, 4 * count :]).view(f"<u{size_of_id}")[:, 0]
+    if not np.isfinite(centre).all():
+        raise _refusal(path, "faces have corners that are NaN or infinite")
     return centre, number
 
 

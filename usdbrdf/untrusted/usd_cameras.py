@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
@@ -91,12 +92,13 @@ def read_here(path: Path) -> tuple[UsdCameras]:
 def _camera(camera: UsdGeom.Camera) -> UsdCamera:
     prim = camera.GetPrim()
     named = map(prim.GetAttribute, _names_of_plates(prim))
-    plate = next((a for a in named if a.Get(Usd.TimeCode.EarliestTime())), None)
+    first = Usd.TimeCode.EarliestTime()
+    plate = next((a for a in named if _is_path(a.Get(first))), None)
     times = _sample_times(camera, plate)
     codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.EarliestTime()]
     said = [name for name in _LENS if name != _SHAPE or prim.GetAttribute(name).IsAuthored()]
     lens = [
-        [prim.GetAttribute(name).Get(code) if name in said else np.nan for name in _LENS]
+        [_number(prim.GetAttribute(name).Get(code)) if name in said else np.nan for name in _LENS]
         for code in codes
     ]
     return UsdCamera(
@@ -135,7 +137,16 @@ def _sample_times(camera: UsdGeom.Camera, plate: Any) -> list[float]:
 def _file_of(plate: Usd.Attribute, code: Usd.TimeCode) -> str:
     """Absolute path, existing or not, relative to the layer that holds the opinion."""
     value = plate.Get(code)
-    if not value or not value.path:
+    if not _is_path(value):
         return ""
     layer = plate.GetPropertyStack(code)[0].layer
     return str(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
+
+
+def _is_path(value: object) -> bool:
+    """Whether an attribute's value is a path; a file may have given it any type."""
+    return isinstance(value, Sdf.AssetPath) and bool(value.path)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan

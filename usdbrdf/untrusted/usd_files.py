@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import unique_identifiers
@@ -73,7 +73,8 @@ def _in_child(
     """``read_here`` in a child."""
     refuse_nameless(path)
     # Absolute and without links.
-    allowed = [str(folder.resolve()) for folder in (path.resolve().parent, *allow)]
+    own = os.path.dirname(os.path.realpath(path))
+    allowed = [own, *(os.path.realpath(folder) for folder in allow)]
     parameters = {"reader": reader, "allowed": allowed}
     return read_in_child(
         "stage", f"{__name__}:read_here", path, returns, parts=parts, parameters=parameters
@@ -103,9 +104,15 @@ def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
 
 @contextmanager
 def _usd_errors(path: Path) -> Iterator[None]:
-    """USD's own errors become InputRefused."""
+    """USD's own errors become InputRefused, and text of the file that Python cannot hold."""
     try:
         yield
+    except UnicodeDecodeError as error:
+        shown = repr(error.object[max(error.start - 20, 0) : error.start + 20])
+        raise InputRefused(
+            f"{path}: a name or a path in it is not UTF-8 ({shown}), so no program can be told of "
+            "it. Rename it, or export the file again. [stage.input]"
+        ) from error
     except Tf.ErrorException as error:
         raise InputRefused(
             f"{path}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
@@ -128,15 +135,16 @@ def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
         for mesh in meshes
     ]
     points, triangles, face_object = joined([part[:2] for part in parts])
+    owner_of_face = []
     prims = [mesh.GetPrim() for mesh in meshes]
     split = [face_subsets(mesh) if subsets else [] for mesh in meshes]
     owners: list[Usd.Prim] = []
     for i, (mesh, own) in enumerate(zip(meshes, split, strict=True)):
         which = _subset_of_triangles(mesh, own, parts[i][3], time)
-        face_object[face_object == i] = len(owners) + np.where(which < 0, len(own), which)
+        owner_of_face.append(len(owners) + np.where(which < 0, len(own), which))
         owners += [*(subset.GetPrim() for subset in own), prims[i]]
     if any(split):  # a whole mesh is an object even without an area: the asset refers to it
-        used, numbered = np.unique(face_object, return_inverse=True)
+        used, numbered = np.unique(np.concatenate(owner_of_face), return_inverse=True)
         owners, face_object = [owners[i] for i in used.tolist()], numbered.astype(np.int32)
     labels = [prim.GetDisplayName() or prim.GetName() for prim in owners]
     identifiers = unique_identifiers(labels)
@@ -178,9 +186,9 @@ def _subset_of_triangles(
     mesh: UsdGeom.Mesh, subsets: Sequence[UsdGeom.Subset], polygon: Int, time: Any
 ) -> Int:
     """(T,) the subset that each triangle's polygon is in, the first of several; -1 for none."""
-    subset_of = np.full(len(mesh.GetFaceVertexCountsAttr().Get(time) or []), -1, np.int32)
+    subset_of = np.full(len(mesh.GetFaceVertexCountsAttr().Get(time)), -1, np.int32)
     for i, subset in reversed(list(enumerate(subsets))):
-        indices = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
+        indices = numbers_of(subset.GetIndicesAttr().Get(time), np.int64)
         subset_of[indices[(indices >= 0) & (indices < len(subset_of))]] = i
     return np.asarray(subset_of[polygon], np.int32)
 
@@ -201,7 +209,8 @@ def _labels_at(prim: Usd.Prim) -> list[str]:
     for attribute in prim.GetAuthoredAttributes():
         words = attribute.GetName().split(":")
         if words[:2] == ["semantics", "labels"]:
-            values = attribute.Get(Usd.TimeCode.EarliestTime()) or ()
+            values = attribute.Get(Usd.TimeCode.EarliestTime())
+            values = values if isinstance(values, Vt.TokenArray) else ()
             found += [(words[-1] not in ("class", "category"), str(value)) for value in values]
         elif words[0] == "semantic" and words[-1] == "semanticData":
             kind = prim.GetAttribute(":".join([*words[:-1], "semanticType"]))
@@ -213,33 +222,63 @@ def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
     """The layers that ``path`` reaches, itself first; InputRefused unless every path in them stays
     in one of the ``allowed`` folders, which are absolute and without links.
 
-    Layers, references, payloads, of every variant, and asset-valued attributes count; links are
-    judged by where they lead. What a crafted crate file does to USD's own reader is not caught
-    here: call this in a child process.
+    Layers, references, payloads, of every variant, and asset-valued attributes count, in packages
+    too; links are judged by where they lead. What a crafted crate file does to USD's own reader is
+    not caught here: call this in a child process.
     """
-    waiting, seen, total = [path.resolve()], list[Path](), 0
+    waiting, seen, total = [str(path.resolve())], list[str](), 0
     while waiting:
         layer = waiting.pop()
         if layer in seen:
             continue
         seen.append(layer)
-        total += layer.stat().st_size
+        total += 0 if Ar.IsPackageRelativePath(layer) else Path(layer).stat().st_size
         if len(seen) > _MAX_LAYERS or total > LIMITS["stage"].file_bytes:
             raise InputRefused(
                 f"{path}: more than {_MAX_LAYERS} layers or {LIMITS['stage'].file_bytes} bytes of "
                 "layers. Flatten the stage, or name the part that was captured. [stage.input_size]"
             )
-        package = Sdf.ZipFile.Open(str(layer)) if layer.suffix.lower() == ".usdz" else None
-        for name in package.GetFileNames() if package else ():
-            if name.startswith(("/", "\\")) or ".." in Path(name).parts:
-                raise _outside(layer, name, "is an entry that leaves the package")
-        with _usd_errors(layer):
-            found = UsdUtils.ExtractExternalReferences(str(layer))
+        waiting += _layers_in_package(layer)
+        with _usd_errors(Path(layer)):
+            opened = Sdf.Layer.FindOrOpen(layer)
+            found = UsdUtils.ExtractExternalReferences(layer)
+            if opened and opened.HasExpressionVariables():
+                # Which value counts depends on the layer that composes this one.
+                raise InputRefused(
+                    f"{layer}: its asset paths may hold variables (expressionVariables), so that "
+                    "nobody can say where they lead. Flatten the stage. [paths.variables]"
+                )
         for reference in sorted({reference for kind in found for reference in kind if reference}):
-            target = _target(layer, reference, allowed)
+            if Ar.IsPackageRelativePath(layer):
+                _refuse_leaving_package(layer, reference)
+                continue
+            target = _target(Path(layer), reference, allowed)
             if target.suffix.lower() in USD_SUFFIXES and target.is_file():
-                waiting.append(target)
-    return seen
+                waiting.append(str(target))
+    return [Path(layer) for layer in seen if not Ar.IsPackageRelativePath(layer)]
+
+
+def _layers_in_package(layer: str) -> list[str]:
+    """The layers in a USDZ, which may itself lie in one; none in other layers."""
+    name = Ar.SplitPackageRelativePathInner(layer)[1] or layer
+    if not name.lower().endswith(".usdz"):
+        return []
+    with _usd_errors(Path(layer)):
+        package = Sdf.ZipFile.Open(layer)
+    names = package.GetFileNames() if package else ()
+    for name in names:
+        if name.startswith(("/", "\\")) or ".." in Path(name).parts:
+            raise _outside(layer, name, "is an entry that leaves the package")
+    inside = [name for name in names if Path(name).suffix.lower() in USD_SUFFIXES]
+    return [Ar.JoinPackageRelativePath(layer, name) for name in inside]
+
+
+def _refuse_leaving_package(layer: str, reference: str) -> None:
+    """InputRefused where a layer in a package refers to anything but what lies in there with it:
+    nothing else is found, but for absolute paths."""
+    name = Ar.SplitPackageRelativePathOuter(reference)[0]
+    if os.path.isabs(name) or "://" in name or name.startswith("\\"):
+        raise _outside(layer, reference, "is no path in the package")
 
 
 def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
@@ -257,7 +296,7 @@ def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
     return target
 
 
-def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
+def _outside(layer: Path | str, reference: str, reason: str) -> InputRefused:
     return InputRefused(
         f"{layer}: the asset path {reference[:200]!r} {reason}. Keep what belongs to the stage "
         "beside it and name it by relative paths. [paths.outside]"
@@ -265,7 +304,15 @@ def _outside(layer: Path, reference: str, reason: str) -> InputRefused:
 
 
 def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:300]
+    return " ".join(words_of(error).split())[:300]
+
+
+def words_of(error: object) -> str:
+    """What an error of USD says, which may quote bytes of a file that are no text."""
+    try:
+        return str(getattr(error, "commentary", error))
+    except UnicodeDecodeError as undecoded:
+        return undecoded.object.decode("utf-8", "replace")
 
 
 def check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
@@ -295,6 +342,14 @@ def is_deforming(mesh: UsdGeom.Mesh) -> bool:
         mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(),
     )  # fmt: skip
     return any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
+
+
+def refuse_broken_meshes(path: Path) -> None:
+    """InputRefused where a mesh of a stage, hidden or not, has faces that its points do not fit."""
+    stage, time = Usd.Stage.Open(str(path), Usd.Stage.LoadAll), Usd.TimeCode.EarliestTime()
+    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
+        if prim.IsA(UsdGeom.Mesh):
+            _topology(UsdGeom.Mesh(prim), time, path)
 
 
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
@@ -363,7 +418,7 @@ def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float
     points, counts, indices = _topology(mesh, time, path)
     mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
-    holes = np.array(mesh.GetHoleIndicesAttr().Get(time) or [], np.int32)
+    holes = numbers_of(mesh.GetHoleIndicesAttr().Get(time), np.int32)
     fans = triangulate(counts, indices, left_handed=left_handed != mirrored, holes=holes)
     world = points @ matrix[:3, :3] + matrix[3, :3]
     normals = np.full((len(fans.triangles), 3, 3), np.nan, np.float32)
@@ -381,9 +436,9 @@ def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:
 
     Nothing can be repaired here: the file is referenced, and the asset must mean the same mesh.
     """
-    points = np.array(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int32)
-    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int32)
+    points = _vectors(mesh.GetPointsAttr().Get(time))
+    counts = numbers_of(mesh.GetFaceVertexCountsAttr().Get(time), np.int32)
+    indices = numbers_of(mesh.GetFaceVertexIndicesAttr().Get(time), np.int32)
     problem = ""
     if len(points) == 0 or len(counts) == 0:
         problem = f"is empty ({len(points)} points, {len(counts)} faces)"
@@ -403,6 +458,20 @@ def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:
     return points, counts, indices
 
 
+def numbers_of(value: Any, kind: Any) -> Any:
+    """An attribute's value as an array; an empty one where a file has given it another type."""
+    try:
+        return np.array([] if value is None else value, kind)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0, kind)
+
+
+def _vectors(value: Any) -> Double:
+    """(N, 3); none where the numbers are no multiple of three."""
+    numbers = numbers_of(value, np.float64)
+    return np.asarray(numbers.reshape(-1, 3) if numbers.size % 3 == 0 else np.zeros((0, 3)))
+
+
 def _authored_normals(
     mesh: Any, fans: Triangulation, num_points: int, num_faces: int, num_corners: int, time: Any
 ) -> Double | None:
@@ -415,7 +484,7 @@ def _authored_normals(
         values, interpolation = primvar.ComputeFlattened(time), primvar.GetInterpolation()
     else:
         values, interpolation = mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation()
-    normals = np.array(values if values is not None else [], np.float64).reshape(-1, 3)
+    normals = _vectors(values)
     expected = {"constant": 1, "uniform": num_faces, "vertex": num_points, "varying": num_points}
     expected["faceVarying"] = num_corners
     if len(normals) != expected.get(interpolation, -1):

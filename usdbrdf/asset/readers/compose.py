@@ -21,6 +21,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, hash_of_files, read_stamp
 from usdbrdf.model.arrays import Array
 from usdbrdf.options import NO_LIGHT, Surroundings
+from usdbrdf.untrusted.usd_files import words_of
 
 _MAX_LENGTH = 600
 _TIMEOUT_S = 600.0
@@ -30,7 +31,7 @@ def in_one_line(error: object) -> str:
     """The text of an error of USD, which often spans lines and repeats itself, on one line. Of an
     exception what its errors say, without the places in USD's own source."""
     told = error.args if isinstance(error, Tf.ErrorException) else [error]
-    parts = (str(getattr(part, "commentary", part)) for part in told)
+    parts = (words_of(part) for part in told)
     text = "; ".join(" ".join(part.split()).rstrip(".; ") for part in parts)
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 

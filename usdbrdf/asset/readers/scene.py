@@ -33,7 +33,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import Triangulation, triangulate
+from usdbrdf.model.mesh import INTERPOLATIONS, Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
 
@@ -207,8 +207,11 @@ def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
 def per_corner(
     values: Any, kind: type[Number], interpolation: str, fans: Triangulation
 ) -> npt.NDArray[Number] | None:
-    """(T, 3, ...) the value that each triangle's corner has; None where there are too few of them:
-    the file is wrong about these values, not about its shape."""
+    """(T, 3, ...) the value that each triangle's corner has; None where there are too few of them,
+    or USD knows no such interpolation: the file is wrong about these values, not about its shape.
+    """
+    if interpolation not in INTERPOLATIONS:
+        return None
     elements = fans.element_of_corner(interpolation)
     return np.asarray(values, kind)[elements] if elements.max(initial=-1) < len(values) else None
 

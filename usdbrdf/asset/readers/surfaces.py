@@ -29,6 +29,7 @@ from usdbrdf.model.material import Material, Surface, constant_map, preview_mate
 from usdbrdf.model.mesh import Triangulation
 from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.renderer_match import shown_share_of_metal
+from usdbrdf.untrusted.usd_files import numbers_of
 
 # The fallbacks of UsdPreviewSurface, which also stand for a mesh without any material.
 _FALLBACKS: dict[str, tuple[float, ...]] = {
@@ -331,7 +332,7 @@ def _faces_by_material(
     own = UsdShade.MaterialBindingAPI(mesh.GetPrim())
     rest = np.ones(len(fans.triangles), np.bool_)
     for subset in own.GetMaterialBindSubsets():
-        polygons = np.asarray(subset.GetIndicesAttr().Get(time) or [], np.int32)
+        polygons = numbers_of(subset.GetIndicesAttr().Get(time), np.int32)
         chosen = np.isin(fans.polygon, polygons) & rest
         rest &= ~chosen
         if chosen.any():
@@ -348,7 +349,7 @@ def _primvar(
     primvar = UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name) if name else None
     if not primvar or not primvar.HasValue():
         return None
-    rows = np.asarray(primvar.ComputeFlattened(time) or [], np.float32)
+    rows = numbers_of(primvar.ComputeFlattened(time), np.float32)
     if not rows.size or rows.size % width:
         return None
     return per_corner(rows.reshape(-1, width), np.float32, primvar.GetInterpolation(), fans)

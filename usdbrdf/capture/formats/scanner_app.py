@@ -27,7 +27,7 @@ from usdbrdf.capture.parts import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.images import image_size
+from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import CaptureOptions
 
@@ -110,7 +110,8 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
     projection = _numbers(document, "projectionMatrix", 16)
     try:
         if projection is not None and projection[0] > 0 and projection[5] > 0:
-            resolution = round(2 * camera[0] / projection[0]), round(2 * camera[4] / projection[5])
+            sides = 2 * camera[0] / projection[0], 2 * camera[4] / projection[5]
+            resolution = round(min(sides[0], MAX_SIDE + 1)), round(min(sides[1], MAX_SIDE + 1))
         else:
             resolution = image_size(photograph)[:2]
     except ImageRefused as error:

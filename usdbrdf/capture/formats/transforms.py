@@ -363,7 +363,7 @@ def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
     them, k4 to k6 are OpenCV's, which divide.
     """
     model = frame.get("camera_model", capture.document.get("camera_model", "PINHOLE"))
-    if model not in _CURVES:
+    if not isinstance(model, str) or model not in _CURVES:
         raise capture.refuse(
             f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_CURVES)}). "
             "Undistort the images to a pinhole camera first.",

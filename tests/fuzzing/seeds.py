@@ -1,0 +1,470 @@
+"""Small sound files of every format that is read, by the writers of the other tests."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import trimesh
+from PIL import Image
+from pxr import Sdf, Usd, UsdGeom, UsdLux
+
+from tests.capture import (
+    test_scan_from_e57,
+    test_scan_from_eyeful_tower,
+    test_scan_from_fipt,
+    test_scan_from_llff,
+    test_scan_from_metashape,
+    test_scan_from_realityscan,
+    test_scan_from_replica,
+    test_scan_from_scanner_app,
+    test_scan_from_scannetpp,
+    test_scan_from_usd_stage,
+)
+from tests.capture.test_raw_frames import write_dng
+from tests.format_truth import Truth, truth, write_image
+from tests.relighting.test_model import STAGE_OF_MATERIALS
+from tests.scenes import make_capture, write_ply
+from usdbrdf.asset.manifest import Manifest, write_manifest
+from usdbrdf.files.documents import save_arrays
+from usdbrdf.job.stamp import Stamp, write_stamp
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seed:
+    """What a reader is given, and which of the files are damaged."""
+
+    entry: Path
+    targets: tuple[Path, ...]
+
+
+@cache
+def _room() -> Truth:
+    return truth()
+
+
+def _alone(*paths: Path) -> list[Seed]:
+    return [Seed(entry=path, targets=(path,)) for path in paths]
+
+
+# --- Pictures ------------------------------------------------------------------------------------
+
+
+def _picture(path: Path, kind: str, channels: int = 3, **attributes: str | int) -> Path:
+    """A gradient of 24 x 16 pixels."""
+    ramp = np.linspace(0, 1, 24 * 16 * channels, dtype=np.float32).reshape(16, 24, channels)
+    pixels = np.round(ramp * 255).astype(np.uint8) if kind == "uint8" else ramp
+    spec = oiio.ImageSpec(24, 16, channels, kind)
+    for name, value in attributes.items():
+        if name in ("x", "y", "full_width", "full_height", "tile_width", "tile_height"):
+            setattr(spec, name, value)
+        else:
+            spec.attribute(name, value)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(pixels)
+    assert output.close()
+    return path
+
+
+def exr(folder: Path) -> list[Seed]:
+    made = [
+        _picture(folder / f"{name}.exr", "half", compression=name)
+        for name in ("none", "rle", "zip", "zips", "piz", "pxr24", "b44", "dwaa")
+    ]
+    made.append(_picture(folder / "float.exr", "float", 4, compression="zip"))
+    made.append(_picture(folder / "tiled.exr", "half", tile_width=8, tile_height=8))
+    made.append(_picture(folder / "window.exr", "half", x=5, y=-3, full_width=40, full_height=20))
+    parts = folder / "parts.exr"
+    specs = [oiio.ImageSpec(8, 8, 1, "half"), oiio.ImageSpec(8, 8, 3, "half")]
+    specs[0].channelnames = ("Z",)
+    output = oiio.ImageOutput.create(str(parts))
+    assert output.open(str(parts), specs)
+    for number, spec in enumerate(specs):
+        if number:
+            assert output.open(str(parts), spec, "AppendSubimage")
+        assert output.write_image(np.ones((8, 8, spec.nchannels), np.float32))
+    assert output.close()
+    return _alone(*made, parts)
+
+
+def hdr(folder: Path) -> list[Seed]:
+    return _alone(_picture(folder / "a.hdr", "float"), _picture(folder / "b.hdr", "float", rgbe=1))
+
+
+def png(folder: Path) -> list[Seed]:
+    grey = _picture(folder / "grey.png", "uint8", 1)
+    return _alone(
+        _picture(folder / "a.png", "uint8"), _picture(folder / "rgba.png", "uint16", 4), grey
+    )
+
+
+def jpeg(folder: Path) -> list[Seed]:
+    plain = _picture(folder / "a.jpg", "uint8", ExposureTime=1, Copyright="me")
+    buffer = io.BytesIO()
+    with Image.open(plain) as image:
+        image.save(buffer, "jpeg", progressive=True, quality=90)
+    (folder / "progressive.jpg").write_bytes(buffer.getvalue())
+    return _alone(plain, folder / "progressive.jpg")
+
+
+def tiff(folder: Path) -> list[Seed]:
+    made = [
+        _picture(folder / f"{name}.tif", kind, compression=name)
+        for name, kind in (("none", "uint8"), ("lzw", "uint16"), ("zip", "float"))
+    ]
+    tiled = _picture(folder / "tiled.tif", "half", tile_width=16, tile_height=16)
+    return _alone(*made, tiled, _picture(folder / "jpeg.tif", "uint8", compression="jpeg"))
+
+
+def dng(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    write_dng(folder / "a.dng", 0.02)
+    return _alone(folder / "a.dng")
+
+
+def pictures(folder: Path) -> list[Seed]:
+    """Of every format, with metadata."""
+    made = [*exr(folder)[2:4], *hdr(folder), *png(folder), *jpeg(folder), *tiff(folder)]
+    return [*made, *_alone(_picture(folder / "told.png", "uint8", Artist="me", Software="it"))]
+
+
+def lights(folder: Path) -> list[Seed]:
+    """Pictures that hold radiance."""
+    return [seed for seed in (*exr(folder), *hdr(folder)) if "window" not in seed.entry.name]
+
+
+# --- Meshes --------------------------------------------------------------------------------------
+
+
+def ply(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    box = trimesh.creation.box((0.2, 0.4, 0.6))
+    write_ply(folder / "ours.ply", box.vertices, box.faces, np.zeros(len(box.faces)))
+    box.visual.vertex_colors = np.tile(np.array([[255, 128, 64, 255]], np.uint8), (8, 1))
+    box.export(folder / "binary.ply")
+    box.export(folder / "ascii.ply", encoding="ascii")
+    return _alone(*sorted(folder.iterdir()))
+
+
+def obj(folder: Path) -> list[Seed]:
+    _picture(folder / "red.png", "uint8")
+    box = trimesh.creation.box((0.2, 0.4, 0.6))
+    (folder / "box.mtl").write_text("newmtl red\nKd 0.8 0.2 0.1\nNs 20\nmap_Kd red.png\n")
+    rows = [f"v {x} {y} {z}" for x, y, z in box.vertices]
+    rows += ["vt 0 0", "vt 1 0", "vt 1 1", "vn 0 0 1", "o box", "usemtl red"]
+    rows += [f"f {a + 1}/1/1 {b + 1}/2/1 {c + 1}/3/1" for a, b, c in box.faces[:6]]
+    rows += ["g other", *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces[6:])]
+    (folder / "box.obj").write_text("\n".join(["mtllib box.mtl", *rows]) + "\n")
+    targets = (folder / "box.obj", folder / "box.obj", folder / "box.mtl")
+    return [Seed(entry=folder / "box.obj", targets=targets)]
+
+
+def glb(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    box = trimesh.creation.box((0.2, 0.4, 0.6))
+    box.export(folder / "plain.glb")
+    picture = Image.fromarray(np.full((4, 4, 3), 99, np.uint8))
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.random.default_rng(0).random((8, 2)),
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorTexture=picture, metallicRoughnessTexture=picture, roughnessFactor=0.4
+        ),
+    )
+    scene = trimesh.Scene()
+    scene.add_geometry(box, transform=np.diag([1.0, -1, 2, 1]))
+    scene.export(folder / "textured.glb")
+    return _alone(*sorted(folder.glob("*.glb")))
+
+
+def labelled_ply(folder: Path) -> list[Seed]:
+    room = _room()
+    scene = test_scan_from_replica.write_scene(folder / "data" / "room0", room)
+    test_scan_from_replica.write_semantics(scene, room)
+    return _alone(scene / "habitat" / "mesh_semantic.ply")
+
+
+# --- Captures ------------------------------------------------------------------------------------
+
+
+def _capture(entry: Path, *names: str) -> list[Seed]:
+    root = entry if entry.is_dir() else entry.parent
+    targets = [path for name in names for path in sorted(root.glob(name))]
+    assert targets
+    return [Seed(entry=entry, targets=tuple(targets))]
+
+
+def transforms(folder: Path) -> list[Seed]:
+    """Our own document, one with a lens, and one as nerfstudio writes them."""
+    made = [
+        make_capture(folder / name, frames=8, size=(12, 10), subdivisions=1)
+        for name in ("own", "lens", "nerfstudio")
+    ]
+    document = json.loads(made[1].manifest.read_text("utf-8"))
+    document |= {"camera_model": "OPENCV", "k1": 0.01, "k2": 0.001, "p1": 1e-4, "p2": 0.0}
+    made[1].manifest.write_text(json.dumps(document))
+    document = json.loads(made[2].manifest.read_text("utf-8"))
+    document |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0, "k1": 0.0}
+    document["frames"][0] |= {"mask_path": "frames/0001.exr", "distortion_params": [0.0] * 6}
+    made[2].manifest.write_text(json.dumps(document))
+    return [s for each in made for s in _capture(each.folder, "transforms.json")]
+
+
+def objects(folder: Path) -> list[Seed]:
+    """objects.json beside a mesh with labels, with directives and with a label for each face."""
+    made = make_capture(folder / "a", frames=8, size=(12, 10), subdivisions=1)
+    document = json.loads((made.folder / "objects.json").read_text("utf-8"))
+    document["objects"][0]["directive"] = "metal"
+    document["face_object_id"] = made.face_object.tolist()
+    (made.folder / "objects.json").write_text(json.dumps(document))
+    return _capture(made.folder, "objects.json")
+
+
+def colmap_text(folder: Path) -> list[Seed]:
+    scene = test_scan_from_scannetpp.write_scene(folder / "0a", _room())
+    model = folder / "capture"
+    shutil.copytree(scene / "dslr" / "resized_images", model / "images")
+    shutil.copytree(scene / "dslr" / "colmap", model / "sparse" / "0")
+    shutil.copy(scene / "scans" / "mesh_aligned_0.05.ply", model / "mesh.ply")
+    cameras = model / "sparse" / "0" / "cameras.txt"
+    cameras.write_text(cameras.read_text() + "2 OPENCV 32 24 20 20 16 12 0.1 0 0 0\n")
+    return _capture(model, "sparse/0/cameras.txt", "sparse/0/images.txt")
+
+
+def colmap_binary(folder: Path) -> list[Seed]:
+    import pycolmap
+
+    (seed,) = colmap_text(folder)
+    sparse = seed.entry / "sparse" / "0"
+    pycolmap.Reconstruction(str(sparse)).write_binary(str(sparse))
+    for text in sparse.glob("*.txt"):
+        text.unlink()
+    return _capture(seed.entry, "sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/rigs.bin",
+                    "sparse/0/frames.bin")  # fmt: skip
+
+
+def colmap(folder: Path) -> list[Seed]:
+    """As text and as binary files."""
+    return [*colmap_text(folder / "text"), *colmap_binary(folder / "binary")]
+
+
+def scanner_app(folder: Path) -> list[Seed]:
+    export, _ = test_scan_from_scanner_app.make_export(folder)
+    return _capture(export, "frame_*.json")
+
+
+def eyeful_tower(folder: Path) -> list[Seed]:
+    rig = test_scan_from_eyeful_tower.write_rig(folder / "office", _room())
+    return _capture(rig, "cameras.json")
+
+
+def fipt(folder: Path) -> list[Seed]:
+    first = test_scan_from_fipt.write_photographed(folder / "classroom", _room())
+    second = test_scan_from_fipt.write_rendered(folder / "kitchen", _room())
+    return [
+        *_capture(first, "cam.txt", "K_list.txt"),
+        *_capture(second, "train/transforms.json", "val/transforms.json"),
+    ]
+
+
+def llff(folder: Path) -> list[Seed]:
+    return _capture(
+        test_scan_from_llff.write_llff(folder / "head", _room().centred()), "poses_bounds.npy"
+    )
+
+
+def nice_slam(folder: Path) -> list[Seed]:
+    scene = test_scan_from_replica.write_scene(folder / "data" / "room0", _room())
+    return [Seed(entry=scene, targets=(scene / "traj.txt", scene.parent / "cam_params.json"))]
+
+
+def replica(folder: Path) -> list[Seed]:
+    room = _room()
+    scene = test_scan_from_replica.write_scene(folder / "data" / "room0", room)
+    test_scan_from_replica.write_semantics(scene, room)
+    (scene.parent / "room0_mesh.ply").rename(scene / "mesh.ply")
+    border = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    (scene / "glass.sur").write_text(json.dumps([{"plane_w": [0, 0, 1, 0], "boundary_w": border}]))
+    return _capture(scene, "habitat/info_semantic.json", "glass.sur")
+
+
+def scannetpp(folder: Path) -> list[Seed]:
+    scene = test_scan_from_scannetpp.write_scene(folder / "0a5c", _room())
+    return _capture(scene, "scans/segments.json", "scans/segments_anno.json")
+
+
+def metashape(folder: Path) -> list[Seed]:
+    return _capture(test_scan_from_metashape.write_project(folder / "p", _room()), "cameras.xml")
+
+
+def realityscan(folder: Path) -> list[Seed]:
+    room = _room().square()
+    pictures = test_scan_from_realityscan.write_pictures(folder / "table", room)
+    table = test_scan_from_realityscan.write_table(pictures, room)
+    beside = test_scan_from_realityscan.write_sidecars(folder / "xmp", room, as_attributes=True)
+    return [*_capture(table, "registration.csv"), *_capture(beside, "images/*.xmp")]
+
+
+def e57(folder: Path) -> list[Seed]:
+    survey = test_scan_from_e57.write_survey(folder / "survey", _room())
+    return _capture(survey / "scan.e57", "scan.e57")
+
+
+# --- USD -----------------------------------------------------------------------------------------
+
+
+def stages(folder: Path) -> list[Seed]:
+    """A room with cameras, as text, as crate and in a package."""
+    room = _room()
+    room = replace(room, world_from_camera=room.world_from_camera[:3])
+    paths = [folder / name for name in ("room.usda", "crate.usdc")]
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stage = test_scan_from_usd_stage.make_stage(path, room, parts=path.suffix == ".usda")
+        test_scan_from_usd_stage.many_cameras(stage, room)
+        mesh = UsdGeom.Mesh(next(prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)))
+        UsdGeom.Subset.CreateGeomSubset(mesh, "part", "face", [0, 1], "objects")
+        mesh.GetPrim().CreateAttribute("semantics:labels:class", Sdf.ValueTypeNames.TokenArray).Set(
+            ["wall"]
+        )
+        stage.Save()
+    packed = package(folder / "package.usdz", {"room.usda": paths[0].read_bytes()})
+    return _alone(*paths, packed)
+
+
+def package(path: Path, entries: Mapping[str, bytes]) -> Path:
+    """A USDZ: entries stored, their contents at multiples of 64 bytes."""
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in entries.items():
+            item = zipfile.ZipInfo(name)
+            padding = -(made.tell() + 30 + len(name) + 4) % 64
+            item.extra = b"\x86\x19" + padding.to_bytes(2, "little") + bytes(padding)
+            archive.writestr(item, content)
+    path.write_bytes(made.getvalue())
+    return path
+
+
+def stage_with_pictures(folder: Path) -> list[Seed]:
+    """A stage as a capture: cameras by the names of their pictures, and one with back plates."""
+    room, found = _room(), []
+    for name in ("still", "moving"):
+        stage = test_scan_from_usd_stage.make_stage(folder / name / "room.usda", room)
+        if name == "still":
+            test_scan_from_usd_stage.many_cameras(stage, room)
+        else:
+            plates = [f"./images/IMG-{i:03d}.exr" for i in range(len(room.images))]
+            test_scan_from_usd_stage.moving_camera(stage, room, plates)
+        stage.Save()
+        for i, image in enumerate(room.images):
+            write_image(folder / name / "images" / f"IMG-{i:03d}.exr", image)
+        found += _alone(folder / name / "room.usda")
+    return found
+
+
+def materials(folder: Path) -> list[Seed]:
+    """A model with materials, and lights of all kinds."""
+    _picture(folder / "glow.exr", "half")
+    (folder / "thing.usda").write_text(STAGE_OF_MATERIALS)
+    stage = Usd.Stage.CreateNew(str(folder / "lights.usdc"))
+    for kind in ("RectLight", "DiskLight", "SphereLight", "CylinderLight", "DistantLight"):
+        light = UsdLux.LightAPI(stage.DefinePrim(f"/{kind}", kind))
+        light.CreateIntensityAttr(3.0)
+        light.CreateColorTemperatureAttr(4000.0)
+    dome = UsdLux.DomeLight.Define(stage, "/dome")
+    dome.CreateTextureFileAttr("glow.exr")
+    stage.GetRootLayer().Save()
+    stage.GetRootLayer().Export(str(folder / "lights.usda"))
+    return _alone(folder / "thing.usda", folder / "lights.usda", folder / "lights.usdc")
+
+
+REVIEW = """#usda 1.0
+(
+    customLayerData = {string tool = "usdbrdf"}
+)
+over "room" (
+    customData = {dictionary usdbrdf = {dictionary review = {
+        string verdict = "wrong"
+        string comment = "a mirror, \\"seen\\" once"
+        string directive = "mirror"
+        string status = "measured"
+        double phi = 0.2
+        double psi = 0.04
+    }}}
+)
+{
+    over "box"
+    {
+    }
+}
+"""
+
+
+def review(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    (folder / "review.usda").write_text(REVIEW)
+    return [Seed(entry=folder, targets=(folder / "review.usda",))]
+
+
+# --- Records -------------------------------------------------------------------------------------
+
+
+def stamps(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    stamp = Stamp(
+        stage="shade", version="1", parameters={"a": [1, 2.5]}, inputs={"capture": "0" * 64},
+        outputs={"layers/shading.usda": "1" * 64},
+    )  # fmt: skip
+    write_stamp(folder / "30-shade.json", stamp)
+    return _alone(folder / "30-shade.json")
+
+
+def manifests(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    manifest = Manifest(
+        name="room", version="3", identifier="room", texture_space="lin_rec709_scene",
+        photographs=False, content="0" * 64, files={"room.usda": "1" * 64},
+    )  # fmt: skip
+    write_manifest(folder, manifest)
+    return [Seed(entry=folder, targets=tuple(folder.iterdir()))]
+
+
+def arrays(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    save_arrays(folder / "a.npz", {"albedo": np.ones((5, 3), np.float32), "n": np.arange(9)})
+    return _alone(folder / "a.npz")
+
+
+def known_objects(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    row = {"name": "box", "id": 1, "phi": 0.2, "psi": 0.04, "emission": [0.0, 0.0, 0.0]}
+    (folder / "objects.json").write_text(json.dumps([row, {**row, "name": "lamp", "id": 2}]))
+    return [Seed(entry=folder, targets=(folder / "objects.json",))]
+
+
+def matrices(folder: Path) -> list[Seed]:
+    folder.mkdir(parents=True)
+    (folder / "matrix.txt").write_text("1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    return _alone(folder / "matrix.txt")
+
+
+NEEDS = {
+    **dict.fromkeys(("colmap", "colmap_text", "colmap_binary", "scannetpp"), "pycolmap"),
+    **{"e57": "pye57", "dng": "rawpy"},
+}
+
+
+def missing(seeds: str) -> str:
+    """The package that this kind of file cannot be read without here, "" if none is missing."""
+    needed = NEEDS.get(seeds, "")
+    return needed if needed and find_spec(needed) is None else ""
