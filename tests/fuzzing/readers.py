@@ -247,7 +247,11 @@ READERS = {
             name="usd",
             seeds=seeds.stages,
             read=_whole_stage,
-            lines=("usdbrdf.untrusted.usd_files", "usdbrdf.untrusted.usd_cameras"),
+            lines=(
+                "usdbrdf.untrusted.usd_files",
+                "usdbrdf.untrusted.usd_paths",
+                "usdbrdf.untrusted.usd_cameras",
+            ),
             in_child=True,
             unknown=frozenset(("corner_normals", "times", "lens", "world_from_camera")),
         ),

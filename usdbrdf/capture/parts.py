@@ -54,7 +54,8 @@ from usdbrdf.model.mesh import (
 )
 from usdbrdf.options import AUTO, CaptureOptions
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
-from usdbrdf.untrusted.usd_files import USD_SUFFIXES, meshes_from_usd
+from usdbrdf.untrusted.usd_files import meshes_from_usd
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 P = ParamSpec("P")
 _MAX_OBJECTS = 65_535

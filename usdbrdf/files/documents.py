@@ -26,6 +26,7 @@ from usdbrdf.model.arrays import Array
 
 MAX_BYTES = 256 << 20
 MAX_DEPTH = 64
+_MAX_ARRAY_BYTES = 4 << 30  # of one that is stored smaller
 _INTEGER_LIMIT = 1 << 63
 _HALF_A_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # or half of a whole one
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
@@ -240,7 +241,7 @@ def refusal_of_arrays(path: Path, error: Exception) -> InputRefused:
 
 def _array_of(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> Array:
     """One array, once its header is known to announce no more than its part holds."""
-    if item.file_size > max(MAX_BYTES, item.compress_size):
+    if item.file_size > max(_MAX_ARRAY_BYTES, item.compress_size):
         raise ValueError(f"{item.compress_size} bytes are to become {item.file_size}")
     reads = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
     with archive.open(item) as stream:

@@ -31,7 +31,7 @@ MAX_CHANNELS = 64
 _MAX_PARTS = 64  # of one file, which are searched for R, G and B
 MAX_DECLARED_BYTES = 4 << 30
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above so many bytes
-_ANY_INFLATION = 1 << 28
+_ANY_INFLATION = 1 << 30
 # A display window may be larger than what the file holds; beyond this many bytes not by any factor.
 MAX_UNKNOWN_BYTES, MAX_UNKNOWN_SHARE = 64 << 20, 63 / 64
 HALF_MAX = 65_504.0

@@ -37,14 +37,15 @@ def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:
 
 
 def number_rows(path: Path) -> tuple[Double, ...]:
-    """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any and
-    those that begin with # are passed over. NaN and infinities are for the caller to judge."""
+    """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any, and
+    what follows a #, are passed over. NaN and infinities are for the caller to judge."""
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
-        if not line.strip() or line.lstrip().startswith("#"):
+        numbers = line.partition("#")[0].replace(",", " ")
+        if not numbers.strip():
             continue
         try:
-            rows.append(np.array(line.replace(",", " ").split(), np.float64))
+            rows.append(np.array(numbers.split(), np.float64))
         except ValueError as error:
             raise InputRefused(
                 f"{path}:{number}: not a row of numbers ({line.strip()[:60]!r}). Export it again. "

@@ -17,7 +17,8 @@ from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import hash_of_files
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.task import HANDED_ON
-from usdbrdf.untrusted.usd_files import USD_SUFFIXES, layers_of_usd
+from usdbrdf.untrusted.usd_files import layers_of_usd
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 
 def parameters_of(options: IngestOptions) -> dict[str, Any]:

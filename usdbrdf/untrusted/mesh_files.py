@@ -29,6 +29,7 @@ SUFFIXES = (".ply", ".obj", ".glb")
 # The face property by which the objects of a segmented PLY are told apart.
 LABEL_PROPERTY = "object_id"
 _MAX_TRIANGLES = 50_000_000
+_MAX_ZEROS = 8 << 20  # elements of a GLB that have no bytes
 _MAX_COORDINATE = 1e6
 _MIN_DIAGONAL = 1e-4
 # Faces with broken corners below this share are removed; above it the file is not what it says.
@@ -201,8 +202,8 @@ def _refuse_promises(file: BinaryIO) -> None:
     document = json.loads(file.read(starts[1] - 20)) if len(starts) > 1 else {}
     file.seek(0)
     promised = [int(a["count"]) for a in document.get("accessors", ()) if "bufferView" not in a]
-    if sum(map(abs, promised)) > size:
-        raise ValueError(f"{size} bytes are to hold {sum(promised)} elements")
+    if sum(map(abs, promised)) > _MAX_ZEROS:
+        raise ValueError(f"{sum(promised)} elements without bytes (limit {_MAX_ZEROS})")
 
 
 def _mesh_from_glb(file: BinaryIO) -> FileMesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,7 +141,9 @@ def _file_of(plate: Usd.Attribute, code: Usd.TimeCode) -> str:
     if not _is_path(value):
         return ""
     layer = plate.GetPropertyStack(code)[0].layer
-    return str(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
+    named = value.resolvedPath or layer.ComputeAbsolutePath(value.path)
+    # What is named without a leading ./ and not there stays as it is named.
+    return os.path.join(os.path.dirname(str(layer.realPath)), str(named))
 
 
 def _is_path(value: object) -> bool:

@@ -1,21 +1,18 @@
-"""USD files that somebody else made: their asset paths, checked before anything is composed, their
-meshes as one soup, and whatever a reader makes of them; all read in child processes.
-
-USD follows absolute paths, ``../`` and links without a question, wherever they lead.
+"""USD files that somebody else made: their meshes as one soup, and whatever a reader makes of them,
+once their asset paths are checked (``usd_paths``); all read in child processes.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
+from pxr import Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import unique_identifiers
@@ -29,10 +26,9 @@ from usdbrdf.model.mesh import (
     joined,
     triangulate,
 )
-from usdbrdf.untrusted.bounds import LIMITS, read_in_child
+from usdbrdf.untrusted.bounds import read_in_child
+from usdbrdf.untrusted.usd_paths import check_asset_paths, one_line, refuse_unchecked, usd_errors
 
-USD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz"})
-_MAX_LAYERS = 1000
 # What fills the sky or lies below an atom is no scan's unit.
 _MIN_UNIT, _MAX_UNIT = 1e-9, 1e9
 T = TypeVar("T")
@@ -84,15 +80,16 @@ def _in_child(
 def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
     """The "layers", the "meshes", these with their "parts", or what another ``reader`` makes of a
     file, in this process, a child; nothing is composed before the asset paths are checked."""
-    with _usd_errors(path):
+    with usd_errors(path):
         layers = check_asset_paths(path, allowed)
         if reader == "layers":
             return tuple(layers)
         stage = Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+        refuse_unchecked(stage, layers)
         problems = stage.GetCompositionErrors()
         if problems:
             raise InputRefused(
-                f"{path}: the stage does not compose: {_one_line(problems[0])}. Bring the missing "
+                f"{path}: the stage does not compose: {one_line(problems[0])}. Bring the missing "
                 "layers along, or flatten it. [stage.input]"
             )
         if reader in ("meshes", "parts"):
@@ -100,23 +97,6 @@ def read_here(path: Path, reader: str, allowed: Sequence[str]) -> Any:
         check_units(stage, path)
         module, _, name = reader.partition(":")
         return getattr(import_module(module), name)(path)
-
-
-@contextmanager
-def _usd_errors(path: Path) -> Iterator[None]:
-    """USD's own errors become InputRefused, and text of the file that Python cannot hold."""
-    try:
-        yield
-    except UnicodeDecodeError as error:
-        shown = repr(error.object[max(error.start - 20, 0) : error.start + 20])
-        raise InputRefused(
-            f"{path}: a name or a path in it is not UTF-8 ({shown}), so no program can be told of "
-            "it. Rename it, or export the file again. [stage.input]"
-        ) from error
-    except Tf.ErrorException as error:
-        raise InputRefused(
-            f"{path}: USD cannot read it ({_one_line(error)}). Export it again. [stage.input]"
-        ) from error
 
 
 def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
@@ -210,109 +190,13 @@ def _labels_at(prim: Usd.Prim) -> list[str]:
         words = attribute.GetName().split(":")
         if words[:2] == ["semantics", "labels"]:
             values = attribute.Get(Usd.TimeCode.EarliestTime())
-            values = values if isinstance(values, Vt.TokenArray) else ()
+            values = (values,) if isinstance(values, str) else values
+            values = values if isinstance(values, Vt.TokenArray | Vt.StringArray | tuple) else ()
             found += [(words[-1] not in ("class", "category"), str(value)) for value in values]
         elif words[0] == "semantic" and words[-1] == "semanticData":
             kind = prim.GetAttribute(":".join([*words[:-1], "semanticType"]))
             found += [(not kind or kind.Get() != "class", str(attribute.Get()))]
     return [label for _, label in sorted(found, key=lambda entry: entry[0]) if label]
-
-
-def check_asset_paths(path: Path, allowed: Sequence[str]) -> list[Path]:
-    """The layers that ``path`` reaches, itself first; InputRefused unless every path in them stays
-    in one of the ``allowed`` folders, which are absolute and without links.
-
-    Layers, references, payloads, of every variant, and asset-valued attributes count, in packages
-    too; links are judged by where they lead. What a crafted crate file does to USD's own reader is
-    not caught here: call this in a child process.
-    """
-    waiting, seen, total = [str(path.resolve())], list[str](), 0
-    while waiting:
-        layer = waiting.pop()
-        if layer in seen:
-            continue
-        seen.append(layer)
-        total += 0 if Ar.IsPackageRelativePath(layer) else Path(layer).stat().st_size
-        if len(seen) > _MAX_LAYERS or total > LIMITS["stage"].file_bytes:
-            raise InputRefused(
-                f"{path}: more than {_MAX_LAYERS} layers or {LIMITS['stage'].file_bytes} bytes of "
-                "layers. Flatten the stage, or name the part that was captured. [stage.input_size]"
-            )
-        waiting += _layers_in_package(layer)
-        with _usd_errors(Path(layer)):
-            opened = Sdf.Layer.FindOrOpen(layer)
-            found = UsdUtils.ExtractExternalReferences(layer)
-            if opened and opened.HasExpressionVariables():
-                # Which value counts depends on the layer that composes this one.
-                raise InputRefused(
-                    f"{layer}: its asset paths may hold variables (expressionVariables), so that "
-                    "nobody can say where they lead. Flatten the stage. [paths.variables]"
-                )
-        for reference in sorted({reference for kind in found for reference in kind if reference}):
-            if Ar.IsPackageRelativePath(layer):
-                _refuse_leaving_package(layer, reference)
-                continue
-            target = _target(Path(layer), reference, allowed)
-            if target.suffix.lower() in USD_SUFFIXES and target.is_file():
-                waiting.append(str(target))
-    return [Path(layer) for layer in seen if not Ar.IsPackageRelativePath(layer)]
-
-
-def _layers_in_package(layer: str) -> list[str]:
-    """The layers in a USDZ, which may itself lie in one; none in other layers."""
-    name = Ar.SplitPackageRelativePathInner(layer)[1] or layer
-    if not name.lower().endswith(".usdz"):
-        return []
-    with _usd_errors(Path(layer)):
-        package = Sdf.ZipFile.Open(layer)
-    names = package.GetFileNames() if package else ()
-    for name in names:
-        if name.startswith(("/", "\\")) or ".." in Path(name).parts:
-            raise _outside(layer, name, "is an entry that leaves the package")
-    inside = [name for name in names if Path(name).suffix.lower() in USD_SUFFIXES]
-    return [Ar.JoinPackageRelativePath(layer, name) for name in inside]
-
-
-def _refuse_leaving_package(layer: str, reference: str) -> None:
-    """InputRefused where a layer in a package refers to anything but what lies in there with it:
-    nothing else is found, but for absolute paths."""
-    name = Ar.SplitPackageRelativePathOuter(reference)[0]
-    if os.path.isabs(name) or "://" in name or name.startswith("\\"):
-        raise _outside(layer, reference, "is no path in the package")
-
-
-def _target(layer: Path, reference: str, allowed: Sequence[str]) -> Path:
-    name = reference
-    if Ar.IsPackageRelativePath(name):
-        name = Ar.SplitPackageRelativePathOuter(name)[0]
-    if "://" in name or name.startswith(("\\\\", "//")):
-        raise _outside(layer, reference, "is a URI")
-    if os.path.isabs(name):
-        raise _outside(layer, reference, "is an absolute path")
-    name = name.partition(":SDF_FORMAT_ARGS:")[0]
-    target = Path(os.path.realpath(layer.parent / name))
-    if not any(target.is_relative_to(folder) for folder in allowed):
-        raise _outside(layer, reference, "leads outside the capture")
-    return target
-
-
-def _outside(layer: Path | str, reference: str, reason: str) -> InputRefused:
-    return InputRefused(
-        f"{layer}: the asset path {reference[:200]!r} {reason}. Keep what belongs to the stage "
-        "beside it and name it by relative paths. [paths.outside]"
-    )
-
-
-def _one_line(error: object) -> str:
-    return " ".join(words_of(error).split())[:300]
-
-
-def words_of(error: object) -> str:
-    """What an error of USD says, which may quote bytes of a file that are no text."""
-    try:
-        return str(getattr(error, "commentary", error))
-    except UnicodeDecodeError as undecoded:
-        return undecoded.object.decode("utf-8", "replace")
 
 
 def check_units(stage: Usd.Stage, path: Path) -> tuple[float, str]:
@@ -345,11 +229,21 @@ def is_deforming(mesh: UsdGeom.Mesh) -> bool:
 
 
 def refuse_broken_meshes(path: Path) -> None:
-    """InputRefused where a mesh of a stage, hidden or not, has faces that its points do not fit."""
+    """InputRefused where a mesh that a stage shows has faces that its points do not fit; one that
+    is empty is nothing."""
     stage, time = Usd.Stage.Open(str(path), Usd.Stage.LoadAll), Usd.TimeCode.EarliestTime()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
-        if prim.IsA(UsdGeom.Mesh):
-            _topology(UsdGeom.Mesh(prim), time, path)
+        if prim.IsA(UsdGeom.Mesh) and _is_shown(UsdGeom.Imageable(prim)):
+            mesh = UsdGeom.Mesh(prim)
+            if mesh.GetFaceVertexCountsAttr().Get(time):
+                _topology(mesh, time, path)
+
+
+def _is_shown(shape: UsdGeom.Imageable) -> bool:
+    """Whether it is visible, and there to be rendered."""
+    visible = shape.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
+    other = UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide
+    return bool(visible and shape.ComputePurpose() not in other)
 
 
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
@@ -363,9 +257,7 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
             )
         if not prim.IsA(UsdGeom.Gprim):
             continue
-        shape = UsdGeom.Imageable(prim)
-        shown = shape.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
-        if not shown or shape.ComputePurpose() in (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):
+        if not _is_shown(UsdGeom.Imageable(prim)):
             hidden += 1
         elif prim.IsA(UsdGeom.Mesh):
             meshes.append(UsdGeom.Mesh(prim))
@@ -458,18 +350,29 @@ def _topology(mesh: Any, time: Any, path: Path) -> tuple[Double, Int, Int]:
     return points, counts, indices
 
 
-def numbers_of(value: Any, kind: Any) -> Any:
-    """An attribute's value as an array; an empty one where a file has given it another type."""
+def numbers_of(value: Any, kind: Any, width: int = 1) -> Any:
+    """An attribute's value as an array, (N,) or (N, width); an empty one where a file has given it
+    another type, or numbers that ``kind`` cannot hold."""
+    shape = (-1,) if width == 1 else (-1, width)
+    none = np.zeros(0, kind).reshape(shape)
     try:
-        return np.array([] if value is None else value, kind)
+        stored = np.array(none if value is None else value)
+        fits = stored.ndim == 1 and stored.size % width == 0
+        fits |= stored.ndim == 2 and stored.shape[1] == width > 1
+        if not fits or stored.dtype.kind not in "buif":
+            return none
+        whole = np.dtype(kind).kind == "i" and stored.size > 0
+        limits = np.iinfo(kind) if whole else None
+        if limits and not (limits.min <= stored.min() and stored.max() <= limits.max):
+            return none
+        return stored.astype(kind).reshape(shape)
     except (TypeError, ValueError, OverflowError):
-        return np.zeros(0, kind)
+        return none
 
 
 def _vectors(value: Any) -> Double:
-    """(N, 3); none where the numbers are no multiple of three."""
-    numbers = numbers_of(value, np.float64)
-    return np.asarray(numbers.reshape(-1, 3) if numbers.size % 3 == 0 else np.zeros((0, 3)))
+    """(N, 3) of an attribute's value."""
+    return np.asarray(numbers_of(value, np.float64, 3))
 
 
 def _authored_normals(

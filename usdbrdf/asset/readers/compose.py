@@ -21,7 +21,7 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, hash_of_files, read_stamp
 from usdbrdf.model.arrays import Array
 from usdbrdf.options import NO_LIGHT, Surroundings
-from usdbrdf.untrusted.usd_files import words_of
+from usdbrdf.untrusted.usd_paths import words_of
 
 _MAX_LENGTH = 600
 _TIMEOUT_S = 600.0

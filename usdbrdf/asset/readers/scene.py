@@ -36,6 +36,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import INTERPOLATIONS, Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted.usd_files import numbers_of
 
 Record = TypeVar("Record")
 Number = TypeVar("Number", np.float32, np.float64)
@@ -218,12 +219,11 @@ def per_corner(
 
 def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
     """The mesh as triangles, counter-clockwise seen from outside, in its own frame."""
-    holes = mesh.GetHoleIndicesAttr().Get(_TIME)
     return triangulate(
-        np.asarray(mesh.GetFaceVertexCountsAttr().Get(_TIME), np.int32),
-        np.asarray(mesh.GetFaceVertexIndicesAttr().Get(_TIME), np.int32),
+        numbers_of(mesh.GetFaceVertexCountsAttr().Get(_TIME), np.int32),
+        numbers_of(mesh.GetFaceVertexIndicesAttr().Get(_TIME), np.int32),
         left_handed=mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded,
-        holes=np.asarray(holes, np.int32) if holes else None,
+        holes=numbers_of(mesh.GetHoleIndicesAttr().Get(_TIME), np.int32),
     )
 
 

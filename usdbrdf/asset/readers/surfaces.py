@@ -349,7 +349,7 @@ def _primvar(
     primvar = UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name) if name else None
     if not primvar or not primvar.HasValue():
         return None
-    rows = numbers_of(primvar.ComputeFlattened(time), np.float32)
-    if not rows.size or rows.size % width:
+    rows = numbers_of(primvar.ComputeFlattened(time), np.float32, width)
+    if not rows.size:
         return None
     return per_corner(rows.reshape(-1, width), np.float32, primvar.GetInterpolation(), fans)

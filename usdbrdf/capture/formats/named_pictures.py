@@ -29,7 +29,7 @@ from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
-from usdbrdf.untrusted.usd_files import USD_SUFFIXES
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")

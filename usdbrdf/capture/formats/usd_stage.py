@@ -33,7 +33,7 @@ from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.usd_cameras import UsdCamera, cameras_from_usd
-from usdbrdf.untrusted.usd_files import USD_SUFFIXES
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 NAME = "usd"
 DESCRIPTION = DESCRIPTIONS[NAME]
