@@ -15,6 +15,7 @@ advice. What lies in WORK already is not made again. WORK/advised_poses.json has
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import shutil
 import subprocess
@@ -57,8 +58,8 @@ def main() -> int:
     times = sorted({frame["exposure_time"] for frame in document(third)["frames"]}, reverse=True)
     rng = np.random.default_rng(SEED)
     draws = [
-        [(free[i], times[k % len(times)]) for k, i in enumerate(rng.permutation(len(free))[:6])]
-        for _ in range(options.draws)
+        [(free[i], times[k % len(times)]) for k, i in enumerate(drawn[: options.poses])]
+        for drawn in (rng.permutation(len(free)) for _ in range(options.draws))
     ]
     rows = {"advised": advice, **{f"random_{k}": draw for k, draw in enumerate(draws)}}
     shown = scene.shares(third, free, rows)
@@ -66,7 +67,7 @@ def main() -> int:
     found: dict[str, Any] = {"before": before, "shares": shown, "rows": {}}
     for number, (name, poses) in enumerate(rows.items()):
         more = scene.with_more(third, work / name, poses, options.samples, SEED + 100 * number)
-        after = measured(convert(more, work / f"{name}_asset"))
+        after = measured(convert(more, more.with_name(f"{more.name}_asset")))
         found["rows"][name] = {"measured": after, "more": len(set(after) - set(before))}
         print(name, len(after), sorted(set(after) - set(before)), sorted(set(before) - set(after)),
               f"{shown['seen'][name]:.0%}", flush=True)  # fmt: skip
@@ -80,10 +81,13 @@ def main() -> int:
 def third_of(capture: Path, folder: Path) -> Path:
     """The capture with every third group of three of its frames."""
     if not folder.exists():
-        shutil.copytree(capture, folder)
-        whole = document(folder)
+        half_done = folder.with_name(f"{folder.name}.half-done")
+        shutil.rmtree(half_done, ignore_errors=True)
+        shutil.copytree(capture, half_done)
+        whole = document(half_done)
         whole["frames"] = [f for k, f in enumerate(whole["frames"]) if k // 3 % 3 == 0]
-        write_json(folder / "transforms.json", whole)
+        write_json(half_done / "transforms.json", whole)
+        half_done.rename(folder)
     return folder
 
 
@@ -197,7 +201,9 @@ class Scene:
     def with_more(
         self, third: Path, folder: Path, poses: list[tuple[Array, float]], samples: int, seed: int
     ) -> Path:
-        """The third with photographs from further poses."""
+        """The third with photographs from further poses, in a folder named after these."""
+        told = repr([(pose.tolist(), time) for pose, time in poses]) + f" {samples} {seed}"
+        folder = folder.with_name(f"{folder.name}_{hashlib.sha256(told.encode()).hexdigest()[:8]}")
         if not (folder / "transforms.json").exists():
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(third, folder, ignore=shutil.ignore_patterns("transforms.json"))

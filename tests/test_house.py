@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import SLOW
+from usdbrdf import identity
 from usdbrdf.calibration import entries
 
 PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
@@ -372,6 +373,10 @@ def test_every_room_has_its_place():
     assert {room(name) for name in modules()} <= ARROWS.keys()
     assert GROUND | RUNNING | SUBJECTS | READERS | {"model"} <= ARROWS.keys()
     assert tuple(TopologicalSorter(ARROWS).static_order())
+
+
+def test_what_writes_into_no_asset_makes_no_step_stale():
+    assert identity._OUTSIDE_TASKS >= READERS
 
 
 def test_imports_go_downwards_only():

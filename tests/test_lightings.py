@@ -16,12 +16,14 @@ from pxr import Sdf, Usd, UsdShade
 import usdbrdf
 from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.asset.adopt import adopt
+from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_edited, open_measured
 from usdbrdf.asset.readers.scene import aov_path, read_fit, read_shading
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.page import report
@@ -265,6 +267,15 @@ def test_an_adopted_edit_of_one_lighting_is_none_of_the_others(asset, tmp_path):
     stages.append(open_edited(asset.in_lighting("day")))
     day, night, before = (stage.GetAttributeAtPath(name).Get() for stage in stages)
     assert (day, night) == (before, 7777.0)
+
+
+def test_advice_is_of_the_lighting_that_the_asset_opens_in(asset):
+    told = usdbrdf.advise(asset.folder, usdbrdf.AdviseOptions(poses=1))
+    place, atlas = measured_atlas(asset.folder, None)
+    place = place.in_lighting(atlas.lighting)
+    assert told["layer"] == str(place.advice_layer)
+    assert read_advice(place) == (told["poses"], True)
+    place.advice_layer.unlink()
 
 
 def test_other_lightings_need_another_folder(base, asset, captures):

@@ -19,7 +19,7 @@ PACKAGE = Path(__file__).resolve().parent
 _DATA = (".json", ".toml")
 # What these say or do never enters a layer or texture of an asset.
 _OUTSIDE_TASKS = {
-    *("delivery", "evaluation", "page", "relighting", "validation"),
+    *("advice", "delivery", "evaluation", "page", "relighting", "validation"),
     *("cli.py", "__main__.py"),
 }
 # Not the package's own code, but what a wheel carries along.

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
@@ -265,9 +265,14 @@ def parallel_kernel(
 
         # Whoever calls works too: to wake one thread less is what small kernels feel.
         others = [_pool().submit(work) for _ in range(min(parts, num_threads()) - 1)]
-        work()
+        try:
+            work()
+        finally:
+            # Those that have not begun find nothing left; none may go on writing after this.
+            wait([other for other in others if not other.cancel()])
         for other in others:
-            other.result()
+            if not other.cancelled():
+                other.result()
 
     return in_parts
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 import usdbrdf
 from tests.advice.plate_room import ROOM, frame_poses, highlight, mesh, write_capture
-from usdbrdf.asset.advice import read_advice
+from usdbrdf.asset.advice import read_advice, write_advice
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict
@@ -128,6 +128,19 @@ def test_what_was_written_is_read_and_told_on_the_page(advised):
     layer.write_bytes(kept + b"\n# changed\n")
     assert read_advice(asset)[1] is False
     layer.write_bytes(kept)
+
+
+def test_where_nothing_is_advised_the_layer_stays_for_who_made_it_a_sublayer(advised):
+    asset = Asset.made(advised[0])
+    kept = asset.advice_layer.read_bytes()
+    assert write_advice(asset, [], {}) == asset.advice_layer
+    assert read_advice(asset) == ([], True)
+    root = Sdf.Layer.CreateAnonymous()
+    root.subLayerPaths = [str(asset.advice_layer), str(asset.root_layer)]
+    stage = Usd.Stage.Open(root)
+    assert not stage.GetCompositionErrors()
+    assert not stage.GetPrimAtPath("/room/cameras/advised_1")
+    asset.advice_layer.write_bytes(kept)
 
 
 def test_a_layer_that_is_none_is_refused(advised):

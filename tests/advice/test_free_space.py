@@ -8,7 +8,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from tests.advice.plate_room import CABINET, ROOM, frame_poses, mesh
-from usdbrdf.advice.free_space import free_places, is_enclosed, surface_samples
+from usdbrdf.advice.free_space import corners_near, free_places, is_enclosed, surface_samples
+from usdbrdf.errors import UsageError
 from usdbrdf.transport.rays import RayScene
 
 CLEARANCE = 0.3
@@ -79,9 +80,33 @@ def test_where_there_is_no_room_there_is_no_place(room, eyes):
 
 def test_samples_lie_as_close_as_is_asked(room):
     points, triangles, _ = room
-    samples = surface_samples(points, triangles, 0.1)
+    samples = surface_samples(points[triangles].astype(np.float64), 0.1)
     surface = trimesh.Trimesh(points, triangles, process=False)
     anywhere = trimesh.sample.sample_surface(surface, 2000, seed=3)[0]
     assert cKDTree(samples).query(anywhere)[0].max() <= 0.1
     dense = cKDTree(trimesh.sample.sample_surface(surface, 400_000, seed=1)[0])
     assert dense.query(samples)[0].max() < 0.08
+
+
+def test_of_a_large_ground_only_what_lies_near_is_looked_at():
+    side = 1000.0
+    ground = np.array([[-side, -side, 0], [side, -side, 0], [side, side, 0], [-side, side, 0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    low, high = np.array([-5.0, -3.0, -1.0]), np.array([7.0, 2.0, 1.0])
+    near = corners_near(ground[triangles], low, high)
+    across = np.cross(near[:, 1] - near[:, 0], near[:, 2] - near[:, 0])
+    area = np.linalg.norm(across, axis=1).sum() / 2
+    assert 12 * 5 <= area < 30 * 20
+    assert (across[:, 2] > 0).all()
+    assert (near.min(axis=(0, 1))[:2] <= low[:2]).all()
+    assert (near.max(axis=(0, 1))[:2] >= high[:2]).all()
+    rays = RayScene(ground.astype(np.float32), triangles)
+    eyes = np.array([[0.0, 0, 1.6], [1, 0, 1.6], [0, 1, 1.5]])
+    found = free_places(rays, eyes, 2, heights=(0.5, 2.0), clearance=0.25, count=50)
+    assert len(found.eye)
+    assert np.abs(found.eye[:, :2]).max() < 8
+
+
+def test_a_clearance_that_asks_for_too_much_is_refused(room, eyes):
+    with pytest.raises(UsageError, match=r"--clearance 0\.005: .* Take 0\.\d+ or more"):
+        free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=0.005, count=50)

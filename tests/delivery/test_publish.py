@@ -370,6 +370,38 @@ def test_stand_ins_have_few_triangles_and_lie_beside_each_mesh(room, tmp_path):
     assert not any(prim.IsA(UsdGeom.Mesh) for prim in unloaded.Traverse())
 
 
+def test_what_an_artist_references_keeps_its_own_purposes(room, tmp_path):
+    stool = Usd.Stage.CreateNew(str(room.asset.folder / "stool.usda"))
+    top = UsdGeom.Xform.Define(stool, "/stool")
+    stool.SetDefaultPrim(top.GetPrim())
+    Usd.ModelAPI(top).SetKind("component")
+    seat = UsdGeom.Mesh.Define(stool, "/stool/stool")
+    seat.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    seat.GetFaceVertexCountsAttr().Set([3])
+    seat.GetFaceVertexIndicesAttr().Set([0, 1, 2])
+    stool.GetRootLayer().Save()
+    grid, folder, dest = dense_grid(room), room.asset.folder, tmp_path / "dest"
+    stage = Usd.Stage.Open(str(room.asset.root_layer))
+    stage.SetEditTarget(Sdf.Layer.FindOrOpen(str(room.asset.edits_layer)))
+    stage.DefinePrim("/room/geo/stool").GetReferences().AddReference("./stool.usda")
+    moved = UsdGeom.Xformable(stage.GetPrimAtPath(grid)).AddTranslateOp()
+    moved.Set((0.0, 0.0, 4.0))
+    stage.GetEditTarget().GetLayer().Save()
+    publish(folder, dest, PublishOptions(proxies=100))
+    stage = Usd.Stage.Open(str(dest / "v001" / "room.usd"))
+    seat = UsdGeom.Imageable(stage.GetPrimAtPath("/room/geo/stool/stool"))
+    assert seat.ComputePurpose() == "default"
+    assert not stage.GetPrimAtPath("/room/geo/stool/stool_proxy")
+    # What moves a mesh within its object moves its stand-in.
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["render", "proxy"])
+    shown = stage.GetPrimAtPath(grid)
+    boxes = [
+        cache.ComputeWorldBound(prim).ComputeAlignedRange().GetMidpoint()
+        for prim in (shown, UsdGeom.Imageable(shown).ComputeProxyPrim()[0])
+    ]
+    assert np.allclose(*boxes, atol=0.1)
+
+
 def test_no_stand_ins_where_the_meshes_are_coarser(room, tmp_path):
     publish(room.asset.folder, tmp_path / "dest", PublishOptions(proxies=10**7))
     assert not (tmp_path / "dest/v001/layers/proxies.usdc").exists()

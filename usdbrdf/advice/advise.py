@@ -109,11 +109,13 @@ def advise(
         )
     with folder_lock(asset.folder / STATE_FOLDER, wait_s, without_lock=without_lock):
         place, atlas = measured_atlas(asset.folder, chosen.lighting)
+        # Where none is asked for it is the one that the asset opens in.
+        place = place.in_lighting(atlas.lighting or None)
         found = find_advice(place, atlas, chosen)
         layer = write_advice(place, found.poses, _recorded(chosen))
     return {
         "asset": str(asset.root_layer),
-        "layer": str(layer) if layer else None,
+        "layer": str(layer),
         "in_room": found.in_room,
         "places": found.places,
         "undetermined": list(found.undetermined),

@@ -9,12 +9,16 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.errors import UsageError
+from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.transport.rays import RayScene
 
-# Nodes of the grid at most; around a scan that is larger only what lies near its cameras is used.
-_MOST_NODES = 150_000
+# Nodes of the grid where clearances allow it, and at all; around a scan that is larger only what
+# lies near its cameras is used.
+_NODES, _MOST_NODES = 150_000, 4_000_000
 _AROUND_M = 6.0
+# Triangles with longer edges are divided before it is asked which parts lie near.
+_LONGEST_M = 4.0
 # Cameras stand in a room where at least so many directions from them meet a surface.
 _ENCLOSED = 2 / 3
 _DIRECTIONS, _EYES = 64, 32
@@ -48,8 +52,9 @@ def free_places(
     up         axis that points up
     heights    above the ground, metres; of a room
     clearance  to any surface, metres
+
+    Raises UsageError for a clearance so small that too many places would have to be looked at.
     """
-    surface = cKDTree(surface_samples(rays.points, rays.triangles, clearance / 3))
     in_room = is_enclosed(rays, eyes)
     low, high = rays.points.min(axis=0).astype(np.float64), rays.points.max(axis=0)
     if not in_room:
@@ -57,8 +62,20 @@ def free_places(
     low = np.maximum(low, eyes.min(axis=0) - _AROUND_M)
     high = np.minimum(high, eyes.max(axis=0) + _AROUND_M)
     # Neighbours are nearer to each other than to any surface: nothing stands between them.
-    step = float(np.cbrt(np.prod(np.maximum(high - low, clearance)) / _MOST_NODES))
-    step = float(np.clip(step, 0.8 * clearance, 1.9 * clearance))
+    volume = float(np.prod(np.maximum(high - low, clearance)))
+    step = float(np.clip(np.cbrt(volume / _NODES), 0.8 * clearance, 1.9 * clearance))
+    if volume / step**3 > _MOST_NODES:
+        least = float(np.cbrt(volume / _MOST_NODES)) / 1.9
+        raise UsageError(
+            f"--clearance {clearance:g}: too many places lie so close to each other in "
+            f"{volume:,.0f} m^3. Take {least:.2g} or more. [usage.option]"
+        )
+    corners = corners_near(
+        rays.points[rays.triangles].astype(np.float64), low - 2 * clearance, high + 2 * clearance
+    )
+    if not len(corners):
+        return Places(np.zeros((0, 3)), np.zeros(0), in_room)
+    surface = cKDTree(surface_samples(corners, clearance / 3))
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     shape = tuple(len(axis) for axis in axes)
     if not all(shape):
@@ -84,10 +101,28 @@ def free_places(
     return Places(nodes[index], np.where(np.isfinite(height), height, np.nan)[index], in_room)
 
 
-def surface_samples(points: Float, triangles: Int, spacing: float) -> Double:
-    """(S, 3): points on the triangles, of which one lies within ``spacing`` of every place on
+def corners_near(corners: Double, low: Double, high: Double) -> Double:
+    """(F', 3, 3): of triangles (F, 3, 3) what lies in the box from ``low`` to ``high``, or a little
+    more: long ones are halved until what lies outside can be left away."""
+    near = []
+    while len(corners):
+        inside = (corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)
+        corners = corners[inside.all(axis=1)]
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
+        short = edges.max(axis=1, initial=0) <= _LONGEST_M
+        near.append(corners[short])
+        # Turned so that the longest edge leads from the first corner to the second.
+        turn = (edges[~short].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(corners[~short], turn[..., None], axis=1), 1, 0)
+        middle = (a + b) / 2
+        halves = [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        corners = np.concatenate(halves)
+    return np.concatenate([np.zeros((0, 3, 3)), *near])
+
+
+def surface_samples(corners: Double, spacing: float) -> Double:
+    """(S, 3): points on triangles (F, 3, 3), of which one lies within ``spacing`` of every place on
     them."""
-    corners = points[triangles].astype(np.float64)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
     parts = np.maximum(np.ceil(edges / spacing).astype(np.int64), 1)
     found = []

@@ -22,9 +22,11 @@ from usdbrdf.advice.knowledge import (
 )
 from usdbrdf.advice.sight import Spots, in_pictures, visible_spots
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.texels import Texels
+from usdbrdf.transport.brdf import DIELECTRIC
+from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import Mixture, lobe_basis
 
@@ -120,7 +122,7 @@ def chosen_spots(
         usable = part.start + np.flatnonzero(~shines[part] & (texels.area[part] > 0))
         share = texels.area[usable].astype(np.float64)
         count = min(_OF_OBJECT, len(usable))
-        some = random.choice(usable, count, replace=False, p=share / share.sum())
+        some = random.choice(usable, count, replace=False, p=share / share.sum() if count else None)
         picked.append(np.sort(some))
         own.append(slice(first, first + count))
         first += count
@@ -211,6 +213,13 @@ def _bases(
     view = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     points = spots.towards(every, eyes[view])
     base, slope = lobe_basis(lit, points, number, seed, _MIXTURE, every)(lit.lobe, PHIS)
+    if lit.lobe == DIELECTRIC:
+        cosine = (points.normal * points.to_camera).sum(axis=1)
+        diffuse = lit.radiance.at(points.face, points.u, points.v)[..., None]
+        base, slope = (
+            part - diffuse * kept[:, None]
+            for part, kept in zip((base, slope), kept_below(PHIS, cosine), strict=True)
+        )
     basis = np.concatenate([base.mean(axis=1), slope.mean(axis=1)], axis=1).astype(np.float64)
     ends = np.cumsum([len(part) for part in parts])[:-1]
     return {
@@ -223,8 +232,3 @@ def _bases(
 def level_of(lit: LitScene, radiance: Float, spots: Spots) -> Double:
     """(N,): mean of the channels of per-texel radiance (T, 3) at the spots."""
     return np.asarray(radiance[spots.texel].mean(axis=1), np.float64)
-
-
-def owners(spots: Spots, count: int) -> Int:
-    """The objects of the first ``count`` spots."""
-    return spots.owner[:count]

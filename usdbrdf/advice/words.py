@@ -75,10 +75,10 @@ def _reflected(lit: LitScene, survey: Survey, choice: Choice, index: int) -> str
     mirrored = np.ascontiguousarray(along * points.normal - points.to_camera, np.float32)
     origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
     # What shines near the mirror direction is what shows: a lobe has some width.
-    width = float(np.interp(0.5, (0, 1), (PHIS[0], PHIS[4])))
+    width = (PHIS[0] + PHIS[4]) / 2
     brightness: dict[int, float] = {}
     for offset in _around(width):
-        directions = mirrored + np.float32(1) * offset
+        directions = mirrored + offset
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         hits = lit.rays.closest(origin, np.ascontiguousarray(directions, np.float32))
         light = lit.radiance.at(hits.face, hits.u, hits.v).mean(axis=1)

@@ -102,21 +102,15 @@ def inputs_of_advice(asset: Asset) -> dict[str, str]:
     return {layer.name: sha256_of(layer) for layer in layers if layer.is_file()}
 
 
-def write_advice(
-    asset: Asset, poses: Sequence[AdvisedPose], parameters: Mapping[str, Any]
-) -> Path | None:
-    """Write the layer, whole or not at all; without a pose it is taken away, and None is returned.
-    Equal advice gives equal bytes."""
+def write_advice(asset: Asset, poses: Sequence[AdvisedPose], parameters: Mapping[str, Any]) -> Path:
+    """Write the layer, whole or not at all. Where nothing is advised it has no cameras, and stays
+    for those who made it a sublayer. Equal advice gives equal bytes."""
     file = asset.advice_layer
     if asset.is_published:
         raise OwnershipConflict(
             f"{asset.folder}: a published version never changes. Ask for advice on the asset that "
             "it was published from. [advice.published]"
         )
-    if not poses:
-        with environment_failures(str(file)):
-            file.unlink(missing_ok=True)
-        return None
     header = read_header(asset.layer("scan"))
     draft = Draft(
         asset=asset,
@@ -187,9 +181,10 @@ def read_advice(asset: Asset) -> tuple[list[dict[str, Any]], bool] | None:
 
         with suppress(AttributeError, KeyError, TypeError, ValueError):
             layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-            recorded = read_provenance(file).get("inputs", {})
-            if found:
-                return [row for _, row in sorted(found)], recorded == inputs_of_advice(asset)
+            recorded = read_provenance(file)
+            if recorded.get("role") == "advice":
+                follows = recorded.get("inputs", {}) == inputs_of_advice(asset)
+                return [row for _, row in sorted(found)], follows
     raise InputRefused(
         f"{file}: this is not the advice that was written. Run `usdbrdf advise` again, or delete "
         "the file. [advice.layer]"

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pxr import Kind, Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.header import LAYOUT, Provenance, new_layer, read_header
 from usdbrdf.asset.layers.author import attribute, define, export, over, relationship
@@ -24,10 +24,10 @@ def add_proxies(root: Path, contents: Path, triangles: int) -> None:
     root       root layer of the copy, which is not finished yet
     triangles  about as many, of all together; where the meshes have no more nothing is written
 
-    Of geometry that a capture's own USD brought there are none: its purposes are its own.
+    Geometry that came as USD, with the capture or by the artist's hand, keeps its own purposes.
     """
     stage = open_stage(root)
-    meshes = _meshes_of_objects(stage)
+    meshes = _meshes_of_objects(stage, contents.parent)
     if sum(len(corners) for _, _, corners in meshes) <= triangles:
         return
     layer = new_layer(read_header(root), Provenance(role="proxies", version=LAYOUT))
@@ -54,16 +54,21 @@ def add_proxies(root: Path, contents: Path, triangles: int) -> None:
     export(named, contents, folder=contents.parent)
 
 
-def _meshes_of_objects(stage: Usd.Stage) -> list[tuple[Usd.Prim, Float, Int]]:
-    """Meshes that components of ours hold, with points and triangles about their pivots."""
+def _meshes_of_objects(stage: Usd.Stage, layers: Path) -> list[tuple[Usd.Prim, Float, Int]]:
+    """The meshes that the scan layer itself holds, with points and triangles about their pivots,
+    as they are after all edits."""
+    scan = Sdf.Layer.FindOrOpen(str(next(layers.glob("scan.usd*"))))
     found = []
     for prim in stage.Traverse():
-        holder = Usd.ModelAPI(prim.GetParent())
-        if not prim.IsA(UsdGeom.Mesh) or holder.GetKind() != Kind.Tokens.component:
+        spec = scan.GetPrimAtPath(prim.GetPath())
+        if spec is None or spec.typeName != "Mesh" or not prim.IsA(UsdGeom.Mesh):
             continue
         mesh = UsdGeom.Mesh(prim)
         if set(mesh.GetFaceVertexCountsAttr().Get() or ()) == {3}:
-            points = np.array(mesh.GetPointsAttr().Get(), np.float32).reshape(-1, 3)
+            points = np.array(mesh.GetPointsAttr().Get(), np.float64).reshape(-1, 3)
+            # USD multiplies row vectors from the left.
+            local = np.array(mesh.GetLocalTransformation())
+            points = (points @ local[:3, :3] + local[3, :3]).astype(np.float32)
             corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32).reshape(-1, 3)
             found.append((prim, points, corners))
     return found

@@ -113,7 +113,7 @@ def _plain_spec(spec: Any, encoding: str) -> Any:
     """Size, windows, channels, numbers and colour space of an image, and nothing else."""
     plain = oiio.ImageSpec()
     plain.copy_dimensions(spec)
-    plain.channelformats = ()
+    plain.channelnames, plain.channelformats = spec.channelnames, ()
     # What is left out cannot be erased instead: names need not be text.
     for item in spec.extra_attribs:
         if _ABOUT_PIXELS.fullmatch(item.name):

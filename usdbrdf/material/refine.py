@@ -40,6 +40,7 @@ from usdbrdf.texturing.passes import (
     smallest_groups,
 )
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
+from usdbrdf.texturing.samples import MIN_COSINE
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
@@ -355,6 +356,8 @@ def _let_through(lit: LitScene, lobes: Lobes, texel: Int, eye: Double) -> Float:
         return np.ones(len(texel), np.float32)
     to_eye = eye - lit.texels.position[texel]
     cosine = (lit.texels.normal[texel] * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
+    # Samples have been taken where the face is not seen at a lower angle; its normals may be.
+    cosine = np.maximum(cosine, MIN_COSINE)
     return np.where(lobes.conducts, 1, share_let_through(lobes.phi, lobes.psi, cosine))
 
 

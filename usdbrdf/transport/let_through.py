@@ -25,6 +25,8 @@ from usdbrdf.transport.renderer_match import albedo_of_parts, view_cosines
 # Knots of the table; the square root of phi and the cosine are even.
 _PHIS, _COSINES = 17, 33
 _LEAST_COSINE = 1e-3
+# Of a refractive index of 1.5.
+_USUAL_F0 = 0.04
 
 
 class _Table(NamedTuple):
@@ -52,8 +54,8 @@ def _table() -> _Table:
 
 
 def kept_below(phis: Sequence[float], cosine: Float) -> tuple[Float, Float]:
-    """(base, slope), (P, K) each, for K roughnesses and P cosines: 1 - t is base + psi slope, to
-    first order in A, where psi is not next to 0."""
+    """(base, slope), (P, K) each, for K roughnesses and P cosines: 1 - t is about base + psi slope,
+    exactly so at the usual F0, and not next to psi = 0."""
     table = _table()
     place = np.clip(cosine, 0, 1, dtype=np.float64) * (_COSINES - 1)
     rows = np.sqrt(np.clip(phis, 0, 1)) * (_PHIS - 1)
@@ -62,7 +64,10 @@ def kept_below(phis: Sequence[float], cosine: Float) -> tuple[Float, Float]:
         beyond = values - mean
         of_phi = [[np.interp(row, range(_PHIS), column) for column in beyond.T] for row in rows]
         found = [np.interp(place, range(_COSINES), curve) for curve in of_phi]
-        return np.stack(found, axis=1).astype(np.float32)
+        return np.asarray(np.stack(found, axis=1) / let_through, np.float32)
+
+    usual = 1 - (table.base_mean + _USUAL_F0 * table.rise_mean)[:, 0]
+    let_through = np.interp(rows, range(_PHIS), usual)
 
     base, rise = (
         beyond_mean(values, mean)
