@@ -137,9 +137,7 @@ def _strangers(trace: str, capture: Path) -> set[str]:
         name = re.search(r'"([^"]*)"', call)
         path = os.path.realpath(name[1]) if name and name[1].startswith("/") else ""
         relative = name is not None and not name[1].startswith("/")  # to the scratch folder
-        writes = re.search(
-            r"O_WRONLY|O_RDWR|O_CREAT|^(creat|mkdir|rename|unlink|link|symlink)", call
-        )
+        writes = re.search(_WRITES, call)
         if call.startswith(("socket", "connect", "execve")):
             allowed = "AF_UNIX" in call
         elif writes:

@@ -23,7 +23,7 @@ _QUICK = (
     "usd", "usd-materials", "review", "stamp", "manifest", "arrays", "truth", "matrix",
     "transforms", "objects", "eyeful-tower", "llff", "nice-slam", "metashape", "realityscan",
 )  # fmt: skip
-_INPUTS = 25
+_INPUTS = 80
 
 
 def test_no_reader_stumbles(tmp_path: Path) -> None:
