@@ -19,9 +19,11 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,6 +32,7 @@ import usdbrdf.files.atomic
 import usdbrdf.files.images
 import usdbrdf.job.task
 
+ROOT = Path(__file__).parents[1]
 VARIABLE = "FAULT_OF_TEST"  # of the environment of a process that is to arm itself
 
 
@@ -121,3 +124,21 @@ def arm_from_environment() -> None:
 def inject(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fault in this process, until ``monkeypatch`` undoes it."""
     Fault(fault).arm(monkeypatch.setattr)
+
+
+def run_watched(*arguments: str | Path, timeout_s: float) -> subprocess.CompletedProcess[str]:
+    """A run of Python that watches its own system calls, which has to end well; where the kernel
+    lets nobody watch, such a program ends with 77 and the test is skipped."""
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+    if done.returncode == 77:
+        pytest.skip("watching system calls wants Linux 5.19 or later on x86-64")
+    assert done.returncode == 0, done.stderr
+    return done

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import ast
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.fault_injection import run_watched
+
 PROGRAM = """
 import os, shutil, sys
 from pathlib import Path
@@ -75,18 +72,7 @@ print(told)
 @pytest.mark.fault("R6")
 def test_nobody_sees_half_a_run_and_an_artist_may_save(tmp_path):
     """In the middle of publishing, as the kernel sees it; the run ends in its own bytes."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    if done.returncode == 77:
-        pytest.skip("watching system calls wants Linux 5.19 or later on x86-64")
-    assert done.returncode == 0, done.stderr
+    done = run_watched("-c", PROGRAM, str(tmp_path), timeout_s=300)
     told = ast.literal_eval(done.stdout.splitlines()[-1])
     refused = dict.fromkeys(("convert", "fit", "package", "publish", "report", "validate"), 5)
     assert {name: told[name] for name in refused} == refused, done.stderr

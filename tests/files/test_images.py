@@ -13,6 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from tests.fault_injection import run_watched
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files import images
 from usdbrdf.files.images import (
@@ -585,17 +586,8 @@ def test_a_disk_that_fails_is_no_damage_of_a_frame(tmp_path, radiance):
     """Once, and from some read on for good: the kernel answers so, nothing of ours is replaced."""
     write_exr(tmp_path / "frame.exr", radiance, half=False)
     np.save(tmp_path / "expected.npy", radiance)
-    done = subprocess.run(
-        [sys.executable, "-c", UNREAD, tmp_path / "frame.exr", tmp_path / "expected.npy"],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    if done.returncode == 77:
-        pytest.skip("watching system calls wants Linux 5.19 or later on x86-64")
-    assert done.returncode == 0, done.stderr
+    files = tmp_path / "frame.exr", tmp_path / "expected.npy"
+    done = run_watched("-c", UNREAD, *files, timeout_s=120)
     found = {tuple(line.split()) for line in done.stdout.splitlines()}
     assert found == {("1", "0"), ("1000000000", "4")}
 

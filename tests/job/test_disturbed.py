@@ -4,29 +4,16 @@ full, its mount gone, the power off. Then the same task: the same bytes, and not
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.fault_injection import run_watched
 
 
 def disturbed(folder: Path, fault: str, stride: int) -> dict[str, object]:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.job.disturbed_toy", str(folder), fault, str(stride)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    if done.returncode == 77:
-        pytest.skip("watching system calls wants Linux 5.19 or later on x86-64")
-    assert done.returncode == 0, done.stderr
+    arguments = folder, fault, str(stride)
+    done = run_watched("-m", "tests.job.disturbed_toy", *arguments, timeout_s=120)
     told: dict[str, object] = json.loads(done.stdout)
     return told
 

@@ -42,14 +42,14 @@ from usdbrdf.advice.words import (
     told_objects,
     where,
 )
-from usdbrdf.asset.advice import AdvisedPose, write_advice
+from usdbrdf.asset.advice import AdvisedPose, refuse_published, write_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.errors import InputRefused, OwnershipConflict
+from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas, viewed_asset
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
@@ -102,11 +102,7 @@ def advise(
     """
     chosen = options or AdviseOptions()
     asset = Asset.made(Path(folder))
-    if asset.is_published:
-        raise OwnershipConflict(
-            f"{asset.folder}: a published version never changes. Ask for advice on the asset that "
-            "it was published from. [advice.published]"
-        )
+    refuse_published(asset)
     with folder_lock(asset.folder / STATE_FOLDER, wait_s, without_lock=without_lock):
         place, atlas = measured_atlas(asset.folder, chosen.lighting)
         # Where none is asked for it is the one that the asset opens in.

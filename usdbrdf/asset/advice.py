@@ -2,7 +2,7 @@
 reason for each.
 
 No layer names it, as with the photographs: whoever wants to see the cameras adds it to the
-sublayers of edits.usda. ``usdbrdf advise`` alone writes it, whole, or takes it away."""
+sublayers of edits.usda. ``usdbrdf advise`` alone writes it, whole."""
 
 from __future__ import annotations
 
@@ -102,16 +102,20 @@ def inputs_of_advice(asset: Asset) -> dict[str, str]:
     return {layer.name: sha256_of(layer) for layer in layers if layer.is_file()}
 
 
-def write_advice(asset: Asset, poses: Sequence[AdvisedPose], parameters: Mapping[str, Any]) -> Path:
-    """Write the layer, whole or not at all. Where nothing is advised it has no cameras, and stays
-    for those who made it a sublayer. Equal advice gives equal bytes."""
-    file = asset.advice_layer
+def refuse_published(asset: Asset) -> None:
+    """OwnershipConflict for a published version."""
     if asset.is_published:
         raise OwnershipConflict(
             f"{asset.folder}: a published version never changes. Ask for advice on the asset that "
             "it was published from. [advice.published]"
         )
-    header = read_header(asset.layer("scan"))
+
+
+def write_advice(asset: Asset, poses: Sequence[AdvisedPose], parameters: Mapping[str, Any]) -> Path:
+    """Write the layer, whole or not at all. Where nothing is advised it has no cameras, and stays
+    for those who made it a sublayer. Equal advice gives equal bytes."""
+    refuse_published(asset)
+    file, header = asset.advice_layer, read_header(asset.layer("scan"))
     draft = Draft(
         asset=asset,
         header=header,

@@ -4,7 +4,7 @@ what the noise of the rays does to it."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -195,10 +195,10 @@ def _least(terms: Double) -> tuple[float, int, float]:
     return float(cost[best]), best, float(psi[best])
 
 
-def _log_cost(fits: Sequence[_Fit]) -> float:
-    """ln of the least cost over footprints and roughnesses of level 1, at the variances that the
-    model has now: kinds of lobe that share a model compare."""
-    return math.log(max(min(_least(fit.coarse())[0] for fit in fits), 1e-30))
+def _log_cost(coarse: Iterable[Double]) -> float:
+    """ln of the least cost over footprints and roughnesses of level 1, of the costs' terms: kinds
+    of lobe that share a model, at the same variances, compare."""
+    return math.log(max(min(_least(terms)[0] for terms in coarse), 1e-30))
 
 
 class FittedKind(NamedTuple):
@@ -232,11 +232,16 @@ def fit_lobe(
     """
     model = before.model if before else ViewModel(samples)
     fits = [_Fit(candidate, model, samples.radiance) for candidate in candidates]
-    with_old = _log_cost(fits) - _log_cost(before.fits) if before else 0.0
+
+    def log_ratio(coarse: Iterable[Double]) -> float:
+        others = (fit.coarse() for fit in before.fits) if before else ()
+        return _log_cost(coarse) - _log_cost(others) if before else 0.0
+
+    with_old = log_ratio(fit.coarse() for fit in fits)
     for _ in range(_MORE if before else _UPDATES):
         fits[0].improve()
-    with_new = _log_cost(fits) - _log_cost(before.fits) if before else 0.0
     coarse = [fit.coarse() for fit in fits]
+    with_new = log_ratio(coarse)
     best = int(np.argmin([_least(terms)[0] for terms in coarse]))
     if best > 0:
         for _ in range(_MORE):

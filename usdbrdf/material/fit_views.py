@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import cache, partial, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -89,13 +89,15 @@ class SampledObject(NamedTuple):
             for part, stream in zip(self.parts, streams, strict=True)
         ]
 
+        seen = cache(lambda: (self._mean_of_texel[..., None], self._cosine(width)))
+
         def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
             bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
             base, slope = np.concatenate(bases), np.concatenate(slopes)
             if kind != DIELECTRIC:
                 return base, slope
-            kept = kept_below(phis, self._cosine(width))
-            taken = self._mean_of_texel[..., None] * np.stack(kept)[:, :, None]
+            mean, cosine = seen()
+            taken = mean * np.stack(kept_below(phis, cosine))[:, :, None]
             return base - taken[0], slope - taken[1]
 
         return basis
