@@ -374,12 +374,11 @@ def plot(found: dict[str, Any], file: Path) -> None:
             axes[0][column].loglog(
                 workers, [p["seconds"] / 3600 for p in points], "o-", label=label
             )
-            axes[1][column].semilogx(workers, [p["core_hours"] for p in points], "o-", label=label)
+            axes[1][column].loglog(workers, [p["core_hours"] for p in points], "o-", label=label)
         axes[0][column].set(
             ylabel="hours", title=("one scan of 10^9 texels", "10,000 scans")[column]
         )
-        axes[1][column].set(xlabel="workers of 2 cores", ylabel="core-hours held", ylim=(0, None))
-        axes[1][column].set_yscale("log")
+        axes[1][column].set(xlabel="workers of 2 cores", ylabel="core-hours held")
         axes[0][column].legend()
     figure.savefig(file, dpi=110)
 
