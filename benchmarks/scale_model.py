@@ -379,7 +379,7 @@ def plot(found: dict[str, Any], file: Path) -> None:
             ylabel="hours", title=("one scan of 10^9 texels", "10,000 scans")[column]
         )
         axes[1][column].set(xlabel="workers of 2 cores", ylabel="core-hours held")
-        axes[0][column].legend()
+        axes[1][column].legend(loc="upper left")
     figure.savefig(file, dpi=110)
 
 
