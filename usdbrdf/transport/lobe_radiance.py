@@ -263,44 +263,64 @@ def integrate(
     """base, slope (G, 3, Q) += light times G D F of psi = 0, and of what psi adds, summed over
     samples, means of each group of consecutive points, with the group's roughnesses phis (G, Q)."""
     group = len(samples.cos_out) // len(phis)
+    # Allocated here: to do so for each point takes longer than most of what is added there.
+    of_lobes = np.empty((3, phis.shape[1]), np.float32)
+    of_angles = np.empty((2, samples.cos_in.shape[1]))
     for g in range(first, last):
         for r in range(g * group, (g + 1) * group):
             if samples.cos_out[r] > 0:
-                _add_point(samples, r, phis[g], kind, 1.0 / group, base[g], slope[g])
+                _add_point(
+                    samples, r, phis[g], kind, 1.0 / group, base[g], slope[g], of_lobes, of_angles
+                )
 
 
 @loop
 def _add_point(
-    samples: LobeSamples, r: int, phis: Float, kind: int, share: float, base: Float, slope: Float
+    samples: LobeSamples,
+    r: int,
+    phis: Float,
+    kind: int,
+    share: float,
+    base: Float,
+    slope: Float,
+    of_lobes: Float,
+    of_angles: Double,
 ) -> None:
     """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
-    side by side, as vector instructions want it."""
+    side by side, as vector instructions want it; F for all samples. of_lobes (3, Q) and of_angles
+    (2, K) are room for what is computed once."""
     cos_in, sin2_half, weighted = samples.cos_in[r], samples.sin2_half[r], samples.weighted[r]
     cos_half, cos_out = samples.cos_half[r], samples.cos_out[r]
     one, count = np.float32(1), len(phis)
-    alpha2, y2, scale = np.empty_like(phis), np.empty_like(phis), np.empty_like(phis)
+    alpha2, y2, scale = of_lobes[0], of_lobes[1], of_lobes[2]
     for q in range(count):
         y = np.float32(width_of_masking(phis[q], kind))
         alpha2[q], y2[q] = alpha_of_phi(phis[q]) ** 2, y * y
         scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
-    dg = np.empty_like(phis)
+    of_base, of_rise = of_angles[0], of_angles[1]
+    for k in range(len(cos_in)):
+        of_base[k], of_rise[k] = reflectance(cos_half[k], kind)
+    base_r, base_g, base_b = base[0], base[1], base[2]
+    slope_r, slope_g, slope_b = slope[0], slope[1], slope[2]
     for k in range(len(cos_in)):
         x, s2 = cos_in[k], sin2_half[k]
         if x <= 0:
             continue
         x2, c2 = x * x, one - s2
         rest = one - x2
+        red, green, blue = weighted[k, 0], weighted[k, 1], weighted[k, 2]
+        b, s = of_base[k], F0_OF_PSI * of_rise[k]
+        b_r, b_g, b_b = np.float32(b * red), np.float32(b * green), np.float32(b * blue)
+        s_r, s_g, s_b = np.float32(s * red), np.float32(s * green), np.float32(s * blue)
         for q in range(count):
             below = stretched(s2, c2, alpha2[q])
-            dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
-        of_base, of_rise = reflectance(cos_half[k], kind)
-        for c in range(3):
-            light = np.float32(of_base * weighted[k, c])
-            for q in range(count):
-                base[c, q] += dg[q] * light
-            light = np.float32(F0_OF_PSI * of_rise * weighted[k, c])
-            for q in range(count):
-                slope[c, q] += dg[q] * light
+            dg = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
+            base_r[q] += dg * b_r
+            base_g[q] += dg * b_g
+            base_b[q] += dg * b_b
+            slope_r[q] += dg * s_r
+            slope_g[q] += dg * s_g
+            slope_b[q] += dg * s_b
 
 
 def trace_lobe_samples(
