@@ -84,7 +84,8 @@ class GroupDraws(NamedTuple):
 
 class Aimed(NamedTuple):
     """Of R points: normals and directions to the camera (R, 3), lobe widths (R, A), directions
-    (R, K, 3), and the light's triangle that each was sent to (R, K), -1 for the others."""
+    (R, K, 3), zero where nothing that counts can come from, and the light's triangle that each was
+    sent to (R, K), -1 for the others."""
 
     normal: Float
     to_camera: Float
@@ -148,6 +149,13 @@ def _draw_point(
         w = _in_world(frame, n, cosine_direction(u1, u2))
         directions[k, 0], directions[k, 1], directions[k, 2] = w
         k += 1
+    for i in range(k):  # neither from below the surface, nor from the back of a light
+        x, y, z, face = directions[i, 0], directions[i, 1], directions[i, 2], aimed.chosen[r, i]
+        lost = n[0] * x + n[1] * y + n[2] * z <= 0
+        if face >= 0 and not lost:
+            lost = facing(groups.triangles[groups.of_face[face]], x, y, z) <= 0
+        if lost:
+            directions[i, 0], directions[i, 1], directions[i, 2] = 0, 0, 0
 
 
 @kernel
