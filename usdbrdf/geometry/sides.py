@@ -66,9 +66,9 @@ class Sides:
     frames: Int
 
 
-def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
-    """The side of every face of a mesh that cameras, in its own frame and unit, looked at."""
-    rays = RayScene(mesh.points, mesh.triangles)
+def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]) -> Sides:
+    """The side of every face of a mesh that cameras, in its own frame and unit, looked at; rays:
+    the scene of the mesh."""
     normals = mesh.face_normals
     seen = sightings(rays, normals, cameras)
     votes = seen.votes
@@ -96,7 +96,7 @@ def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sig
         face, point = visible_faces(rays, small)
         shown = np.zeros_like(pixels)
         _count_sides(face.reshape(-1), point.reshape(-1, 3), normals, small.eye, shown)
-        some = np.flatnonzero(shown.any(axis=1))
+        some = np.flatnonzero(shown[:, 0] | shown[:, 1])
         return some, shown[some]
 
     for some, shown in ahead(look, cameras):
