@@ -116,46 +116,42 @@ def draw_directions(
     first: int, last: int, aimed: Aimed, origin: Float, draws: GroupDraws, mixture: Mixture,
     groups: LightGroups,
 ) -> None:  # fmt: skip
-    """Directions of every technique in turn, and what they are sent to, into ``aimed``."""
+    """Directions of every technique in turn, and what they are sent to, into ``aimed``. One loop,
+    for to hand all this to a function takes as long as what that does for a point."""
     for r in range(first, last):
-        _draw_point(aimed, r, origin[r], draws, mixture, groups)
-
-
-@kernel
-def _draw_point(
-    aimed: Aimed, r: int, origin: Float, draws: GroupDraws, mixture: Mixture, groups: LightGroups
-) -> None:
-    n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
-    sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
-    number, place = draws.number[r // group], r % group
-    frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
-    for a in range(widths):
-        flips = _flips(seed, number, a)
-        for i in range(mixture.per_lobe):
-            u1, u2 = _drawn(sobol, place * mixture.per_lobe + i, flips)
-            half = _in_world(frame, n, sample_half_vector(u1, u2, aimed.alphas[r, a]))
-            _reflect(half, to_camera, directions[k])
+        n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
+        sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
+        number, place = draws.number[r // group], r % group
+        frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
+        for a in range(widths):
+            flips = _flips(seed, number, a)
+            for i in range(mixture.per_lobe):
+                u1, u2 = _drawn(sobol, place * mixture.per_lobe + i, flips)
+                half = _in_world(frame, n, sample_half_vector(u1, u2, aimed.alphas[r, a]))
+                _reflect(half, to_camera, directions[k])
+                k += 1
+        flips = _flips(seed, number, widths)
+        turn = hashed_uniform(seed, number, 15)
+        for i in range(mixture.lights):
+            j = i * group + place
+            pick = (turn + j / (group * mixture.lights)) % 1.0
+            aimed.chosen[r, k] = _aim(
+                groups, pick, _drawn(sobol, j, flips), origin[r], directions[k]
+            )
             k += 1
-    flips = _flips(seed, number, widths)
-    turn = hashed_uniform(seed, number, 15)
-    for i in range(mixture.lights):
-        j = i * group + place
-        pick = (turn + j / (group * mixture.lights)) % 1.0
-        aimed.chosen[r, k] = _aim(groups, pick, _drawn(sobol, j, flips), origin, directions[k])
-        k += 1
-    flips = _flips(seed, number, widths + 1)
-    for i in range(mixture.cosine):
-        u1, u2 = _drawn(sobol, place * mixture.cosine + i, flips)
-        w = _in_world(frame, n, cosine_direction(u1, u2))
-        directions[k, 0], directions[k, 1], directions[k, 2] = w
-        k += 1
-    for i in range(k):  # neither from below the surface, nor from the back of a light
-        x, y, z, face = directions[i, 0], directions[i, 1], directions[i, 2], aimed.chosen[r, i]
-        lost = n[0] * x + n[1] * y + n[2] * z <= 0
-        if face >= 0 and not lost:
-            lost = facing(groups.triangles[groups.of_face[face]], x, y, z) <= 0
-        if lost:
-            directions[i, 0], directions[i, 1], directions[i, 2] = 0, 0, 0
+        flips = _flips(seed, number, widths + 1)
+        for i in range(mixture.cosine):
+            u1, u2 = _drawn(sobol, place * mixture.cosine + i, flips)
+            w = _in_world(frame, n, cosine_direction(u1, u2))
+            directions[k, 0], directions[k, 1], directions[k, 2] = w
+            k += 1
+        for i in range(k):  # neither from below the surface, nor from the back of a light
+            x, y, z, face = directions[i, 0], directions[i, 1], directions[i, 2], aimed.chosen[r, i]
+            lost = n[0] * x + n[1] * y + n[2] * z <= 0
+            if face >= 0 and not lost:
+                lost = facing(groups.triangles[groups.of_face[face]], x, y, z) <= 0
+            if lost:
+                directions[i, 0], directions[i, 1], directions[i, 2] = 0, 0, 0
 
 
 @kernel
@@ -218,50 +214,37 @@ def weigh(
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
     first surfaces along the (R, K) directions."""
     for r in range(first, last):
-        _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
-
-
-@kernel
-def _weigh_point(
-    aimed: Aimed,
-    r: int,
-    hits: Hits,
-    mixture: Mixture,
-    groups: LightGroups,
-    environment: Environment,
-    samples: LobeSamples,
-) -> None:
-    n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
-    for k in range(len(weighted)):
-        w = aimed.direction[r, k]
-        f = hits.face[r, k]
-        cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
-        light, of_sun = 0.0, k >= len(weighted) - mixture.sun
-        if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
-            triangle = groups.triangles[groups.of_face[f]]
-            sent = facing(triangle, w[0], w[1], w[2])
-            if sent > 0:
-                light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
-        # A ray sent to a point on a light counts only if that is what it meets.
-        missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
-        if cosine <= 0 or missed or (of_sun and f >= 0):
-            weighted[k] = 0
-            continue
-        s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
-        density = mixture.cosine * cosine / np.pi + mixture.lights * light
-        for a in range(len(alphas)):
-            density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
-        samples.cos_in[r, k] = cosine
-        samples.sin2_half[r, k] = s2
-        samples.cos_half[r, k] = clamped(cos_wh)
-        for c in range(3):
-            value = weighted[k, c]
-            if of_sun:  # which only this sample looks for: its irradiance is L over the density
-                weighted[k, c] = environment.sun_irradiance[c] * cosine
+        n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
+        for k in range(len(weighted)):
+            w = aimed.direction[r, k]
+            f = hits.face[r, k]
+            cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+            light, of_sun = 0.0, k >= len(weighted) - mixture.sun
+            if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
+                triangle = groups.triangles[groups.of_face[f]]
+                sent = facing(triangle, w[0], w[1], w[2])
+                if sent > 0:
+                    light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
+            # A ray sent to a point on a light counts only if that is what it meets.
+            missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
+            if cosine <= 0 or missed or (of_sun and f >= 0):
+                weighted[k] = 0
                 continue
-            if f < 0:
-                value = environment_at(environment, w[0], w[1], w[2], c)
-            weighted[k, c] = value * cosine / density
+            s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
+            density = mixture.cosine * cosine / np.pi + mixture.lights * light
+            for a in range(len(alphas)):
+                density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
+            samples.cos_in[r, k] = cosine
+            samples.sin2_half[r, k] = s2
+            samples.cos_half[r, k] = clamped(cos_wh)
+            for c in range(3):
+                value = weighted[k, c]
+                if of_sun:  # which only this sample looks for: its irradiance is L over the density
+                    weighted[k, c] = environment.sun_irradiance[c] * cosine
+                    continue
+                if f < 0:
+                    value = environment_at(environment, w[0], w[1], w[2], c)
+                weighted[k, c] = value * cosine / density
 
 
 @parallel_kernel
