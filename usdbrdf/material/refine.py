@@ -44,11 +44,12 @@ from usdbrdf.texturing.samples import MIN_COSINE
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import irradiance_at
-from usdbrdf.transport.let_through import share_let_through
+from usdbrdf.transport.irradiance import ByAngle, irradiance_at
+from usdbrdf.transport.let_through import share_let_through, share_seen, table_let_through
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
+from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.warps import shifts_of
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
@@ -105,6 +106,41 @@ def refined_irradiance(
     return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
 
 
+def let_through_surfaces(
+    run: TaskRun, lit: LitScene, light: Float, lobes: Lobes, seed: int
+) -> Float:
+    """By how much (T, 3), W/m^2, the light that dielectrics scatter below their surface differs
+    from S: they let through what comes from the front, and mostly reflect what grazes them; see
+    ``let_through``. light (T, 3): what all surfaces send out, W/(m^2 sr)."""
+    texels, owner, seed = lit.texels, lit.texels.object_index(), seed ^ _SEED
+    passing = ~lobes.conducts & (lobes.psi.mean(axis=1) > 0) & (lit.lobe == DIELECTRIC)
+    if not passing.any():
+        return np.zeros((len(texels), 3), np.float32)
+    differs = table_let_through(lobes.phi, lobes.psi) - 1
+    texture, lights = (
+        lit.radiance.showing(texels, light),
+        lights_from_radiance(lit.scene, texels, light),
+    )
+    sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
+
+    def tile(index: Array, patch: Array) -> dict[str, Array]:
+        found, own = np.zeros((len(index), 3), np.float32), passing[owner[index]]
+        inner, surface = index[own], owner[index[own]]
+        if len(inner):
+            normal, sun = texels.normal[inner], lit.environment.sun
+            found[own] = irradiance_at(
+                lit.rays, texture, lights, lit.environment, texels.position[inner], normal,
+                patch[own], sampling, lit.diagonal_m, by_angle=ByAngle(differs, surface),
+            ).mean  # fmt: skip
+            of_sun = share_let_through(
+                lobes.phi[surface], lobes.psi[surface], normal @ sun.direction
+            )
+            found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, sampling.seed)
+        return {"differs": found}
+
+    return by_tiles(run, texels, "let-through", "fit: surfaces", tile)["differs"]
+
+
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
 # see needs fewer of each.
 _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
@@ -113,8 +149,8 @@ _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 _MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (132), its place among the blocks of texels while these are
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
-# and what it is lit by.
-_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=150, always=24)
+# and what it is lit by, with and without what its surface keeps.
+_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
@@ -221,7 +257,7 @@ def refined_light(
         ]
 
     _, first = reflected([one.before.irradiance for one in lightings])
-    irradiance = []
+    irradiance, scattered = [], []
     for (name, lit, before, _), diffuse in zip(lightings, first, strict=True):
         change = np.where(before.emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
         traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
@@ -229,8 +265,15 @@ def refined_light(
         irradiance.append(
             refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
         )
+        light = np.where(before.emissive[:, None], before.emission, diffuse).astype(np.float32)
+        scattered.append(
+            np.maximum(irradiance[-1] + let_through_surfaces(own, lit, light, lobes, seed), 0)
+        )
     found = [(diffuse, error) for diffuse, (_, error) in zip(first, found, strict=True)]
-    base_color, shown = reflected(irradiance)
+    base_color, shown = reflected(scattered)
+    if lightings[0].lit.lobe == DIELECTRIC:
+        base_color = base_color * share_seen(lobes.phi, lobes.psi)[owner, None]
+        base_color = np.clip(base_color, 0, 1).astype(np.float32)
     reflects = metal & ~np.all([one.before.emissive for one in lightings], axis=0)
     base_color[reflects] = F0_OF_PSI * lobes.psi[owner[reflects]]
     return [
