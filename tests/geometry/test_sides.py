@@ -18,6 +18,7 @@ from usdbrdf.geometry.sides import (
 )
 from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.options import IngestOptions
+from usdbrdf.transport.rays import RayScene
 
 WIDTH, HEIGHT = 64, 48
 INTRINSICS = (40.0, 40.0, 32.0, 24.0)
@@ -42,6 +43,10 @@ def room():
     return _mesh(points, triangles, face_object)
 
 
+def _sides(mesh, cameras):
+    return sides_from_cameras(mesh, RayScene(mesh.points, mesh.triangles), cameras)
+
+
 def _wound(mesh, turned):
     triangles = mesh.triangles.copy()
     triangles[turned] = triangles[turned][:, [0, 2, 1]]
@@ -49,7 +54,7 @@ def _wound(mesh, turned):
 
 
 def test_a_mesh_that_faces_its_cameras_stays_as_it_is(room):
-    sides = sides_from_cameras(room, _cameras(ring_of_poses(12)))
+    sides = _sides(room, _cameras(ring_of_poses(12)))
     assert not sides.turned.any()
     assert not sides.both.any()
 
@@ -58,9 +63,9 @@ def test_a_mesh_that_faces_its_cameras_stays_as_it_is(room):
 def test_faces_that_are_turned_are_found_whether_a_frame_shows_them_or_not(room, share):
     turned = np.random.default_rng(3).random(len(room.triangles)) < share
     # Three frames see little of the room, and so do the parts of it that are never in view.
-    sides = sides_from_cameras(_wound(room, turned), _cameras(ring_of_poses(3)))
+    sides = _sides(_wound(room, turned), _cameras(ring_of_poses(3)))
     assert (sides.turned == turned).mean() > 0.95
-    shown = sides_from_cameras(_wound(room, turned), _cameras(ring_of_poses(12)))
+    shown = _sides(_wound(room, turned), _cameras(ring_of_poses(12)))
     np.testing.assert_array_equal(shown.turned, turned)
 
 
@@ -86,7 +91,7 @@ def test_a_part_that_no_frame_shows_faces_what_was_seen():
     for faces, towards_wall in ((number, True), (number[:, [0, 2, 1]], False)):
         mesh = _mesh(both, np.concatenate([triangles, faces]), owner)
         assert (face_normals_and_angles(both, faces)[0][:, 1] < 0).all() == towards_wall
-        sides = sides_from_cameras(mesh, _cameras(poses))
+        sides = _sides(mesh, _cameras(poses))
         assert (sides.turned[-2:] == towards_wall).all()
 
 
@@ -97,7 +102,7 @@ def test_a_sheet_seen_from_both_sides_gets_a_second_skin():
     middle = np.array([0.5, 0.0, 0.5])
     places = [(0.5, -2, 0.6), (0.4, -2, 0.5), (0.6, -2, 0.5), (0.5, 2, 0.6), (0.4, 2, 0.5)]
     poses = [look_at(np.array(place), middle) for place in places]
-    sides = sides_from_cameras(mesh, _cameras(poses))
+    sides = _sides(mesh, _cameras(poses))
     assert sides.both.all()
     assert not sides.turned.any()
     skinned = turned_towards_cameras(mesh, sides, None, 40)

@@ -16,6 +16,7 @@ from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import SurfacePoints
 from usdbrdf.transport.lobe_radiance import LobeSamples, Mixture, non_diffuse, trace_lobe_samples
+from usdbrdf.transport.rays import Hits, RayScene
 
 PHIS = (0.0, 0.02, 0.1, 0.3, 0.7, 1.0)
 RGB = np.array([3.0, 2.0, 1.0])
@@ -100,6 +101,30 @@ def test_a_furnace(degrees: float, aims: str):
     )
     assert (len(lights.face) > 0) == (aims != "nowhere")
     _assert_albedo(world, lit, lights, np.zeros(3), degrees)
+
+
+def test_what_cannot_count_is_not_traced(monkeypatch: pytest.MonkeyPatch):
+    # A box is the light: of the points that are aimed at most lie on sides that face away. In a
+    # furnace all other samples bring something, whatever they are for.
+    sides = box((0.5, 0.4, 0.6), (1.0, 0.9, 1.2))
+    world = world_of(room((-2, -2, 0), (2, 2, 2.5)) + sides)
+    lit = world.lit(world.per_object([tuple(RGB)] * 12))
+    lights = world.lights(world.per_object([(100.0 * (i >= 6),) * 3 for i in range(12)]))
+    aimed = []
+
+    def closest(rays: RayScene, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        aimed.append(directions.any(axis=1))
+        return original(rays, origins, directions)
+
+    original = RayScene.closest
+    monkeypatch.setattr(RayScene, "closest", closest)
+    points = _points(np.zeros(3), _towards(75), repeat=512)
+    samples = trace_lobe_samples(replace(lit, lights=lights), points, Mixture(), 0)
+    traced = aimed[0].reshape(samples.cos_in.shape)
+    assert 0.5 < traced.mean() < 0.9
+    assert not samples.weighted[~traced].any()
+    # Of a ray to a side that faces the point another side may be in the way.
+    assert samples.weighted[traced].any(axis=1).mean() > 0.97
 
 
 @pytest.mark.parametrize("degrees", [10, 45])

@@ -41,6 +41,14 @@ def test_rays_that_leave_the_scene_have_no_face(triangle: RayScene):
     np.testing.assert_array_equal(hits.face, [-1, -1])
 
 
+def test_a_ray_without_direction_meets_nothing(triangle: RayScene):
+    # It starts on the triangle; the rays around it find what they would find without it.
+    origins = _f32((0.5, 0.25, 3), (0.5, 0.25, 0), (0.5, 0.25, 1))
+    hits = triangle.closest(origins, _f32((0, 0, -1), (0, 0, 0), (0, 0, -1)))
+    np.testing.assert_array_equal(hits.face, [0, -1, 0])
+    np.testing.assert_allclose(hits.distance[[0, 2]], [3, 1], rtol=1e-6)
+
+
 def test_the_nearest_of_several_surfaces_is_found():
     parts = [quad((-1, -1, z), (2, 0, 0), (0, 2, 0)) for z in (0, 2, 1)]
     hits = world_of(parts).rays.closest(

@@ -37,12 +37,11 @@ def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> Non
         )
 
 
-def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float:
+def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> float:
     """Share of camera rays that hit the mesh; InputRefused below 20 %.
 
     The usual mix-ups of conventions are then tried, and those that would hit are named.
     """
-    scene = RayScene(mesh.points, mesh.triangles)
     share = _hit_share(scene, frames, lambda pose: pose)
     if share >= _MIN_HIT_SHARE:
         return share
@@ -62,11 +61,15 @@ def refuse_rays_that_miss(frames: Frames, mesh: ScanMesh, source: Path) -> float
 
 
 def drop_cameras_inside(
-    frames: Frames, mesh: ScanMesh, sides: Sides, names: Sequence[str], findings: Findings
+    frames: Frames,
+    mesh: ScanMesh,
+    scene: RayScene,
+    sides: Sides,
+    names: Sequence[str],
+    findings: Findings,
 ) -> list[int]:
     """Indices of the frames that show surfaces from the side from which others show them; those
     that look at their backs from inside are noted in ``findings`` by their ``names``."""
-    scene = RayScene(mesh.points, mesh.triangles)
     normals = mesh.face_normals
     # Of each side: few frames see it, compared with the other, and it is no sheet seen from both.
     alone = (2 * sides.frames < sides.frames[:, ::-1]) & ~sides.both[:, None]

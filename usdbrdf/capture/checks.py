@@ -480,7 +480,8 @@ def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] |
     if float((known & ~pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
         return "all of its pixels are saturated", "capture.saturated"
     # With a noise floor of 0 a black pixel is not dark, but it is no light either.
-    lit = known & (np.nan_to_num(pixels.radiance).max(axis=2) > 0) & ~pixels.dark
+    red, green, blue = np.moveaxis(pixels.radiance > 0, 2, 0)
+    lit = known & (red | green | blue) & ~pixels.dark
     if float((lit | pixels.clipped).mean()) < _MIN_USEFUL_SHARE:
         return "black: no pixel rises above the noise floor", "capture.black"
     return None

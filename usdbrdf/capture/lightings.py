@@ -20,6 +20,7 @@ from usdbrdf.files.naming import identifier_from
 from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.transport.rays import RayScene
 
 # Points of two files that hold one mesh differ by no more than this, of its size.
 _ROUNDING = 1e-6
@@ -57,7 +58,8 @@ def scan_of_lightings(scans: Mapping[str, Scan], crease_angle_deg: float) -> Sca
         corner_normals=first.mesh.corner_normals[: len(triangles)],
         face_object=face_object,
     )
-    sides = sides_from_cameras(mesh, (frames.camera(i) for i in range(len(frames))))
+    rays = RayScene(mesh.points, mesh.triangles)
+    sides = sides_from_cameras(mesh, rays, (frames.camera(i) for i in range(len(frames))))
     if first.usd_geometry is not None:
         sides = replace(sides, both=np.zeros_like(sides.both))
     turned = np.zeros(len(triangles), np.bool_)

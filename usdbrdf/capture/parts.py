@@ -53,6 +53,7 @@ from usdbrdf.model.mesh import (
     welded_ids,
 )
 from usdbrdf.options import AUTO, CaptureOptions
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 from usdbrdf.untrusted.usd_files import meshes_from_usd
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
@@ -370,7 +371,8 @@ def scan_from_parts(
     findings.frames, findings.geometry = photographs, geometry
     if not any(r.lens.curve == "equirectangular" for r in rigid):
         refuse_without_parallax(frames, geometry.mesh, source)
-    hit_share = refuse_rays_that_miss(frames, geometry.mesh, source)
+    rays = RayScene(geometry.mesh.points, geometry.mesh.triangles)
+    hit_share = refuse_rays_that_miss(frames, rays, source)
     usable = check_frames(
         photographs,
         [r.name for r in rigid],
@@ -386,7 +388,7 @@ def scan_from_parts(
     # From here on the faces of a photograph count one by one.
     total += len(kept) - len(usable)
     frames, used = frames.at(kept), [rigid[photograph_of[i]].name for i in kept]
-    sides, outside = _sides(geometry, frames, used, findings)
+    sides, outside = _sides(geometry, rays, frames, used, findings)
     frames, kept = frames.at(outside), [kept[i] for i in outside]
     findings.refuse_too_few_frames(source, total)
     findings.warn_of_dropped_frames(source, total)
@@ -413,17 +415,17 @@ def scan_from_parts(
 
 
 def _sides(
-    geometry: ScanGeometry, frames: Frames, names: Sequence[str], findings: Findings
+    geometry: ScanGeometry, rays: RayScene, frames: Frames, names: Sequence[str], findings: Findings
 ) -> tuple[Sides, list[int]]:
     """Which faces have to be turned towards the cameras, and which show both sides; and the numbers
     of the frames that were not taken inside of something."""
 
     def seen(frames: Frames) -> Sides:
         numbers = progress(range(len(frames)), total=len(frames), label="sides", unit="frames")
-        return sides_from_cameras(geometry.mesh, (frames.camera(i) for i in numbers))
+        return sides_from_cameras(geometry.mesh, rays, (frames.camera(i) for i in numbers))
 
     sides = seen(frames)
-    outside = drop_cameras_inside(frames, geometry.mesh, sides, names, findings)
+    outside = drop_cameras_inside(frames, geometry.mesh, rays, sides, names, findings)
     if 0 < len(outside) < len(frames):
         sides = seen(frames.at(outside))
     turned, both = int(sides.turned.sum()), int(sides.both.sum())

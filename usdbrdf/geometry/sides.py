@@ -66,9 +66,9 @@ class Sides:
     frames: Int
 
 
-def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
-    """The side of every face of a mesh that cameras, in its own frame and unit, looked at."""
-    rays = RayScene(mesh.points, mesh.triangles)
+def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]) -> Sides:
+    """The side of every face of a mesh that cameras, in its own frame and unit, looked at; rays:
+    the scene of the mesh."""
     normals = mesh.face_normals
     seen = sightings(rays, normals, cameras)
     votes = seen.votes
@@ -87,28 +87,34 @@ def sides_from_cameras(mesh: ScanMesh, cameras: Iterable[Camera]) -> Sides:
 
 def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sightings:
     """Of each face with its unit normal (F, 3)."""
-    count = len(normals)
-    pixels, frames = np.zeros((2, count, 2), np.int32)
+    pixels, frames = np.zeros((2, len(normals), 2), np.int32)
+    last = np.full_like(frames, -1)
 
-    def look(camera: Camera) -> tuple[Long, Int]:
-        """Faces that a frame shows, and on how many pixels their front and back."""
+    def look(camera: Camera) -> tuple[Int, Float, Double]:
+        """Faces that a frame shows, the points on them, and where it was taken from."""
         small = camera.at_width(min(camera.width, _MOST_ACROSS))
         face, point = visible_faces(rays, small)
-        shown = np.zeros_like(pixels)
-        _count_sides(face.reshape(-1), point.reshape(-1, 3), normals, small.eye, shown)
-        some = np.flatnonzero(shown.any(axis=1))
-        return some, shown[some]
+        return face.reshape(-1), point.reshape(-1, 3), small.eye
 
-    for some, shown in ahead(look, cameras):
-        pixels[some] += shown
-        frames[some] += shown > 0
+    for number, (face, point, eye) in enumerate(ahead(look, cameras)):
+        _count_sides(number, face, point, normals, eye, pixels, frames, last)
     return Sightings(pixels, frames)
 
 
 @kernel
-def _count_sides(face: Int, point: Float, normals: Double, eye: Double, shown: Int) -> None:
-    """Add to ``shown`` (F, 2) the pixels (P,) of which each shows the front or the back of a face,
-    at a point of it, clearly."""
+def _count_sides(
+    number: int,
+    face: Int,
+    point: Float,
+    normals: Double,
+    eye: Double,
+    pixels: Int,
+    frames: Int,
+    last: Int,
+) -> None:
+    """Add to ``pixels`` (F, 2) those (P,) of which each shows the front or the back of a face, at a
+    point of it, clearly; and to ``frames`` (F, 2) one where that is the first of the frame of this
+    ``number``: ``last`` (F, 2) is the frame before."""
     for p in range(len(face)):
         f = face[p]
         if f < 0:
@@ -119,7 +125,11 @@ def _count_sides(face: Int, point: Float, normals: Double, eye: Double, shown: I
             towards += way * normals[f, c]
             square += way * way
         if towards * towards > _GRAZING * _GRAZING * square:
-            shown[f, 0 if towards > 0 else 1] += 1
+            side = 0 if towards > 0 else 1
+            pixels[f, side] += 1
+            if last[f, side] != number:
+                last[f, side] = number
+                frames[f, side] += 1
 
 
 def connected_windings(mesh: ScanMesh) -> tuple[Long, Bool]:

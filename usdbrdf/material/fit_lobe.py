@@ -22,7 +22,7 @@ from usdbrdf.material.verdict import (
     lobe_from_costs,
 )
 from usdbrdf.material.view_model import ViewModel, ViewSamples
-from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.arrays import Double, Float, Long
 
 Pair = tuple[Float, Float]
 OfPhis = Callable[[Sequence[float]], Pair]
@@ -161,20 +161,24 @@ class _Fit:
         ends = _LEVEL_1[max(best - 1, 0) : best + 2]
         steps = [np.linspace(low, high, _LEVEL_2 + 2)[1:-1] for low, high in pairwise(ends)]
         between = [float(phi) for part in steps for phi in part]
-        bases = self._candidate.first(between), self._candidate.second(between)
+        closer = self._candidate.first(between), self._candidate.second(between)
         order = np.argsort([*_LEVEL_1, *between])
         phis = np.array([*_LEVEL_1, *between])[order]
-        terms = np.concatenate([coarse, self._terms(*bases)])[order]
+        terms = np.concatenate([coarse, self._terms(*closer)])[order]
         least, best, psi = _least(terms)
-        near = [float(phis[k]) for k in (max(best - 1, 0), best, min(best + 1, len(phis) - 1))]
-        bases = self._candidate.first(near), self._candidate.second(near)
+        near = [max(best - 1, 0), best, min(best + 1, len(phis) - 1)]
+        bases = (
+            _chosen(self._first, closer[0], order[near]),
+            _chosen(self._second, closer[1], order[near]),
+        )
         # The cost with the bases' own noise in it: the mean of either basis' squares.
         lobes = [(base + np.float32(psi) * slope)[..., 1:2] for base, slope in bases]
         rest = self._model.reduced(self._radiance - np.concatenate(lobes, axis=2))
         noisy = least + (float(self._model.product(rest, rest).mean()) - least) / repeats
         freedom = self._model.degrees_of_freedom
         found = lobe_from_costs(phis, terms, without, noisy, freedom, self._candidate.blur)
-        of_rays = error_of_rays(self._model, self._radiance[..., 0], bases, near, psi)
+        neighbours = phis[near].tolist()
+        of_rays = error_of_rays(self._model, self._radiance[..., 0], bases, neighbours, psi)
         return found._replace(of_rays=of_rays)
 
     def _terms(self, first: Pair, second: Pair) -> Double:
@@ -186,6 +190,12 @@ class _Fit:
         crossed = model.product(slope, other_rest) + model.product(other_slope, rest)
         square, constant = model.product(slope, other_slope), model.product(rest, other_rest)
         return np.stack([constant, crossed / 2, square], axis=1)
+
+
+def _chosen(one: Pair, other: Pair, which: Long) -> Pair:
+    """Of bases at some roughnesses and at others, those at ``which`` (K,) of all."""
+    base, slope = (np.concatenate(both, axis=2) for both in zip(one, other, strict=True))
+    return base.take(which, axis=2), slope.take(which, axis=2)
 
 
 def _least(terms: Double) -> tuple[float, int, float]:

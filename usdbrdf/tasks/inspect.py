@@ -18,7 +18,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
-from usdbrdf.texturing.agreement import doubts_about_agreement
+from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 
 
 def inspect(
@@ -37,7 +37,9 @@ def inspect(
     try:
         with scratch_folder() as folder:
             frames = developed_frames(spread_evenly(len(every), ASKED), folder)
-            agrees = agreement_of_frames(mesh, frames, partial(read_frame, frames), capture)
+            surface, rays = surface_and_rays(mesh)
+            read = partial(read_frame, frames)
+            agrees = agreement_of_frames(surface, rays, frames, read, capture)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)

@@ -11,7 +11,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.capture import Scan
-from usdbrdf.texturing.agreement import points_of_surface
+from usdbrdf.texturing.agreement import SurfacePoints
 from usdbrdf.texturing.optics import (
     Samples,
     balance_drift,
@@ -26,13 +26,12 @@ _ASKED, _LISTED = 32, 6
 
 
 def asked_of_its_optics(
-    scan: Scan, read: Read, *, estimate: bool
+    scan: Scan, surface: SurfacePoints, rays: RayScene, read: Read, *, estimate: bool
 ) -> tuple[Scan, dict[str, Any], list[str]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
     that corners are darker by, and that the balance of red or blue to green is off by in the worst
     frame; and a sentence for the user on each of them that is much."""
-    frames, mesh = scan.frames, scan.mesh
-    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+    frames = scan.frames
     asked = spread_evenly(len(frames), _ASKED)
     images = read_frames(read, asked)
     shown = progress(images, total=len(asked), label="optics", unit="frames")

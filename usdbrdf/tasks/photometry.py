@@ -19,7 +19,6 @@ from usdbrdf.files.frames import Read, read_frame, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
-from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
@@ -27,12 +26,13 @@ from usdbrdf.tasks.poses import with_refined_poses
 from usdbrdf.tasks.task import warned
 from usdbrdf.texturing.agreement import (
     Agreement,
+    SurfacePoints,
     agreement,
     doubts_about_agreement,
     is_doubtful,
     logarithms_in_frame,
     other_convention,
-    points_of_surface,
+    surface_and_rays,
 )
 from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
@@ -47,17 +47,18 @@ def asked_of_its_pixels(
     """The scan, whose frames lie in ``images`` now, its exposures estimated if that is wanted, and
     what was found, for the record: under "warnings" what the user has been warned of."""
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
-    agrees = agreement_of_frames(scan.mesh, scan.frames, read, scan.source)
+    surface, rays = surface_and_rays(scan.mesh)
+    agrees = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
     estimate = options.vignetting == "estimate"
-    scan, told, doubts = asked_of_its_optics(scan, read, estimate=estimate)
+    scan, told, doubts = asked_of_its_optics(scan, surface, rays, read, estimate=estimate)
     warnings += warned(doubts)
     told |= {"agreement": agrees and agrees.ratio, "warnings": warnings}
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     if options.refine_poses:
         scan, told["refined_poses"] = with_refined_poses(scan, read)
     if options.exposure == "estimate":
-        scan, off = estimated_exposures(scan, read)
+        scan, off = estimated_exposures(scan, surface, rays, read)
         told["estimated_exposures"] = off
         warnings += warned(doubts_about_exposures(off, len(scan.frames), scan.source))
         read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
@@ -68,7 +69,7 @@ def asked_of_its_pixels(
 
 
 def agreement_of_frames(
-    mesh: ScanMesh, frames: Frames, read: Read, source: Path
+    surface: SurfacePoints, rays: RayScene, frames: Frames, read: Read, source: Path
 ) -> Agreement | None:
     """How far some frames agree; None where they see too few points in common. Of much the user
     is to be told by ``doubts_about_agreement``.
@@ -76,7 +77,6 @@ def agreement_of_frames(
     Raises InputRefused, in the name of ``source``, where they hardly do and would under another
     reading of the poses.
     """
-    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
     asked = spread_evenly(len(frames), ASKED)
 
     def under(readings: Mapping[str, Callable[[Double], Double]]) -> dict[str, Agreement | None]:
@@ -105,11 +105,12 @@ def agreement_of_frames(
     return given
 
 
-def estimated_exposures(scan: Scan, read: Read) -> tuple[Scan, dict[str, float]]:
+def estimated_exposures(
+    scan: Scan, surface: SurfacePoints, rays: RayScene, read: Read
+) -> tuple[Scan, dict[str, float]]:
     """The scan with its frames exposed as their pixels say; image and gain of those that
     contradicted the others by much."""
-    frames, mesh = scan.frames, scan.mesh
-    surface, rays = points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+    frames = scan.frames
     images = read_frames(read, range(len(frames)))
     seen = progress(images, total=len(frames), label="exposures", unit="frames")
     columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]

@@ -49,6 +49,11 @@ def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> SurfacePoints:
     return SurfacePoints(a + u * (b - a) + v * (c - a), across[face] / area[face, None])
 
 
+def surface_and_rays(mesh: ScanMesh) -> tuple[SurfacePoints, RayScene]:
+    """The points of a mesh that are looked up, and the rays that tell which frames see them."""
+    return points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
+
+
 def logarithms_in_frame(
     surface: SurfacePoints, rays: RayScene, camera: Camera, pixels: FramePixels
 ) -> Float:

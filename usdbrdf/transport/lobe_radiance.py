@@ -84,7 +84,8 @@ class GroupDraws(NamedTuple):
 
 class Aimed(NamedTuple):
     """Of R points: normals and directions to the camera (R, 3), lobe widths (R, A), directions
-    (R, K, 3), and the light's triangle that each was sent to (R, K), -1 for the others."""
+    (R, K, 3), zero where nothing that counts can come from, and the light's triangle that each was
+    sent to (R, K), -1 for the others."""
 
     normal: Float
     to_camera: Float
@@ -115,39 +116,42 @@ def draw_directions(
     first: int, last: int, aimed: Aimed, origin: Float, draws: GroupDraws, mixture: Mixture,
     groups: LightGroups,
 ) -> None:  # fmt: skip
-    """Directions of every technique in turn, and what they are sent to, into ``aimed``."""
+    """Directions of every technique in turn, and what they are sent to, into ``aimed``. One loop,
+    for to hand all this to a function takes as long as what that does for a point."""
     for r in range(first, last):
-        _draw_point(aimed, r, origin[r], draws, mixture, groups)
-
-
-@kernel
-def _draw_point(
-    aimed: Aimed, r: int, origin: Float, draws: GroupDraws, mixture: Mixture, groups: LightGroups
-) -> None:
-    n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
-    sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
-    number, place = draws.number[r // group], r % group
-    frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
-    for a in range(widths):
-        flips = _flips(seed, number, a)
-        for i in range(mixture.per_lobe):
-            u1, u2 = _drawn(sobol, place * mixture.per_lobe + i, flips)
-            half = _in_world(frame, n, sample_half_vector(u1, u2, aimed.alphas[r, a]))
-            _reflect(half, to_camera, directions[k])
+        n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
+        sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
+        number, place = draws.number[r // group], r % group
+        frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
+        for a in range(widths):
+            flips = _flips(seed, number, a)
+            for i in range(mixture.per_lobe):
+                u1, u2 = _drawn(sobol, place * mixture.per_lobe + i, flips)
+                half = _in_world(frame, n, sample_half_vector(u1, u2, aimed.alphas[r, a]))
+                _reflect(half, to_camera, directions[k])
+                k += 1
+        flips = _flips(seed, number, widths)
+        turn = hashed_uniform(seed, number, 15)
+        for i in range(mixture.lights):
+            j = i * group + place
+            pick = (turn + j / (group * mixture.lights)) % 1.0
+            aimed.chosen[r, k] = _aim(
+                groups, pick, _drawn(sobol, j, flips), origin[r], directions[k]
+            )
             k += 1
-    flips = _flips(seed, number, widths)
-    turn = hashed_uniform(seed, number, 15)
-    for i in range(mixture.lights):
-        j = i * group + place
-        pick = (turn + j / (group * mixture.lights)) % 1.0
-        aimed.chosen[r, k] = _aim(groups, pick, _drawn(sobol, j, flips), origin, directions[k])
-        k += 1
-    flips = _flips(seed, number, widths + 1)
-    for i in range(mixture.cosine):
-        u1, u2 = _drawn(sobol, place * mixture.cosine + i, flips)
-        w = _in_world(frame, n, cosine_direction(u1, u2))
-        directions[k, 0], directions[k, 1], directions[k, 2] = w
-        k += 1
+        flips = _flips(seed, number, widths + 1)
+        for i in range(mixture.cosine):
+            u1, u2 = _drawn(sobol, place * mixture.cosine + i, flips)
+            w = _in_world(frame, n, cosine_direction(u1, u2))
+            directions[k, 0], directions[k, 1], directions[k, 2] = w
+            k += 1
+        for i in range(k):  # neither from below the surface, nor from the back of a light
+            x, y, z, face = directions[i, 0], directions[i, 1], directions[i, 2], aimed.chosen[r, i]
+            lost = n[0] * x + n[1] * y + n[2] * z <= 0
+            if face >= 0 and not lost:
+                lost = facing(groups.triangles[groups.of_face[face]], x, y, z) <= 0
+            if lost:
+                directions[i, 0], directions[i, 1], directions[i, 2] = 0, 0, 0
 
 
 @kernel
@@ -210,50 +214,37 @@ def weigh(
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
     first surfaces along the (R, K) directions."""
     for r in range(first, last):
-        _weigh_point(aimed, r, hits, mixture, groups, environment, samples)
-
-
-@kernel
-def _weigh_point(
-    aimed: Aimed,
-    r: int,
-    hits: Hits,
-    mixture: Mixture,
-    groups: LightGroups,
-    environment: Environment,
-    samples: LobeSamples,
-) -> None:
-    n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
-    for k in range(len(weighted)):
-        w = aimed.direction[r, k]
-        f = hits.face[r, k]
-        cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
-        light, of_sun = 0.0, k >= len(weighted) - mixture.sun
-        if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
-            triangle = groups.triangles[groups.of_face[f]]
-            sent = facing(triangle, w[0], w[1], w[2])
-            if sent > 0:
-                light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
-        # A ray sent to a point on a light counts only if that is what it meets.
-        missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
-        if cosine <= 0 or missed or (of_sun and f >= 0):
-            weighted[k] = 0
-            continue
-        s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
-        density = mixture.cosine * cosine / np.pi + mixture.lights * light
-        for a in range(len(alphas)):
-            density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
-        samples.cos_in[r, k] = cosine
-        samples.sin2_half[r, k] = s2
-        samples.cos_half[r, k] = clamped(cos_wh)
-        for c in range(3):
-            value = weighted[k, c]
-            if of_sun:  # which only this sample looks for: its irradiance is L over the density
-                weighted[k, c] = environment.sun_irradiance[c] * cosine
+        n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
+        for k in range(len(weighted)):
+            w = aimed.direction[r, k]
+            f = hits.face[r, k]
+            cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
+            light, of_sun = 0.0, k >= len(weighted) - mixture.sun
+            if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
+                triangle = groups.triangles[groups.of_face[f]]
+                sent = facing(triangle, w[0], w[1], w[2])
+                if sent > 0:
+                    light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
+            # A ray sent to a point on a light counts only if that is what it meets.
+            missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
+            if cosine <= 0 or missed or (of_sun and f >= 0):
+                weighted[k] = 0
                 continue
-            if f < 0:
-                value = environment_at(environment, w[0], w[1], w[2], c)
-            weighted[k, c] = value * cosine / density
+            s2, cos_wh = half_vector(n, w, aimed.to_camera[r])
+            density = mixture.cosine * cosine / np.pi + mixture.lights * light
+            for a in range(len(alphas)):
+                density += mixture.per_lobe * reflected_density(s2, cos_wh, alphas[a])
+            samples.cos_in[r, k] = cosine
+            samples.sin2_half[r, k] = s2
+            samples.cos_half[r, k] = clamped(cos_wh)
+            for c in range(3):
+                value = weighted[k, c]
+                if of_sun:  # which only this sample looks for: its irradiance is L over the density
+                    weighted[k, c] = environment.sun_irradiance[c] * cosine
+                    continue
+                if f < 0:
+                    value = environment_at(environment, w[0], w[1], w[2], c)
+                weighted[k, c] = value * cosine / density
 
 
 @parallel_kernel
@@ -263,44 +254,64 @@ def integrate(
     """base, slope (G, 3, Q) += light times G D F of psi = 0, and of what psi adds, summed over
     samples, means of each group of consecutive points, with the group's roughnesses phis (G, Q)."""
     group = len(samples.cos_out) // len(phis)
+    # Allocated here: to do so for each point takes longer than most of what is added there.
+    of_lobes = np.empty((3, phis.shape[1]), np.float32)
+    of_angles = np.empty((2, samples.cos_in.shape[1]))
     for g in range(first, last):
         for r in range(g * group, (g + 1) * group):
             if samples.cos_out[r] > 0:
-                _add_point(samples, r, phis[g], kind, 1.0 / group, base[g], slope[g])
+                _add_point(
+                    samples, r, phis[g], kind, 1.0 / group, base[g], slope[g], of_lobes, of_angles
+                )
 
 
 @loop
 def _add_point(
-    samples: LobeSamples, r: int, phis: Float, kind: int, share: float, base: Float, slope: Float
+    samples: LobeSamples,
+    r: int,
+    phis: Float,
+    kind: int,
+    share: float,
+    base: Float,
+    slope: Float,
+    of_lobes: Float,
+    of_angles: Double,
 ) -> None:
     """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
-    side by side, as vector instructions want it."""
+    side by side, as vector instructions want it; F for all samples. of_lobes (3, Q) and of_angles
+    (2, K) are room for what is computed once."""
     cos_in, sin2_half, weighted = samples.cos_in[r], samples.sin2_half[r], samples.weighted[r]
     cos_half, cos_out = samples.cos_half[r], samples.cos_out[r]
     one, count = np.float32(1), len(phis)
-    alpha2, y2, scale = np.empty_like(phis), np.empty_like(phis), np.empty_like(phis)
+    alpha2, y2, scale = of_lobes[0], of_lobes[1], of_lobes[2]
     for q in range(count):
         y = np.float32(width_of_masking(phis[q], kind))
         alpha2[q], y2[q] = alpha_of_phi(phis[q]) ** 2, y * y
         scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
-    dg = np.empty_like(phis)
+    of_base, of_rise = of_angles[0], of_angles[1]
+    for k in range(len(cos_in)):
+        of_base[k], of_rise[k] = reflectance(cos_half[k], kind)
+    base_r, base_g, base_b = base[0], base[1], base[2]
+    slope_r, slope_g, slope_b = slope[0], slope[1], slope[2]
     for k in range(len(cos_in)):
         x, s2 = cos_in[k], sin2_half[k]
         if x <= 0:
             continue
         x2, c2 = x * x, one - s2
         rest = one - x2
+        red, green, blue = weighted[k, 0], weighted[k, 1], weighted[k, 2]
+        b, s = of_base[k], F0_OF_PSI * of_rise[k]
+        b_r, b_g, b_b = np.float32(b * red), np.float32(b * green), np.float32(b * blue)
+        s_r, s_g, s_b = np.float32(s * red), np.float32(s * green), np.float32(s * blue)
         for q in range(count):
             below = stretched(s2, c2, alpha2[q])
-            dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
-        of_base, of_rise = reflectance(cos_half[k], kind)
-        for c in range(3):
-            light = np.float32(of_base * weighted[k, c])
-            for q in range(count):
-                base[c, q] += dg[q] * light
-            light = np.float32(F0_OF_PSI * of_rise * weighted[k, c])
-            for q in range(count):
-                slope[c, q] += dg[q] * light
+            dg = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
+            base_r[q] += dg * b_r
+            base_g[q] += dg * b_g
+            base_b[q] += dg * b_b
+            slope_r[q] += dg * s_r
+            slope_g[q] += dg * s_g
+            slope_b[q] += dg * s_b
 
 
 def trace_lobe_samples(

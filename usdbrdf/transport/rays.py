@@ -133,12 +133,16 @@ def empty_hits(count: int) -> Hits:
 
 @loop
 def closest_hits(scene: int, origins: Float, directions: Float, hits: Hits) -> None:
-    """First surface along each of R rays with directions (R, 3), into ``hits``; origins (P, 3): ray
-    r starts at origins[r % P]."""
+    """First surface along each of R rays with directions (R, 3), into ``hits``: none where that is
+    zero; origins (P, 3): ray r starts at origins[r % P]."""
     ray, point, count = _empty_ray(), 0, len(origins)
     for r in range(len(directions)):
-        _aim(ray, origins, point, directions, r)
-        _find(scene, ray, hits, r)
+        if directions[r, 0] == 0 and directions[r, 1] == 0 and directions[r, 2] == 0:
+            hits.face[r], hits.distance[r] = -1, _FARTHEST
+            hits.u[r], hits.v[r] = 0, 0
+        else:
+            _aim(ray, origins, point, directions, r)
+            _find(scene, ray, hits, r)
         point = point + 1 if point + 1 < count else 0
 
 
@@ -301,7 +305,7 @@ class RayScene:
 
     def closest(self, origins: Float, directions: Float) -> Hits:
         """First hit of R rays: directions (R, 3), origins (P, 3), 1 <= P <= R, ray r from r % P,
-        all float32 in the world frame."""
+        all float32 in the world frame; a direction of zeros meets nothing."""
         count = len(directions)
         hits: Hits = empty_hits(count)
         in_turn = len(origins) < count

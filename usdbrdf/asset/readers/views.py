@@ -39,6 +39,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
 from usdbrdf.options import CaptureOptions
+from usdbrdf.transport.rays import RayScene
 
 # A reference may leave much of a picture unknown; a view that holds next to nothing is dropped.
 _MAX_UNKNOWN = 0.999
@@ -131,7 +132,7 @@ def photographs_of_views(
         corner_normals=scene.corner_normals,
         face_object=scene.face_object,
     )
-    refuse_rays_that_miss(frames, mesh, source)
+    refuse_rays_that_miss(frames, RayScene(mesh.points, mesh.triangles), source)
     names = [record.name for record in records]
     usable = check_frames(taken, names, findings, max_nonfinite=_MAX_UNKNOWN)
     _refuse_none(len(usable), findings, source)
