@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from usdbrdf import options
+from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.interrupts import loading
@@ -132,6 +133,7 @@ class Convert(EditOptions, _RunOnCapture):
     """Do all four steps: capture in, USD asset out."""
 
     options: options.ConvertOptions
+    cluster: ClusterOptions
 
     def run(self) -> int:
         with loading():
@@ -139,6 +141,7 @@ class Convert(EditOptions, _RunOnCapture):
         results = convert(
             self.capture, self.output, self.options, adapter=self.adapter, plugins=self.plugins,
             hand_edits=self.hand_edits, wait_s=self.wait_s, without_lock=self.without_lock,
+            cluster=self.cluster,
         )  # fmt: skip
         return self.report(results, self.output)
 
@@ -213,9 +216,9 @@ class _RunOnAsset(_Run):
     def run(self) -> int:
         with loading():
             from usdbrdf import pipeline
-        name = type(self).__name__.lower()
-        with self.working_on(self.asset) as asset:
-            done = getattr(pipeline, name)(asset, getattr(self, name))
+        name, cluster = type(self).__name__.lower(), getattr(self, "cluster", None)
+        with self.working_on(self.asset) as asset, pipeline.workers_of(cluster) as workers:
+            done = getattr(pipeline, name)(asset, getattr(self, name), workers)
         return self.report({name: done}, self.asset)
 
 
@@ -229,12 +232,14 @@ class Shade(_RunOnAsset):
     """Trace irradiance S, divide for albedo, find the emitters."""
 
     shade: options.ShadeOptions
+    cluster: ClusterOptions
 
 
 class Fit(_RunOnAsset):
     """Fit roughness and specular of each object."""
 
     fit: options.FitOptions
+    cluster: ClusterOptions
 
 
 class _WithAsset(_Waiting, _Talking):

@@ -23,7 +23,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
@@ -46,9 +46,10 @@ from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.let_through import share_let_through
-from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
+from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
@@ -72,6 +73,32 @@ class Lobes:
         return Lobes(self.phi[index], self.psi[index], self.conducts[index])
 
 
+class _Change(NamedTuple):
+    """What of the light is other than traced before: ``radiance`` by its texture, ``lights`` where
+    that shows, and the specular light of ``lobes``."""
+
+    lit: LitScene
+    radiance: SurfaceTexture
+    lights: Lights
+    lobes: Lobes
+    sampling: Sampling
+
+
+def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Array]:
+    """By how much S of some texels is other."""
+    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
+    position, normal = texels.position[index], texels.normal[index]
+    diffuse = irradiance_at(
+        lit.rays, given.radiance, given.lights, black_environment(), position, normal, patch,
+        given.sampling, lit.diagonal_m,
+    )  # fmt: skip
+    specular = specular_irradiance(
+        lit, position, normal, index, lobes.phi, lobes.psi,
+        rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=given.sampling.seed,
+    )  # fmt: skip
+    return {"change": diffuse.mean + specular}
+
+
 def refined_irradiance(
     run: TaskRun,
     lit: LitScene,
@@ -88,19 +115,8 @@ def refined_irradiance(
     lights = lights_from_radiance(lit.scene, texels, np.abs(change))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
 
-    def tile(index: Array, patch: Array) -> dict[str, Array]:
-        position, normal = texels.position[index], texels.normal[index]
-        diffuse = irradiance_at(
-            lit.rays, texture, lights, black_environment(), position, normal, patch, sampling,
-            lit.diagonal_m,
-        )  # fmt: skip
-        specular = specular_irradiance(
-            lit, position, normal, index, lobes.phi, lobes.psi,
-            rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed,
-        )  # fmt: skip
-        return {"change": diffuse.mean + specular}
-
-    found = by_tiles(run, texels, "refined", "fit: shade", tile)["change"]
+    given = _Change(lit, texture, lights, lobes, sampling)
+    found = by_tiles(run, texels, "refined", "fit: shade", _changed_irradiance, given)["change"]
     refined = np.maximum(traced + np.asarray(found, np.float32), 0)
     return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
 
