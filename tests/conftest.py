@@ -17,6 +17,7 @@ SLOW = (
     "asset/test_previews.py",
     "asset/test_schema.py",
     "capture/test_adapters.py",
+    "cluster/test_workers.py",
     "dcc",
     "delivery/test_acescg.py",
     "delivery/test_glb.py",

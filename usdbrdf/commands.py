@@ -218,7 +218,8 @@ class _RunOnAsset(_Run):
             from usdbrdf import pipeline
         name, cluster = type(self).__name__.lower(), getattr(self, "cluster", None)
         with self.working_on(self.asset) as asset, pipeline.workers_of(cluster) as workers:
-            done = getattr(pipeline, name)(asset, getattr(self, name), workers)
+            own = [workers] if cluster else []
+            done = getattr(pipeline, name)(asset, getattr(self, name), *own)
         return self.report({name: done}, self.asset)
 
 
@@ -398,8 +399,7 @@ class Validate(_Waiting):
         with loading():
             from usdbrdf.asset.layout import Asset
             from usdbrdf.validation.validate import has_errors, validate, write_cures
-        asset = Asset.made(self.asset)
-        root = asset.root_layer
+        root = (asset := Asset.made(self.asset)).root_layer
         with self.reading(root):
             findings = validate(root)
             cured = write_cures(asset, self.fix) if self.fix is not None else None
@@ -492,12 +492,9 @@ class PluginPath(Command):
         return 0
 
 
-_TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
-_OTHERS = (
-    MergeBrackets, DevelopRaw, Evaluate, Compare, Relight, Package, Publish, Report, View,
-    Advise, Validate, Rules, Adapters, Doctor, Completion, PluginPath,
+_ALL: tuple[type[Command], ...] = (
+    Inspect, Convert, Ingest, Texture, Shade, Fit, MergeBrackets, DevelopRaw, Evaluate, Compare,
+    Relight, Package, Publish, Report, View, Advise, Validate, Rules, Adapters, Doctor, Completion,
+    PluginPath,
 )  # fmt: skip
-COMMANDS = {
-    re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
-    for command in (*_TASKS, *_OTHERS)
-}
+COMMANDS = {re.sub("(?<!^)(?=[A-Z])", "-", own.__name__).lower(): own for own in _ALL}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
 from usdbrdf.asset.layout import ROLES, Asset
@@ -13,27 +13,21 @@ from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
 from usdbrdf.job.units import HERE, Workers
 
-Options = TypeVar("Options")
 # The input that later steps follow and a task only hands on: a layer that told of it would change
 # with it, and all steps after that.
 HANDED_ON = "directives"
 
 
-def in_each_lighting(
-    task: Callable[[Asset, Options, Workers], TaskResult],
-    asset: Asset,
-    options: Options,
-    workers: Workers,
-) -> TaskResult:
-    """What a task finds that is done for each lighting apart: of several under their names, with
-    all their warnings."""
+def in_each_lighting(task: Callable[..., TaskResult], asset: Asset, *given: Any) -> TaskResult:
+    """What a task finds that is done for each lighting apart, each time with what is ``given``: of
+    several under their names, with all their warnings."""
     several = asset.in_each_lighting
     if not several[0].lighting:
-        return task(asset, options, workers)
+        return task(asset, *given)
     found = {}
     for one in several:
         say(f"{task.__name__}: in the lighting {one.lighting}")
-        found[one.lighting] = task(one, options, workers)
+        found[one.lighting] = task(one, *given)
     warnings = [w for each in found.values() for w in each.summary.get("warnings", ())]
     ran = [each for each in found.values() if each.reran]
     return TaskResult(

@@ -18,7 +18,6 @@ from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
-from usdbrdf.job.units import HERE, Workers
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task, warned
 from usdbrdf.tasks.unwrap import charts_of_lightings, new_charts
@@ -28,7 +27,7 @@ from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
 
-def texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> TaskResult:
+def texture(asset: Asset, options: TextureOptions) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps; of one of
     several lightings, which are unwrapped together before, its own layer and maps."""
     maps = AssetMaps(open_weaker(asset, "texturing"))
@@ -80,7 +79,7 @@ def texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> T
             "warnings": doubts + found.contradictions(),
         }
 
-    return task.run(work, workers)
+    return task.run(work)
 
 
 def _write_maps(
