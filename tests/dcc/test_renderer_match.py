@@ -11,7 +11,8 @@ from tests.blender import needs_blender
 from tests.dcc.renderers import cycles, storm
 from usdbrdf.asset.layers.looks import surface
 from usdbrdf.asset.preview_lobe import preview_surface_from_fit
-from usdbrdf.transport.renderer_match import cycles_albedo, fitted_albedo, storm_albedo
+from usdbrdf.transport.directional_albedo import fitted_albedo
+from usdbrdf.transport.renderer_match import cycles_albedo, storm_albedo
 
 pytestmark = needs_blender
 

@@ -10,7 +10,7 @@ from tests.physics.chi2 import sidak
 from tests.physics.surfaces import World, box, estimates, room, world_of
 from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import ByAngle, Irradiance, irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import Lights
 
 # Quads of the room and its two boxes; those of the lamp follow.
@@ -196,3 +196,49 @@ def test_stopping_early_hardly_biases_the_irradiance(furnished):
     resolved = off.std(ddof=1) / np.sqrt(len(off))
     assert resolved < 2.5e-4
     assert abs(off.mean()) < 1e-3, f"{off.mean():.2e} +- {resolved:.1e}"
+
+
+# The cosine at even knots: a lookup that is linear between them is exact.
+COSINE = np.linspace(0, 1, 5, dtype=np.float32)
+
+
+def test_light_that_counts_by_its_angle_in_the_open():
+    # Of uniform light L: integral of L cos^n cos dw = 2 pi L / (n + 2).
+    world = world_of(room((0, 0, 0), (1, 1, 1)))
+    nothing = np.zeros((len(world.texels), 3), np.float32)
+    normal = np.eye(3, dtype=np.float32)[[0, 1, 2, 2]]
+    sky = Environment(image=np.full((2, 4, 3), [1, 2, 3], np.float32), z_up=True)
+    factor = np.stack([np.ones_like(COSINE), COSINE, -COSINE])
+    surface = np.array([0, 1, 1, 2], np.int32)
+    found = irradiance_at(
+        world.rays, world.texture(nothing), world.lights(nothing), sky,
+        np.full((4, 3), 9, np.float32), normal, np.zeros(4, np.int32),
+        Sampling(standard_error=0, max_rays=4096), world.size,
+        by_angle=ByAngle(factor, surface),
+    ).mean  # fmt: skip
+    of_angle = np.array([np.pi, 2 * np.pi / 3, 2 * np.pi / 3, -2 * np.pi / 3])
+    np.testing.assert_allclose(found, of_angle[:, None] * [1, 2, 3], rtol=3e-3)
+
+
+def test_light_that_counts_by_its_angle_comes_to_the_same_by_either_technique(furnished):
+    world, lit, lights = furnished
+    rng = np.random.default_rng(5)
+    pick = rng.choice(np.flatnonzero(world.texels.object_index() < NUM_REFLECTORS), 48)
+    tile, surface = np.arange(48, dtype=np.int32), np.zeros(48, np.int32)
+    factor = np.stack([COSINE])
+
+    def found(estimator: str, rays: int, by_angle: ByAngle | None) -> np.ndarray:
+        return irradiance_at(
+            world.rays, world.texture(lit), lights, black_environment(),
+            world.texels.position[pick], world.texels.normal[pick], tile,
+            Sampling(estimator=estimator, standard_error=0, max_rays=rays), world.size,
+            by_angle=by_angle,
+        ).mean.mean(axis=0)  # fmt: skip
+
+    by_angle = ByAngle(factor, surface)
+    mis = found("mis", 1 << 13, by_angle)
+    np.testing.assert_allclose(found("cosine", 1 << 16, by_angle), mis, rtol=0.01)
+    whole = found("mis", 1 << 13, None)
+    assert (mis < 0.95 * whole).all()
+    alike = ByAngle(np.ones((1, 2), np.float32), surface)
+    np.testing.assert_allclose(found("mis", 1 << 13, alike), whole, rtol=1e-5)

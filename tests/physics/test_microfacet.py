@@ -17,8 +17,9 @@ from usdbrdf.transport.brdf import (
     reflectance,
     width_of_masking,
 )
+from usdbrdf.transport.directional_albedo import fitted_albedo
 from usdbrdf.transport.lobe_radiance import lobe_radiance
-from usdbrdf.transport.renderer_match import cycles_albedo, fitted_albedo
+from usdbrdf.transport.renderer_match import cycles_albedo
 
 
 def _fresnel(ior: float, cosine: np.ndarray) -> np.ndarray:

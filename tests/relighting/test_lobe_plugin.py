@@ -11,6 +11,7 @@ from tests.physics.brdf import f_nd
 from usdbrdf.relighting import lobe_plugin
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, reflectance
+from usdbrdf.transport.let_through import share_let_through, share_seen
 
 _CASES = [(0.05, 0.9, 0.1), (0.3, 0.5, 0.4), (0.9, 0.1, 0.7)]
 
@@ -73,6 +74,28 @@ def test_value_of_the_lobe_of_renderers(mi: Any) -> None:
         found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
         base, rise = reflectance(cosine, kind)
         assert found == pytest.approx(other * (base + 0.04 * rise), rel=2e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("phi", [0.02, 0.3])
+def test_diffuse_light_passes_the_surface_of_a_dielectric_twice(mi: Any, phi: float) -> None:
+    import drjit as dr
+
+    psi, rho, angles = 0.6, 0.4, np.radians([5.0, 40.0, 70.0, 85.0])
+    cos_i, cos_o = (grid.ravel() for grid in np.meshgrid(np.cos(angles), np.cos(angles)))
+    zero, sine = np.zeros_like(cos_i), np.sqrt(1 - cos_o**2)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(cos_i))
+    si.wi = mi.Vector3f(np.sqrt(1 - cos_i**2), zero, cos_i)
+
+    def value(colour: float) -> np.ndarray:
+        bsdf = mi.load_dict(_plugin(phi, psi, colour) | {"lobe": DIELECTRIC})
+        found = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(zero, sine, cos_o))
+        return np.array(found)[0] / cos_o
+
+    one = np.ones(len(cos_i), np.float32)
+    through = [share_let_through(phi * one, psi * one, cosine) for cosine in (cos_i, cos_o)]
+    seen = share_seen(np.array([phi]), np.array([psi]))
+    below = value(rho) - value(0.0)
+    assert below == pytest.approx(rho / np.pi * through[0] * through[1] / seen, rel=2e-3)
 
 
 @pytest.mark.parametrize(("phi", "psi", "rho"), _CASES[1:])

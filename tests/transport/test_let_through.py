@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from usdbrdf.transport.brdf import F0_OF_PSI, dielectric_fresnel
-from usdbrdf.transport.let_through import kept_below, share_let_through
+from usdbrdf.transport.let_through import (
+    kept_below,
+    share_let_through,
+    share_seen,
+    table_let_through,
+)
 
 # Cosines that weigh alike under uniform light.
 EVEN = np.sqrt((np.arange(4000) + 0.5) / 4000)
@@ -57,3 +62,20 @@ def test_what_the_fit_takes_off_is_the_same_to_first_order(phi: float):
     for psi in (0.4, 0.8):
         found = 1 - (base + psi * slope)
         np.testing.assert_allclose(found, _let_through(phi, psi, cosine), atol=0.025)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.15, 0.6])
+@pytest.mark.parametrize("psi", [0.0, 0.05, 0.5, 1.0])
+def test_from_the_front_more_is_seen_than_on_the_mean(phi: float, psi: float):
+    front = np.linspace(np.sqrt(0.5), 1, 1001)
+    seen = share_seen(np.array([phi]), np.array([psi]))
+    assert seen == pytest.approx(_let_through(phi, psi, front).mean(), abs=3e-3)
+    assert seen == pytest.approx(1, abs=1e-6) if psi == 0 else seen > 1
+
+
+def test_a_table_holds_the_same_at_even_cosines():
+    phi, psi = np.array([0.0, 0.3], np.float32), np.array([0.5, 0.9], np.float32)
+    table = table_let_through(phi, psi)
+    cosines = np.linspace(0, 1, table.shape[1])[1:]
+    for row, one, other in zip(table, phi, psi, strict=True):
+        np.testing.assert_allclose(row[1:], _let_through(one, other, cosines), atol=1e-6)

@@ -81,7 +81,7 @@ def test_picks_follow_the_density_and_leave_a_uniform_number():
     nothing, bits = np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint32)
     receivers = Receivers(
         nothing, nothing, PointDraws(bits, bits, 0, np.zeros(0, np.int64)), groups,
-        np.zeros(count, np.int32), tiles,
+        np.zeros(count, np.int32), tiles, np.zeros((0, 0), np.float32), np.zeros(0, np.int32),
     )  # fmt: skip
     pick_triangles(receivers, 0, 0, even, Picked(chosen, favour, left, left))
     power = np.diff(groups.cumulative, prepend=0)

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from tests.physics.brdf import directional_albedo
-from usdbrdf.transport.renderer_match import (
-    cycles_albedo,
-    fitted_albedo,
-    measured_lobe,
-    shown_lobe,
-    storm_albedo,
-    view_cosines,
-)
+from usdbrdf.transport.directional_albedo import fitted_albedo, view_cosines
+from usdbrdf.transport.renderer_match import cycles_albedo, measured_lobe, shown_lobe, storm_albedo
 
 ANGLES = np.radians([10, 45, 75])
 # Directional albedo at psi = 1 by independent quadratures: the fit, and Storm's own formula.

@@ -44,11 +44,12 @@ from usdbrdf.texturing.samples import MIN_COSINE
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import irradiance_at
-from usdbrdf.transport.let_through import share_let_through
+from usdbrdf.transport.irradiance import ByAngle, irradiance_at
+from usdbrdf.transport.let_through import share_let_through, share_seen, table_let_through
 from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
+from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
 
@@ -119,6 +120,61 @@ def refined_irradiance(
     found = by_tiles(run, texels, "refined", "fit: shade", _changed_irradiance, given)["change"]
     refined = np.maximum(traced + np.asarray(found, np.float32), 0)
     return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
+
+
+class _Scattering(NamedTuple):
+    """What light goes in by: ``radiance`` of all surfaces by its texture, ``lights`` where that is
+    bright, and by how much it ``differs`` from S at each angle (num_objects, C) of the objects that
+    are ``passing`` (num_objects,) some of it; owner (T,): the object of each texel."""
+
+    lit: LitScene
+    radiance: SurfaceTexture
+    lights: Lights
+    lobes: Lobes
+    sampling: Sampling
+    differs: Float
+    passing: Bool
+    owner: Int
+
+
+def _scattered(given: _Scattering, index: Long, patch: Int) -> dict[str, Array]:
+    """By how much the light that some texels scatter differs from S."""
+    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
+    owner = given.owner[index]
+    found, own = np.zeros((len(index), 3), np.float32), given.passing[owner]
+    inner, surface = index[own], owner[own]
+    if len(inner):
+        normal, sun = texels.normal[inner], lit.environment.sun
+        found[own] = irradiance_at(
+            lit.rays, given.radiance, given.lights, lit.environment, texels.position[inner], normal,
+            patch[own], given.sampling, lit.diagonal_m, by_angle=ByAngle(given.differs, surface),
+        ).mean  # fmt: skip
+        of_sun = share_let_through(lobes.phi[surface], lobes.psi[surface], normal @ sun.direction)
+        found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, given.sampling.seed)
+    return {"differs": found}
+
+
+def let_through_surfaces(
+    run: TaskRun, lit: LitScene, light: Float, lobes: Lobes, seed: int
+) -> Float:
+    """By how much (T, 3), W/m^2, the light that dielectrics scatter below their surface differs
+    from S: they let through what comes from the front, and mostly reflect what grazes them; see
+    ``let_through``. light (T, 3): what all surfaces send out, W/(m^2 sr)."""
+    texels = lit.texels
+    passing = ~lobes.conducts & (lobes.psi.mean(axis=1) > 0) & (lit.lobe == DIELECTRIC)
+    if not passing.any():
+        return np.zeros((len(texels), 3), np.float32)
+    given = _Scattering(
+        lit,
+        lit.radiance.showing(texels, light),
+        lights_from_radiance(lit.scene, texels, light),
+        lobes,
+        Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
+        table_let_through(lobes.phi, lobes.psi) - 1,
+        passing,
+        texels.object_index(),
+    )
+    return by_tiles(run, texels, "let-through", "fit: surfaces", _scattered, given)["differs"]
 
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
@@ -237,7 +293,7 @@ def refined_light(
         ]
 
     _, first = reflected([one.before.irradiance for one in lightings])
-    irradiance = []
+    irradiance, scattered = [], []
     for (name, lit, before, _), diffuse in zip(lightings, first, strict=True):
         change = np.where(before.emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
         traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
@@ -245,8 +301,15 @@ def refined_light(
         irradiance.append(
             refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
         )
+        light = np.where(before.emissive[:, None], before.emission, diffuse).astype(np.float32)
+        scattered.append(
+            np.maximum(irradiance[-1] + let_through_surfaces(own, lit, light, lobes, seed), 0)
+        )
     found = [(diffuse, error) for diffuse, (_, error) in zip(first, found, strict=True)]
-    base_color, shown = reflected(irradiance)
+    base_color, shown = reflected(scattered)
+    if lightings[0].lit.lobe == DIELECTRIC:
+        base_color = base_color * share_seen(lobes.phi, lobes.psi)[owner, None]
+        base_color = np.clip(base_color, 0, 1).astype(np.float32)
     reflects = metal & ~np.all([one.before.emissive for one in lightings], axis=0)
     base_color[reflects] = F0_OF_PSI * lobes.psi[owner[reflects]]
     return [

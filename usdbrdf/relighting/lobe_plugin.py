@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
+
 from usdbrdf.transport.brdf import (
+    DIELECTRIC,
     MIN_ALPHA,
     PAPER,
     distribution,
@@ -14,6 +18,7 @@ from usdbrdf.transport.brdf import (
     reflectance,
     share_of_base,
 )
+from usdbrdf.transport.let_through import facet_shares
 
 NAME = "usdbrdf_lobe"
 _registered: set[str] = set()
@@ -24,7 +29,9 @@ def register(mi: Any) -> None:
 
     It takes the textures ``diffuse`` and ``f0`` (colours) and ``phi``, the roughness parameter of
     the lobe, and the number ``lobe``, its kind: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h),
-    with the terms of ``brdf``. The back is black. B. Haefner et al. 2021, eq. 2 to 6.
+    with the terms of ``brdf``. The back is black. B. Haefner et al. 2021, eq. 2 to 6. Of DIELECTRIC
+    the diffuse part is what the surface lets through twice, t(wi) t(wo) diffuse / pi over t as seen
+    from the front (``let_through``).
     """
     if mi.variant() in _registered:
         return
@@ -40,6 +47,12 @@ def register(mi: Any) -> None:
             self.kind = int(props.get("lobe", PAPER))
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             matte = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            if self.kind == DIELECTRIC:
+                shares = facet_shares()
+                knots = np.stack([shares.base, shares.rise], axis=-1)
+                means = np.concatenate(shares[2:], axis=1)
+                self.facets = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(knots, np.float32)))
+                self.means = mi.Texture1f(mi.TensorXf(np.ascontiguousarray(means, np.float32)))
             self.m_components = [glossy, matte]
             self.m_flags = glossy | matte
 
@@ -52,6 +65,28 @@ def register(mi: Any) -> None:
             glossy = fresnel(dr.mean(f0), dr.clip(mi.Frame3f.cos_theta(si.wi), 0, 1))
             return dr.clip(glossy / (glossy + 0.5 * dr.mean(diffuse)), 0.1, 0.9)
 
+        def _let_through(self, cos_i: Any, cos_o: Any, f0: Any, phi: Any) -> Any:
+            """t(wi) t(wo) over t as seen from the front."""
+            if self.kind != DIELECTRIC:
+                return 1.0
+            mean = dr.mean(f0)
+            of_base = share_of_base(mean, DIELECTRIC, dr.minimum)
+
+            def place(x: Any, knots: int) -> Any:  # of knots from 0 to 1, in pixels' middles
+                return (dr.clip(x, 0, 1) * (knots - 1) + 0.5) / knots
+
+            def kept(base: Any, rise: Any) -> Any:
+                return 1 - of_base * base - mean * rise
+
+            phis, cosines, _ = self.facets.shape
+            row = place(dr.sqrt(dr.maximum(phi, 0)), phis)
+            passed = (
+                kept(*self.facets.eval(mi.Point2f(place(cosine, cosines), row)))
+                for cosine in (cos_i, cos_o)
+            )
+            base, rise, base_seen, rise_seen = self.means.eval(mi.Point1f(row))
+            return math.prod(passed) / (kept(base, rise) * kept(base_seen, rise_seen))
+
         def _value_and_density(self, si: Any, wo: Any, parameters: Any) -> tuple[Any, Any]:
             diffuse, f0, phi = parameters
             cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
@@ -63,7 +98,8 @@ def register(mi: Any) -> None:
             base, rise = reflectance(wo_h, self.kind, dr.safe_sqrt)
             g = masking(cos_i, y, dr.safe_sqrt) * masking(cos_o, y, dr.safe_sqrt)
             base = base * share_of_base(f0, self.kind, dr.minimum)
-            value = (diffuse / dr.pi + g * d * (base + f0 * rise)) * cos_o
+            below = diffuse * self._let_through(cos_i, cos_o, f0, phi) / dr.pi
+            value = (below + g * d * (base + f0 * rise)) * cos_o
             share = self._glossy_share(si, diffuse, f0)
             lobe = d * cos_h / (4 * dr.maximum(wo_h, 1e-8))
             density = share * lobe + (1 - share) * cos_o / dr.pi

@@ -10,11 +10,13 @@ Its face, which is all that the rest of the package calls:
     irradiance       irradiance_at points, in tiles of texels
     lobe_radiance    lobe_radiance of known lobes, lobe_basis for roughnesses that are tried, and
                      specular_irradiance that they bring to other surfaces
+    let_through      what comes through a dielectric's surface, either way
     renderer_match   what to write for renderers with another lobe
     sunlight         what the sun brings to texels
     brdf             the lobe's equations
     denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things
 
-Behind it are random numbers (tile_draws) and the estimators' loops (sampling_loops).
+Behind it are random numbers (tile_draws), the estimators' loops (sampling_loops) and quadratures
+(directional_albedo).
 """

@@ -54,6 +54,7 @@ from usdbrdf.transport.tile_draws import independent_tiles as independent_tiles
 
 # Samples of the first round, and blocks that sums are kept in.
 _FIRST_ROUND, _BLOCKS = 64, 4
+ALL_ALIKE = np.zeros((0, 0), np.float32)
 # Points that a thread takes at a time: near points' nearly parallel rays follow each other.
 _POINTS = 1 << 12
 
@@ -98,8 +99,8 @@ def whole_tiles(tile: Int, points: int) -> list[slice]:
 
 class _Points(NamedTuple):
     """Points of whole tiles: origins of their rays and normals (P, 3), tiles, random numbers'
-    identities and strata, least S to hold errors against, and the row of their tile in what is
-    kept for each, (P,)."""
+    identities and strata, least S to hold errors against, the row of their tile in what is kept
+    for each, and of their surface in how light counts by its angle, (P,)."""
 
     origin: Float
     normal: Float
@@ -108,18 +109,29 @@ class _Points(NamedTuple):
     stratum: Int
     floor: Double
     row: Int
+    surface: Int
 
     def of(self, which: Any) -> _Points:
         return _Points._make(values[which] for values in self)
 
 
 class _Light(NamedTuple):
-    """All that brings light, and the one or two ``techniques`` that look for it."""
+    """All that brings light, the one or two ``techniques`` that look for it, and by ``angle`` how
+    it counts on each surface."""
 
     met: Met
     groups: LightGroups
     draws: TileDraws
     techniques: int
+    angle: Float
+
+
+class ByAngle(NamedTuple):
+    """How light counts: factors (K, C) of K surfaces at even cosines from 0 to 1, linear between;
+    surface (N,) of each point."""
+
+    factor: Float
+    surface: Int
 
 
 def irradiance_at(
@@ -133,6 +145,7 @@ def irradiance_at(
     sampling: Sampling,
     diagonal_m: float,
     dark: Float | None = None,
+    by_angle: ByAngle | None = None,
 ) -> Irradiance:
     """S at N surface points.
 
@@ -140,7 +153,8 @@ def irradiance_at(
     points of one tile share what lights they pick, part of their random bits, and their stopping;
     tiles that follow each other share random bits as well, ``independent_tiles`` do not.
     diagonal_m: the scene's, for the lift off the surface. dark: (N,) W/m^2; where S is below it,
-    the standard error is held against it instead of S.
+    the standard error is held against it instead of S. by_angle: light counts by its angle from
+    the normal; None: all alike.
     """
     # A point's number within its tile of at most 64: so no two points of the scene share their
     # random numbers, and a point draws the same ones whatever comes with it.
@@ -150,6 +164,7 @@ def irradiance_at(
     identity = TEXELS * tile.astype(np.int64) + number
     stratum = STRATA_BY_PLACE[TEXELS * number // np.repeat(size, size)]
     floor = np.zeros(len(tile)) if dark is None else dark.astype(np.float64)
+    angle, surface = by_angle or ByAngle(ALL_ALIKE, np.zeros(len(tile), np.int32))
     techniques = 1 if sampling.estimator == "cosine" or not len(lights.face) else 2
     rounds = _rounds(sampling, techniques)
     if sampling.estimator == "cosine":
@@ -157,15 +172,18 @@ def irradiance_at(
     else:
         draws = tile_draws(sampling.seed, rounds[0][1], rounds[-1][1])
     # The groups are made here, once, not by each thread.
-    light = _Light(Met(rays.address, radiance, environment), lights.groups, draws, techniques)
+    light = _Light(
+        Met(rays.address, radiance, environment), lights.groups, draws, techniques, angle
+    )
 
     def traced(part: slice) -> Irradiance:
         origin = lift_from_surface(position[part], normal[part], diagonal_m)
         # Which of the tiles here, counted from 0.
         row = np.cumsum(np.diff(tile[part], prepend=tile[part][0]) != 0, dtype=np.int32)
         points = _Points(
-            origin, normal[part], tile[part], identity[part], stratum[part], floor[part], row
-        )
+            origin, normal[part], tile[part], identity[part], stratum[part], floor[part], row,
+            surface[part],
+        )  # fmt: skip
         return _irradiance_of(points, light, rounds, sampling.standard_error)
 
     threads = num_threads()
@@ -226,7 +244,10 @@ def _receivers(points: _Points, light: _Light, picks: TilePicks) -> Receivers:
     sobol, seed, shared = light.draws.sobol, light.draws.seed, light.draws.shared
     scrambles = scrambles_of_points(points.identity, points.stratum, seed, shared)
     draws = PointDraws(sobol, scrambles, seed, points.identity)
-    return Receivers(points.origin, points.normal, draws, light.groups, points.row, picks)
+    return Receivers(
+        points.origin, points.normal, draws, light.groups, points.row, picks, light.angle,
+        points.surface,
+    )  # fmt: skip
 
 
 def _rounds(sampling: Sampling, techniques: int) -> list[tuple[int, int]]:

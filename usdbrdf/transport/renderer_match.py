@@ -31,19 +31,22 @@ from usdbrdf.transport.brdf import (
     DIELECTRIC,
     F0_OF_PSI,
     MIN_ALPHA,
-    PAPER,
     distribution,
     fresnel,
     masking,
     masking_width,
-    reflectance,
-    share_of_base,
-    width_of_masking,
 )
+from usdbrdf.transport.directional_albedo import (
+    WH,
+    fitted_albedo,
+    half_vectors,
+    over_cosines,
+    view_cosines,
+)
+from usdbrdf.transport.let_through import share_seen
 
-# Of the grid: views, slopes and azimuths of half vectors, cosines of w.h, and candidates for F0'.
-_VIEWS, _SLOPES, _AZIMUTHS, _COSINES, _CANDIDATES = 24, 120, 32, 128, 400
-_WH = (np.arange(_COSINES) + 0.5) / _COSINES
+# Candidates for F0'.
+_CANDIDATES = 400
 # The diffuse colour for which the sum of both terms is kept.
 _TYPICAL = 0.5
 _PHI = np.linspace(0, 1, 25) ** 2
@@ -71,12 +74,14 @@ def shown_lobe(phi: npt.ArrayLike, psi: npt.ArrayLike) -> Shown:
 @cache
 def _kept_beside_microfacets() -> Double:
     """(phi, F0) of the tables: the factor on the diffuse colour for a lobe that is the renderers'
-    own, of which they take what it reflects away from the diffuse term."""
+    own, of which they take what it reflects away from the diffuse term. The colour is what is seen
+    from the front (``share_seen``), more than the mean over the hemisphere."""
     rows = []
     for phi in _PHI.tolist():
         fitted = fitted_albedo(phi, _F0, kind=DIELECTRIC).mean(axis=0)
         lobe, kept = (part.mean(axis=0) for part in cycles_albedo(phi, _F0))
-        rows.append((_TYPICAL + fitted - lobe) / (_TYPICAL * kept))
+        mean = _TYPICAL / share_seen(np.full(len(_F0), phi), _F0 / F0_OF_PSI)
+        rows.append((mean + fitted - lobe) / (_TYPICAL * kept))
     return np.array(rows)
 
 
@@ -148,32 +153,6 @@ class Albedo(NamedTuple):
     diffuse: Double
 
 
-def view_cosines() -> Double:
-    """(V,) cosines that weigh alike under uniform light."""
-    return np.asarray(np.sqrt((np.arange(_VIEWS) + 0.5) / _VIEWS))
-
-
-def fitted_albedo(
-    phi: float, f0: Double, cosines: Double | None = None, *, kind: int = PAPER
-) -> Double:
-    """(V, N) directional albedo of a fitted kind of lobe for reflectances F0 (N,)."""
-    base, rise, _ = albedo_of_parts(phi, cosines, kind=kind)
-    return np.asarray(share_of_base(f0, kind) * base[:, None] + f0 * rise[:, None])
-
-
-def albedo_of_parts(
-    phi: float, cosines: Double | None = None, *, kind: int = PAPER
-) -> tuple[Double, Double, Double]:
-    """(V,) each: what the parts ``base`` and ``rise`` of F (see ``brdf.reflectance``) reflect, and
-    what F = 1 would."""
-    lobe = _half_vectors(max(MIN_ALPHA, phi), cosines)
-    y = width_of_masking(phi, kind)
-    g = masking(lobe.cos_out, y) * masking(lobe.cos_in, y)  # holds 1 / (4 cos cos)
-    weights = _over_cosines(lobe, g)
-    base, rise = reflectance(_WH, kind)
-    return weights @ base, weights @ rise, weights.sum(axis=1)
-
-
 def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albedo:
     """Of the lobe of Blender's Principled BSDF, which scatters between the facets too."""
     alpha = max(MIN_ALPHA, phi)
@@ -182,12 +161,12 @@ def cycles_albedo(phi: float, f0: Double, cosines: Double | None = None) -> Albe
         return np.asarray(0.5 * (np.sqrt(1 + alpha**2 * (1 / x**2 - 1)) - 1))
 
     def single(at: Double | None) -> Double:
-        lobe = _half_vectors(alpha, at)
+        lobe = half_vectors(alpha, at)
         g = 1 / (1 + shadowing(lobe.cos_out) + shadowing(lobe.cos_in))
-        return _over_cosines(lobe, g / (4 * lobe.cos_out * lobe.cos_in))
+        return over_cosines(lobe, g / (4 * lobe.cos_out * lobe.cos_in))
 
     weights = single(cosines)
-    white, reflected = weights.sum(axis=1)[:, None], weights @ _dielectric(f0, _WH)
+    white, reflected = weights.sum(axis=1)[:, None], weights @ _dielectric(f0, WH)
     white_mean = single(None).sum(axis=1).mean()
     fresnel_mean = _dielectric(f0, view_cosines()).mean(axis=0)
     between = fresnel_mean * white_mean / (1 - fresnel_mean * (1 - white_mean))
@@ -201,63 +180,20 @@ def storm_albedo(
     """Of Hydra Storm's UsdPreviewSurface under direct light; ``mirror_error``: with the excess of
     its D."""
     alpha = max(MIN_ALPHA, phi)
-    lobe = _half_vectors(alpha, cosines)
+    lobe = half_vectors(alpha, cosines)
     k = alpha / 2
     g = 1 / (4 * lobe.cos_out * lobe.cos_in + 0.001)
     for x in (lobe.cos_out, lobe.cos_in):
         g = g * x / (x * (1 - k) + k)
     excess = 1 + 0.001 / alpha**2 if mirror_error else 1.0
     # The diffuse term's light comes from everywhere: cosine-distributed about the normal.
-    half = _half_vectors(1.0, cosines)
-    everywhere = _over_cosines(
+    half = half_vectors(1.0, cosines)
+    everywhere = over_cosines(
         half, half.cos_in * 0 + 1 / np.pi / distribution(1 - half.cos_half**2, 1.0)
     )
-    f = fresnel(f0, _WH[:, None])
+    f = fresnel(f0, WH[:, None])
     kept = everywhere @ (1 - f) / everywhere.sum(axis=1)[:, None]
-    return Albedo(excess * (_over_cosines(lobe, g) @ f), kept)
-
-
-class _HalfVectors(NamedTuple):
-    """Half vectors h about the normal for each view: cosines of both directions and of w.h, and
-    D cos_in dw, the weight of what is left of an integrand; all (V, S, A) or to be broadcast."""
-
-    cos_out: Double
-    cos_in: Double
-    cos_half: Double
-    cos_wh: Double
-    weight: Double
-
-
-def _half_vectors(alpha: float, cosines: Double | None = None) -> _HalfVectors:
-    """tan(t) = alpha s with log s even; dw = 4 (w.h) dh, dh = sin^2 t cos t dlog(s) dazimuth."""
-    cos_out = (view_cosines() if cosines is None else cosines)[:, None, None]
-    log_s = np.linspace(np.log(1e-3), np.log(1e3 / alpha), _SLOPES)
-    t = np.arctan(alpha * np.exp(log_s))[None, :, None]
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
-    cos_half, sin_half = np.cos(t), np.sin(t)
-    cos_wh = np.sqrt(1 - cos_out**2) * sin_half * np.cos(azimuth) + cos_out * cos_half
-    cos_in = 2 * cos_wh * cos_half - cos_out
-    step = (log_s[1] - log_s[0]) * 2 * np.pi / _AZIMUTHS
-    weight = (
-        4 * cos_wh * sin_half**2 * cos_half * step * distribution(1 - cos_half**2, alpha) * cos_in
-    )
-    front = (cos_wh > 0) & (cos_in > 0)
-    return _HalfVectors(
-        cos_out,
-        np.where(front, cos_in, 1.0),
-        cos_half,
-        np.where(front, cos_wh, 1.0),
-        np.where(front, weight, 0.0),
-    )
-
-
-def _over_cosines(lobe: _HalfVectors, rest: Double) -> Double:
-    """(V, C) integral of D ``rest`` cos_in over directions, apart for each cosine of w.h."""
-    value = np.broadcast_to(lobe.weight * rest, lobe.weight.shape)
-    index = np.minimum((lobe.cos_wh * _COSINES).astype(np.intp), _COSINES - 1)
-    return np.array(
-        [np.bincount(i.ravel(), v.ravel(), _COSINES) for i, v in zip(index, value, strict=True)]
-    )
+    return Albedo(excess * (over_cosines(lobe, g) @ f), kept)
 
 
 def _dielectric(f0: Double, cosine: Double) -> Double:

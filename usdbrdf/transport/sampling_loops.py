@@ -68,8 +68,9 @@ class PointDraws(NamedTuple):
 
 class Receivers(NamedTuple):
     """P points that light arrives at: origins of their rays and normals (P, 3), their random
-    numbers, and how they pick lights: the ``groups`` and the row (P,) of each point's tile in
-    ``picks``."""
+    numbers, how they pick lights: the ``groups`` and the row (P,) of each point's tile in
+    ``picks``; and how light counts by its angle: factors (K, C) at even cosines (none: all alike)
+    and each point's ``surface`` (P,), a row of these."""
 
     origin: Float
     normal: Float
@@ -77,6 +78,8 @@ class Receivers(NamedTuple):
     groups: LightGroups
     row: Int
     picks: TilePicks
+    angle: Float
+    surface: Int
 
 
 class Segments(NamedTuple):
@@ -200,6 +203,9 @@ def light_segments(
         by_picks = triangle[DENSITY] * ratio[n] * square * square
         segments.weight[i] = both / (both * _INVERSE_PI + by_picks)
         i = unsigned(i + ((square > _TINY) & (received > 0) & (sent > 0)))
+    if len(receivers.angle):
+        for n in range(i):
+            segments.weight[n] *= counted(receivers, segments.point[n], segments.direction, n)
     return i
 
 
@@ -291,15 +297,34 @@ def add_cosine_samples(
             else:
                 weight[i], k = 0, unsigned(first + i)
                 escaped[k] += 1
+                share = 1.0
+                if len(receivers.angle):
+                    share = counted(receivers, k, d, i)
                 for c in range(3):
                     far = environment_at(met.environment, d[i, 0], d[i, 1], d[i, 2], c)
-                    total[k, c] += np.pi * far
+                    total[k, c] += np.pi * far * share
         if use_lights:
             weigh_lamps(receivers, first, d, hits, lamps[:count], light, weight)
+        if len(receivers.angle):
+            for i in range(part):
+                k = unsigned(first + i)
+                weight[i] *= counted(receivers, k, d, i)
         for i in range(part):
             look_at(radiance, looks, i, max(hits.face[i], 0), hits.u[i], hits.v[i])
         for i in range(part):
             add_looked_at(radiance, looks, i, weight[i], total, unsigned(first + i))
+
+
+@loop
+def counted(receivers: Receivers, k: int, directions: Float, i: int) -> float:
+    """How light from direction i, of any length, counts at point k by its angle there."""
+    x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+    normal, factors = receivers.normal[k], receivers.angle[receivers.surface[k]]
+    cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / math.sqrt(x * x + y * y + z * z)
+    place = min(max(cosine, 0.0), 1.0) * (len(factors) - 1)
+    left = min(int(place), len(factors) - 2)
+    share: float = factors[left] + (factors[left + 1] - factors[left]) * (place - left)
+    return share
 
 
 @loop
