@@ -3,7 +3,7 @@
     python benchmarks/cluster.py CAPTURE [-o FOLDER] [--turns 3] [--kills 5] -- --texel-size 0.05
 
 The capture is ingested and textured once; what follows `--` are more options of `usdbrdf texture`.
-Then the steps shade and fit run in fresh copies, in turns: in one process, and on 1, 2 and 4
+Then `usdbrdf convert` does the rest in fresh copies, in turns: in one process, and on 1, 2 and 4
 workers. Then on 2 workers of which one is killed with SIGKILL every few seconds; with one that is
 stopped (SIGSTOP); and with a scheduler of its own, which is killed, and started for the same
 command once more. Every published file counts.
@@ -33,7 +33,6 @@ from measure import Spent, figure, median, ratio, report
 
 from usdbrdf.files.atomic import sha256_of
 
-STEPS = ("shade", "fit")
 WORKERS = (1, 2, 4)
 # Seconds: between blows, at least and at most; and that a unit may take where one worker hangs.
 BLOWS, LIMIT = (2.0, 6.0), 30.0
@@ -61,6 +60,7 @@ class Bench:
 
     def __init__(self, folder: Path, capture: Path, options: Sequence[str], seed: int) -> None:
         self.folder, self.chance = folder, random.Random(seed)
+        self.capture, self.options = capture, options
         self.made = folder / "made" / "asset"
         run("ingest", str(capture), "-o", str(self.made))
         run("texture", str(self.made), *options)
@@ -120,13 +120,18 @@ class Bench:
         """What the steps spend on a copy, and the hashes of what they publish."""
         asset = self.fresh(name)
         before, start = _cpu_of_children(), time.perf_counter()
-        for step in STEPS:
-            run(step, str(asset), *options, during=during)
+        self.convert(asset, *options, during=during)
         spent = Spent(_cpu_of_children() - before, time.perf_counter() - start)
         print(f"{name}: {spent.cpu:.1f} s of CPU, {spent.wall:.1f} s", file=sys.stderr)
         found = contents(asset)
         shutil.rmtree(asset.parent)
         return spent, found
+
+    def convert(
+        self, asset: Path, *more: str, during: Blows | None = None, check: bool = True
+    ) -> int:
+        given = (str(self.capture), "-o", str(asset), *self.options, *more)
+        return run("convert", *given, during=during, check=check)
 
     def scheduler_killed(self) -> tuple[int, dict[str, str]]:
         """Exit status of the step whose scheduler was killed, and what the next one published."""
@@ -140,11 +145,10 @@ class Bench:
         with scheduler() as (address, process):
             thread = threading.Thread(target=strike, args=(process,), daemon=True)
             thread.start()
-            status = run("shade", str(asset), "--scheduler", address, check=False)
+            status = self.convert(asset, "--scheduler", address, check=False)
             thread.join()
         with scheduler() as (address, _):
-            for step in STEPS:
-                run(step, str(asset), "--scheduler", address)
+            self.convert(asset, "--scheduler", address)
         return status, contents(asset)
 
 

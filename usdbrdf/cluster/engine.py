@@ -145,32 +145,32 @@ class DaskWorkers:
 
     def _look_after(self, out: dict[Future, _Sent]) -> None:
         """Restart workers that are at a unit for too long: what they had goes to others."""
-        now, workers = time.monotonic(), {}
+        now, workers = time.monotonic(), dict[Any, str]()
         late = {future: sent for future, sent in out.items() if now - sent.since > self._limit}
         if late:
             found = self._asked(self._client.processing)
             workers = {key: worker for worker, keys in found.items() for key in keys}
         elif self._client.status != "running":
             raise self._gone()
-        for future, sent in late.items():
+        hung = dict.fromkeys(workers[future.key] for future in late if future.key in workers)
+        for sent in late.values():
             sent.since, sent.failed = now, sent.failed + 1
-            if future.key not in workers or future.done():
-                continue
             if sent.failed == _TRIES:
                 raise EnvironmentFailure(
                     f"{sent.key}: {_TRIES} workers did not finish it in {self._limit:g} s each. "
                     "Allow more with --unit-limit. [cluster.hangs]"
                 )
-            worker = workers[future.key]
+        for worker in hung:
             say(
-                f"{sent.key}: the worker {worker} did not finish it in {self._limit:g} s. It is "
+                f"{worker}: this worker is at its unit of work for over {self._limit:g} s. It is "
                 "restarted, and others do its work. [cluster.hangs]"
             )
             self._restart(worker)
 
     def _restart(self, worker: str) -> None:
         how = {"timeout": _STOPPING, "raise_for_error": False}
-        self._asked(lambda: self._client.restart_workers([worker], **how))
+        with suppress(KeyError):  # gone meanwhile
+            self._asked(lambda: self._client.restart_workers([worker], **how))
 
     @property
     def _address(self) -> str:

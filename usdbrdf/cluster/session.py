@@ -101,7 +101,7 @@ def _local_cluster(count: int) -> Iterator[Any]:
         threads_per_worker=1,
         host="127.0.0.1",
         security=Security.temporary(),
-        dashboard_address="127.0.0.1:0" if find_spec("bokeh") else None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=logging.CRITICAL,
         # Pages of files that are mapped into memory would count, which the system may take back.
         memory_limit=0,
