@@ -81,6 +81,7 @@ ARROWS: dict[str, set[str]] = {
 
 IMPORTERS: dict[str, set[str]] = {
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
+    "dask": {"cluster/"},
     "distributed": {"cluster/"},
     "drjit": {"relighting/"},
     "embreex": {"transport/rays.py"},

@@ -19,8 +19,14 @@ from usdbrdf.model.arrays import Array
 if TYPE_CHECKING:
     from distributed import Client
 
-# Seconds in which a scheduler answers, and in which workers of our own start.
+# Seconds in which a scheduler answers.
 _ANSWER = 20.0
+# Dask looks at every thread's stack a hundred times a second, which takes time from the work.
+_UNWATCHED = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
+}
 
 
 @contextmanager
@@ -93,20 +99,24 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
 def _local_cluster(count: int) -> Iterator[Any]:
     """So many worker processes, whose threads are this machine's cores shared out. Nobody else can
     reach them: they listen on this machine alone, and to who holds this session's certificate."""
+    from dask import config
     from distributed import LocalCluster, Security
 
     threads = str(max(1, (os.cpu_count() or 1) // count))
-    with LocalCluster(
-        n_workers=count,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        security=Security.temporary(),
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-        # Pages of files that are mapped into memory would count, which the system may take back.
-        memory_limit=0,
-        env={"NUMBA_NUM_THREADS": threads},
-    ) as cluster:
+    with (
+        config.set(_UNWATCHED),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            security=Security.temporary(),
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+            # Pages of files that are mapped into memory would count, which the system may take back.
+            memory_limit=0,
+            env={"NUMBA_NUM_THREADS": threads},
+        ) as cluster,
+    ):
         say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
         yield cluster
 
