@@ -179,6 +179,26 @@ def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
     assert contents(copy.folder) == alone
 
 
+def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed
+
+    from usdbrdf.cluster import session
+
+    tries = []
+
+    def dies(**_: object) -> None:
+        tries.append(1)
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(distributed, "LocalCluster", dies)
+    with (
+        pytest.raises(EnvironmentFailure, match=r"do not start.*\[cluster.workers\]"),
+        session._local_cluster(2),
+    ):
+        pass
+    assert len(tries) == 3
+
+
 def test_workers_of_two_kinds_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="exclude each other"):
         ClusterOptions(workers=2, scheduler="tcp://127.0.0.1:8786")

@@ -99,26 +99,38 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
 def _local_cluster(count: int) -> Iterator[Any]:
     """So many worker processes, whose threads are this machine's cores shared out. Nobody else can
     reach them: they listen on this machine alone, and to who holds this session's certificate."""
+    threads = str(max(1, (os.cpu_count() or 1) // count))
+    with _started(count, {"NUMBA_NUM_THREADS": threads}) as cluster:
+        say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
+        yield cluster
+
+
+def _started(count: int, environment: Mapping[str, str]) -> Any:
+    """A LocalCluster. A worker that dies while it starts is no reason to give up."""
     from dask import config
     from distributed import LocalCluster, Security
 
-    threads = str(max(1, (os.cpu_count() or 1) // count))
-    with (
-        config.set(_UNWATCHED),
-        LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            security=Security.temporary(),
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-            # Pages of files that are mapped into memory would count, which the system may take back.
-            memory_limit=0,
-            env={"NUMBA_NUM_THREADS": threads},
-        ) as cluster,
-    ):
-        say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
-        yield cluster
+    for last in (False, False, True):
+        try:
+            with config.set(_UNWATCHED):
+                return LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    security=Security.temporary(),
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                    # Pages of mapped files would count, which the system may take back.
+                    memory_limit=0,
+                    env=environment,
+                )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            if last:
+                raise EnvironmentFailure(
+                    f"--workers {count}: they do not start on this machine ({error}). Run the same "
+                    "command again, with fewer if memory is short. [cluster.workers]"
+                ) from error
+    raise AssertionError  # not reached
 
 
 def _say_dashboard(client: Client) -> None:
