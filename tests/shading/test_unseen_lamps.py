@@ -7,6 +7,7 @@ import pytest
 
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading.outside_light import Asked, Sources, mirrored_by_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
 from usdbrdf.transport.environment import black_environment
@@ -90,3 +91,48 @@ def test_what_only_reflects_is_none(hall):
     assert not len(found.object)
     assert found.with_light(surface.texels, lit) is lit
     assert not len(UnseenLamps.none().error)
+
+
+def test_dark_surfaces_that_mirror_their_surroundings_do_not_dim_a_lamp():
+    # Segments of any albedo, half of whose texels the lamp lights; all mirror a share of the rest.
+    random = np.random.default_rng(4)
+    count, each = 40, 60
+    segment = np.repeat(np.arange(count, dtype=np.int32), each)
+    albedo = np.exp(random.uniform(np.log(0.03), np.log(0.8), (count, 3)))
+    albedo[:, 2] *= 0.4  # browns
+    around = random.uniform(0.5, 1.5, (count * each, 1)) * [1.0, 0.8, 0.6]
+    share = random.uniform(0.02, 0.2, count * each) * (random.random(count * each) < 0.5)
+    lamp, texture = np.array([20.0, 18.0, 16.0]), np.exp(0.1 * random.standard_normal((2400, 1)))
+
+    def found(mirrored: float) -> tuple[float, np.ndarray, np.ndarray]:
+        reflected = albedo[segment] * (around + share[:, None] * lamp) + mirrored * around
+        asked = Asked(
+            texel=np.arange(count * each),
+            segment=segment,
+            owner=segment,
+            reflected=reflected * texture,
+            clipped=np.zeros(count * each, np.bool_),
+            irradiance=around,
+        )
+        sources = Sources(
+            share=share[None],
+            mean=np.zeros((1, 3)),
+            deviation=np.array([3.0]),
+            bound=np.zeros(1, np.bool_),
+            pairs=np.zeros((0, 2), np.int64),
+            apart=np.zeros(0),
+            compact=np.ones(1, np.bool_),
+        )
+        told = mirrored_by_scene(asked, sources)
+        with_it = sources._replace(mirrored=(told, told))
+        return told, *(np.exp(solved(asked, one).log_radiance[0]) for one in (sources, with_it))
+
+    told, without, with_it = found(0.04)
+    assert told in (0.03, 0.04, 0.05)
+    np.testing.assert_allclose(with_it, lamp, rtol=0.06)
+    assert (without < 0.85 * lamp)[2]
+    # And of surfaces that mirror nothing, nothing changes.
+    told, without, with_it = found(0.0)
+    assert told == 0
+    np.testing.assert_allclose(without, lamp, rtol=0.03)
+    np.testing.assert_array_equal(with_it, without)

@@ -185,8 +185,8 @@ _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 _MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (132), its place among the blocks of texels while these are
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
-# and what it is lit by.
-_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=150, always=24)
+# and what it is lit by, with and without what its surface keeps.
+_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")

@@ -310,7 +310,7 @@ def _sky(
     below = centre[:, 2 if z_up else 1] < 0
     apart = np.where(below[near[:, 0]] == below[near[:, 1]], _ALIKE, _ALIKE_OVER_HORIZON)
     deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
-    return Sources(share[used], mean, deviation, bound, near, apart)
+    return Sources(share[used], mean, deviation, bound, near, apart, np.zeros(len(used), np.bool_))
 
 
 def _with_sun(
@@ -329,6 +329,7 @@ def _with_sun(
         bound=np.append(sky.bound, False),
         pairs=sky.pairs,
         apart=sky.apart,
+        compact=np.append(sky.compact, True),
     )
     chosen = asked.of(kept)
     segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)

@@ -1,5 +1,12 @@
 """How strong the sources of light outside are: least squares on the logarithms of what texels
 reflect, pi L_d = albedo S, where S is what was seen and each source's share times its strength.
+L_d holds the specular light that all frames see as well: of E, the light from everywhere around, a
+few per cent however dark the surface is, and none of a lamp's or the sun's. So
+
+    pi L_d = albedo S + a E
+
+with a of each segment about that of the scene, ``mirrored_by_scene``, without which dark surfaces
+make compact lights too dim, and most so in the colours that they reflect least.
 
 On one segment (a facing of one object) the albedo varies about one value. Outliers weigh as under
 Student's t, and each segment by how much its texels scatter. What clips is a lower bound. Before
@@ -37,7 +44,8 @@ class Sources(NamedTuple):
     """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
     the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
     mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), and by how much
-    these are apart, (P,)."""
+    these are apart, (P,); whether a source is compact, so that most frames do not see it mirrored,
+    (K,); and what of all other light segments mirror to all frames: mean and standard deviation."""
 
     share: Double
     mean: Double
@@ -45,6 +53,8 @@ class Sources(NamedTuple):
     bound: Bool
     pairs: Long
     apart: Double
+    compact: Bool
+    mirrored: tuple[float, float] = (0.0, 0.0)
 
     def irradiance(self, log_radiance: Double) -> Double:
         """(N, 3) W/m^2 of all of them."""
@@ -54,6 +64,10 @@ class Sources(NamedTuple):
 _FREEDOM = calibration.number("outside.student_freedom")
 _INDEPENDENT = calibration.number("outside.independent")
 _USUAL_ALBEDO = calibration.pair("outside.albedo")
+# Shares of the light from around that may be mirrored to all frames, up to what a dielectric does.
+_MIRRORED = (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)
+# Standard deviation of a share that is given.
+_GIVEN = 5e-4
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
 _ITERATIONS = 40
@@ -61,12 +75,13 @@ _LEAST_NOISE = calibration.number("outside.least_noise")
 
 
 class Solution(NamedTuple):
-    """log_radiance (K, 3) of the sources, log_albedo (M, 3) of the segments, and the logarithm of
-    the mean albedo, (3,)."""
+    """log_radiance (K, 3) of the sources, log_albedo (M, 3) of the segments, the logarithm of the
+    mean albedo, (3,), and what of the light from around segments mirror to all frames, (M, 3)."""
 
     log_radiance: Double
     log_albedo: Double
     mean: Double
+    mirrored: Double
 
 
 def solved(
@@ -78,7 +93,8 @@ def solved(
         rest = np.log(asked.reflected) - light
         num = int(asked.segment.max()) + 1
         albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
-        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]))
+        mirrored = np.full((num, 3), sources.mirrored[0])
+        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]), mirrored)
     found = start
     # Which channel it is that clips, what does not clip tells first.
     for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
@@ -95,48 +111,61 @@ def solved(
 
 def _solved_channel(
     asked: Asked, sources: Sources, start: Solution, channel: int, counted: Bool, iterations: int
-) -> tuple[Double, Double, Double]:
+) -> tuple[Double, Double, Double, Double]:
     """One channel's part of ``solved``: Gauss-Newton steps on the weighted squares of the texels
     that are ``counted`` (N,)."""
     known, observed = asked.irradiance[:, channel], np.log(asked.reflected[:, channel])
-    g, albedo = start.log_radiance[:, channel].copy(), start.log_albedo[:, channel].copy()
+    g, albedo, mirrored = (
+        part[:, channel].copy() for part in (start.log_radiance, start.log_albedo, start.mirrored)
+    )
     mean = float(start.mean[channel])
     num_sources, num_segments = len(g), len(albedo)
     size = np.bincount(asked.segment, minlength=num_segments)
     effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
+    # A texel depends on all sources, and on the albedo and the mirrored share of one segment.
+    of_albedo = num_sources + np.arange(num_segments)
+    of_mirrored = of_albedo + num_segments
 
     def by_segment(values: Double) -> Double:
         return np.bincount(asked.segment, values, num_segments).astype(np.float64)
 
     for _ in range(iterations):
-        parts = np.exp(g)[:, None] * sources.share
-        total = known + parts.sum(axis=0)
+        brought = np.exp(g)[:, None] * sources.share
+        around = known + brought[~sources.compact].sum(axis=0)
+        scattered = known + brought.sum(axis=0)
+        over_albedo = np.exp(-albedo)[asked.segment]
+        share = mirrored[asked.segment] * over_albedo
+        total = scattered + share * around
         residual = observed - np.log(total) - albedo[asked.segment]
         # What clips reflects at least as much: it says something where the model says less.
         counts = counted & (~asked.clipped | (residual > 0))
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
-        # A texel depends on all sources and on the albedo of one segment.
-        parts /= total
-        rows = num_sources + num_segments + 1
+        by_source = brought * np.where(sources.compact[:, None], 1, 1 + share) / total
+        by_albedo, by_mirrored = scattered / total, over_albedo * around / total
+        rows = num_sources + 2 * num_segments + 1
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
-        curvature[:num_sources, :num_sources] = parts @ (parts * weight).T
-        for source, part in enumerate(parts):
-            both = by_segment(part * weight)
-            curvature[source, num_sources:-1] = curvature[num_sources:-1, source] = both
-        np.fill_diagonal(curvature[num_sources:-1, num_sources:-1], by_segment(weight))
-        gradient[:num_sources] = parts @ (weight * residual)
-        gradient[num_sources:-1] = by_segment(weight * residual)
-        _add_priors(curvature, gradient, sources, channel, (g, albedo, mean))
+        curvature[:num_sources, :num_sources] = by_source @ (by_source * weight).T
+        gradient[:num_sources] = by_source @ (weight * residual)
+        for place, part in ((of_albedo, by_albedo), (of_mirrored, by_mirrored)):
+            for source, other in enumerate(by_source):
+                both = by_segment(part * other * weight)
+                curvature[source, place] = curvature[place, source] = both
+            curvature[place, place] = by_segment(part**2 * weight)
+            gradient[place] = by_segment(part * weight * residual)
+        both = by_segment(by_albedo * by_mirrored * weight)
+        curvature[of_albedo, of_mirrored] = curvature[of_mirrored, of_albedo] = both
+        _add_priors(curvature, gradient, sources, channel, (g, albedo, mirrored, mean))
         damped = curvature + 1e-3 * np.diag(np.diag(curvature))
         step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
         g += step[:num_sources]
-        albedo += step[num_sources:-1]
+        albedo += step[of_albedo]
+        mirrored = np.maximum(mirrored + step[of_mirrored], 0)
         mean += float(step[-1])
         if np.abs(step).max() < 1e-4:
             break
-    return g, albedo, np.array(mean)
+    return g, albedo, np.array(mean), mirrored
 
 
 def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
@@ -154,10 +183,10 @@ def _add_priors(
     gradient: Double,
     sources: Sources,
     channel: int,
-    at: tuple[Double, Double, float],
+    at: tuple[Double, Double, Double, float],
 ) -> None:
-    """What is known of sources and albedos before the evidence."""
-    g, albedo, mean = at
+    """What is known of sources, albedos and mirrored shares before the evidence."""
+    g, albedo, mirrored, mean = at
     k, last = len(g), len(gradient) - 1
     index = np.arange(k)
     off = sources.mean[:, channel] - g
@@ -171,7 +200,11 @@ def _add_priors(
             curvature[one, one] += pull
             curvature[one, other] -= pull
             gradient[one] -= pull * (g[one] - g[other])
-    segment = np.arange(k, last)
+    segment = np.arange(k, k + len(albedo))
+    glossy = segment + len(albedo)
+    usual, spread = sources.mirrored[0], max(sources.mirrored[1], _GIVEN)
+    curvature[glossy, glossy] += spread**-2
+    gradient[glossy] += (usual - mirrored) / spread**2
     off = albedo - mean
     precision_of = _OF_SEGMENT**-2
     curvature[segment, segment] += precision_of
@@ -184,6 +217,32 @@ def _add_priors(
     over = np.maximum(albedo - np.log(_WHITEST), 0)
     curvature[segment, segment] += (over > 0) * _AS_WHITE**-2
     gradient[segment] -= over * _AS_WHITE**-2
+
+
+def mirrored_by_scene(asked: Asked, sources: Sources) -> float:
+    """What of the light from around all segments mirror to all frames, if it is the same for all:
+    the likeliest under Student's t."""
+    number, plain = int(asked.segment.max()) + 1, ~asked.clipped
+    size = np.bincount(asked.segment[plain], minlength=number)
+    counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
+
+    def cost(share: float) -> float:
+        found = solved(asked, sources._replace(mirrored=(share, 0.0)))
+        of_sources = sources.share[:, :, None] * np.exp(found.log_radiance)[:, None]
+        around = asked.irradiance + of_sources[~sources.compact].sum(axis=0)
+        light = asked.irradiance + of_sources.sum(axis=0)
+        explained = np.exp(found.log_albedo)[asked.segment] * light
+        explained += found.mirrored[asked.segment] * around
+        residual = np.log(asked.reflected / explained)
+        total = 0.0
+        for channel in residual.T:
+            noise = _noise_of_segments(asked, channel, number)[asked.segment]
+            square = (channel / noise)[plain] ** 2
+            each = np.log(noise[plain]) + 0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
+            total += float(counts @ each)
+        return total
+
+    return min(_MIRRORED, key=cost)
 
 
 _MOSTLY_INFERRED = calibration.number("outside.level_unknown")
@@ -234,7 +293,9 @@ def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
         some = asked.of(kept)
         numbers, segment = np.unique(some.segment, return_inverse=True)
         some = some._replace(segment=segment.astype(np.int32))
-        start = found._replace(log_albedo=found.log_albedo[numbers])
+        start = found._replace(
+            log_albedo=found.log_albedo[numbers], mirrored=found.mirrored[numbers]
+        )
         part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
         moved += (part.log_radiance - found.log_radiance) ** 2
     return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))

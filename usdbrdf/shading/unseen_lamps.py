@@ -20,7 +20,7 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.clipped_light import irradiance_of_texels
 from usdbrdf.shading.outside import asked_texels, looked_around
-from usdbrdf.shading.outside_light import Asked, Sources, jackknife, solved
+from usdbrdf.shading.outside_light import Asked, Sources, jackknife, mirrored_by_scene, solved
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -113,14 +113,18 @@ def lamps_that_explain(
         return UnseenLamps.none()
     # Few rays meet a lamp, and errors of what it brings draw its strength to nothing: they only
     # say which of the objects may be one.
-    found, _, near, part = _strengths(surface, lit, asked, share[candidates], candidates, seed)
+    found, _, near, part = _strengths(
+        surface, lit, asked, share[candidates], candidates, seed, closely=False
+    )
     likely = np.where(np.pi * found.mean(axis=1) > near, part, 0)
     likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
     candidates = candidates[likeliest[likely[likeliest] > _LEAST_PART / 4]]
     traced = {int(k): _brought(surface, asked, int(k), seed) for k in candidates}
     while len(candidates):
         shares = np.stack([traced[int(k)] for k in candidates])
-        found, error, near, part = _strengths(surface, lit, asked, shares, candidates, seed)
+        found, error, near, part = _strengths(
+            surface, lit, asked, shares, candidates, seed, closely=True
+        )
         # Clearly brighter than what only reflects: even with as much light as the texels that see
         # it receive.
         brightness = np.log(np.pi * found.mean(axis=1) / near)
@@ -160,10 +164,18 @@ def _brought(surface: TexturedScene, asked: Asked, index: int, seed: int) -> Dou
 
 
 def _strengths(
-    surface: TexturedScene, lit: Float, asked: Asked, share: Double, candidates: Long, seed: int
+    surface: TexturedScene,
+    lit: Float,
+    asked: Asked,
+    share: Double,
+    candidates: Long,
+    seed: int,
+    *,
+    closely: bool,
 ) -> tuple[Double, Double, Double, Double]:
     """Radiance (K, 3) of the candidates, its relative error (K,), S (K,) of the texels that they
-    light, each as much as it does, and what part of all light is theirs, (K,)."""
+    light, each as much as it does, and what part of all light is theirs, (K,); ``closely``: with
+    what surfaces mirror of the other light."""
     of_candidates = np.isin(surface.texels.object_index(), candidates)
     dark = np.where(of_candidates[:, None], np.float32(0), lit)
     known = irradiance_of_texels(surface, dark, black_environment(), asked.texel, seed)
@@ -178,7 +190,11 @@ def _strengths(
         bound=np.zeros(count, np.bool_),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
+        compact=np.ones(count, np.bool_),
     )
+    if closely:
+        mirrored = mirrored_by_scene(asked, sources)
+        sources = sources._replace(mirrored=(mirrored, mirrored))
     found = solved(asked, sources)
     error = jackknife(asked, sources, found).max(axis=1)
     light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
