@@ -52,6 +52,7 @@ class DaskWorkers:
         """shared_folder: which all workers see under this name, None: the task's own, in the asset;
         unit_limit_s: seconds after which a worker is taken to hang at a unit."""
         self._client, self._folder, self._limit = client, shared_folder, unit_limit_s
+        self._address = str(client.scheduler.address)
 
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
@@ -171,10 +172,6 @@ class DaskWorkers:
         how = {"timeout": _STOPPING, "raise_for_error": False}
         with suppress(KeyError):  # gone meanwhile
             self._asked(lambda: self._client.restart_workers([worker], **how))
-
-    @property
-    def _address(self) -> str:
-        return str(self._client.scheduler.address) if self._client.scheduler else "the scheduler"
 
     def _gone(self) -> EnvironmentFailure:
         return EnvironmentFailure(

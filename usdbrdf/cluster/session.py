@@ -75,7 +75,8 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
     from distributed import Client
 
     # What it logs of deaths and lost connections is told in our words.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if options.scheduler is None:
         with _local_cluster(options.workers or 1) as cluster, Client(cluster) as client:
             _say_dashboard(client)
