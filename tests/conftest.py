@@ -26,6 +26,7 @@ SLOW = (
     "delivery/test_package_whole.py",
     "delivery/test_publish.py",
     "evaluation",
+    "farm/test_work.py",
     "faults/test_bad_captures.py",
     "faults/test_frames_that_disagree.py",
     "faults/test_hostile_files.py",

@@ -70,7 +70,11 @@ ARROWS: dict[str, set[str]] = {
     "cli": {"commands", "command_parser"},
     "run_table": set(),
     "doctor": {"asset", "relighting"},
-    "commands": {"command_parser", "doctor", "run_table"},
+    # Many scans: each converted, validated, shown; the look of its page is that of theirs.
+    "farm": {"pipeline", "page", "validation", "run_table"},
+    "farm_commands": {"command_kinds", "farm"},
+    "command_kinds": {"command_parser", "run_table"},
+    "commands": {"command_kinds", "doctor", "farm_commands"},
     "command_parser": {"pipeline", *READERS},
     "__main__": {"cli"},
     # The public face, which nothing inside may import.

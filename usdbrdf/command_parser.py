@@ -150,7 +150,9 @@ def _argument(said: _Said) -> inspect.Parameter:
         _key(option),
         inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY,
         default=inspect.Parameter.empty if field.default is REQUIRED else None,
-        annotation=Annotated[list[str] if several else kind, parameter],
+        # As wide as what ``read`` makes, and the default: where pydantic is loaded, cyclopts has it
+        # check the values against these.
+        annotation=Annotated[(list[Any] if several else kind) | None, parameter],
     )
 
 
@@ -280,9 +282,12 @@ def _entry(said: _Said) -> tuple[str, str]:
 
 def _meaning(owner: type[Options], name: str) -> str:
     """Of a field: what the string below it says."""
-    places = [f"{base.__name__}.{name}" for base in owner.__mro__]
-    meanings = {**_meanings(options.__name__), **_meanings(owner.__module__)}
-    return next(meanings[place] for place in places if place in meanings)
+    # Options is the last of them, whose source knows none: every field is told before.
+    return next(
+        meanings[place]
+        for base in owner.__mro__
+        if (place := f"{base.__name__}.{name}") in (meanings := _meanings(base.__module__))
+    )
 
 
 @cache

@@ -10,106 +10,21 @@ import os
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from usdbrdf import options
 from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.command_kinds import Locking, OnCapture, Run, RunOnCapture, Talking, Waiting
 from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.farm_commands import Farm, FarmTable, FarmWork
 from usdbrdf.job.interrupts import loading
-from usdbrdf.job.progress import printable, say, set_quiet, show, tell
+from usdbrdf.job.progress import printable, say, set_quiet, show
 from usdbrdf.option import REQUIRED, option
-from usdbrdf.options import EditOptions, TalkOptions
-from usdbrdf.run_table import table
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from contextlib import AbstractContextManager
-
-    from usdbrdf.asset.layout import Asset
-    from usdbrdf.job.task import TaskResult
+from usdbrdf.options import EditOptions
 
 
-class _Talking(TalkOptions, Command):
-    def told(self, summary: Mapping[str, Any], *lines: str) -> int:
-        """The end of a command that did what it was asked for."""
-        if self.json:
-            show(json.dumps(summary, indent=2), whole=True)
-        for line in lines:
-            say(line)
-        return 0
-
-
-class _Waiting(Command):
-    wait_s: float = option("--wait S", 0.0, (0, 10**9))
-    "wait up to this many seconds for a busy asset folder"
-
-    def reading(self, *assets: Path) -> AbstractContextManager[object]:
-        """Assets that no run changes meanwhile."""
-        from usdbrdf.job.ownership import reading
-
-        return reading(*assets, wait_s=self.wait_s)
-
-
-class _Locking(_Waiting):
-    without_lock: bool = option("--without-lock", False)
-    """go on where the file system has no locks: see that nothing else writes into the asset"""
-
-
-class _Run(_Locking, _Talking):
-    strict: bool = option("--strict", False)
-    "exit with 7 if a step of this asset warned, now or when it was done"
-
-    def working_on(self, folder: Path) -> AbstractContextManager[Asset]:
-        """The asset folder, made ready and locked as these options say."""
-        from usdbrdf.pipeline import working_on
-
-        return working_on(folder, wait_s=self.wait_s, without_lock=self.without_lock)
-
-    def report(self, results: Mapping[str, TaskResult], folder: Path) -> int:
-        """What the tasks found, with the root layer, whose name only a finished ingest knows."""
-        from usdbrdf.asset.layout import Asset
-        from usdbrdf.asset.review import notes_for_run
-
-        root = Asset.at(folder).root_layer
-        steps = {
-            name: {"reran": result.reran, "reason": result.reason, **result.summary}
-            for name, result in results.items()
-        }
-        done = "written" if any(r.reran for r in results.values()) else "up to date"
-        lines = [*table(steps, root), f"{root}: {done}"]
-        if steps.get("ingest", {}).get("radiometric") is False:
-            doubt = "the images are not radiometric; albedo and fit have no absolute meaning."
-            lines = [f"warning: {doubt}", *lines]
-        notes = notes_for_run(Asset.at(folder)) if any(r.reran for r in results.values()) else []
-        lines += [f"review.usda: {note}" for note in notes]
-        known = {"review": notes} if notes else {}
-        status = self.told({"asset": str(root), "steps": steps, **known}, *lines)
-        doubts = sum(len(result.summary.get("warnings", ())) for result in results.values())
-        if self.strict and doubts:
-            tell(f"usdbrdf: done, with {doubts} warnings, which --strict counts. [quality.strict]")
-            return 7
-        return status
-
-
-class _OnCapture(_Talking):
-    adapter: str | None = option(
-        "--adapter NAME", None, unset="recognised by its content", shared="ingest"
-    )
-    "capture format"
-    plugins: bool = option("--no-plugins", True, shared="ingest")
-    "use our own adapters only"
-
-
-class _RunOnCapture(_OnCapture, _Run):
-    capture: tuple[Path, ...] = option("SCAN", REQUIRED)
-    """capture folder or its main file; several of one scene, with the same mesh and objects, are
-    its lightings and get the names of their folders"""
-    output: Path = option("-o --output ASSET", REQUIRED)
-    "asset folder, made if it is not there"
-
-
-class Inspect(_OnCapture):
+class Inspect(OnCapture):
     """Say what a capture holds and what convert would refuse; nothing is written."""
 
     capture: Path = option("SCAN", REQUIRED)
@@ -129,7 +44,7 @@ class Inspect(_OnCapture):
         return 0
 
 
-class Convert(EditOptions, _RunOnCapture):
+class Convert(EditOptions, RunOnCapture):
     """Do all four steps: capture in, USD asset out."""
 
     options: options.ConvertOptions
@@ -146,7 +61,7 @@ class Convert(EditOptions, _RunOnCapture):
         return self.report(results, self.output)
 
 
-class Ingest(_RunOnCapture):
+class Ingest(RunOnCapture):
     """Read a capture into the layer scan.usdc."""
 
     write_capture: Path | None = option("--write-capture DIR", None)
@@ -164,7 +79,7 @@ class Ingest(_RunOnCapture):
         return self.report({"ingest": done}, self.output)
 
 
-class MergeBrackets(_Talking):
+class MergeBrackets(Talking):
     """Merge brackets of 8-bit photographs into a capture of radiance."""
 
     capture: Path = option("SCAN", REQUIRED)
@@ -187,7 +102,7 @@ class MergeBrackets(_Talking):
         return self.told({"capture": str(self.output), **found}, told)
 
 
-class DevelopRaw(_Talking):
+class DevelopRaw(Talking):
     """Develop camera raw files into a capture of radiance."""
 
     capture: Path = option("SCAN", REQUIRED)
@@ -209,7 +124,7 @@ class DevelopRaw(_Talking):
         return self.told({"capture": str(self.output), **found}, told)
 
 
-class _RunOnAsset(_Run):
+class _RunOnAsset(Run):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder made by ingest"
 
@@ -243,7 +158,7 @@ class Fit(_RunOnAsset):
     cluster: ClusterOptions
 
 
-class _WithAsset(_Waiting, _Talking):
+class _WithAsset(Waiting, Talking):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder; it is not changed"
 
@@ -270,7 +185,7 @@ class Evaluate(_WithAsset):
         return self.told({"output": str(self.output), **found["summary"], **truth}, *lines)
 
 
-class Compare(_Waiting, _Talking):
+class Compare(Waiting, Talking):
     """Compare two assets of one scene, lit differently."""
 
     first: Path = option("ASSET", REQUIRED)
@@ -321,7 +236,7 @@ class Package(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
-class Publish(_Locking, _WithAsset):
+class Publish(Locking, _WithAsset):
     """Write the asset as a version that never changes, for others to take in."""
 
     destination: Path = option("DEST", REQUIRED)
@@ -355,7 +270,7 @@ class Report(_WithAsset):
         return self.told(summary, f"{self.output}: written, {summary['bytes']:,} bytes")
 
 
-class Advise(_Locking, _Talking):
+class Advise(Locking, Talking):
     """Say what to photograph next, as guide cameras in a layer of their own."""
 
     asset: Path = option("ASSET", REQUIRED)
@@ -386,7 +301,7 @@ class View(_WithAsset):
         return 0
 
 
-class Validate(_Waiting):
+class Validate(Waiting):
     """Check an asset by our rules and those of USD."""
 
     asset: Path = option("ASSET", REQUIRED)
@@ -492,9 +407,12 @@ class PluginPath(Command):
         return 0
 
 
-_ALL: tuple[type[Command], ...] = (
-    Inspect, Convert, Ingest, Texture, Shade, Fit, MergeBrackets, DevelopRaw, Evaluate, Compare,
-    Relight, Package, Publish, Report, View, Advise, Validate, Rules, Adapters, Doctor, Completion,
-    PluginPath,
+_TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
+_OTHERS = (
+    MergeBrackets, DevelopRaw, Evaluate, Compare, Relight, Package, Publish, Report, View,
+    Advise, Validate, Farm, FarmWork, FarmTable, Rules, Adapters, Doctor, Completion, PluginPath,
 )  # fmt: skip
-COMMANDS = {re.sub("(?<!^)(?=[A-Z])", "-", own.__name__).lower(): own for own in _ALL}
+COMMANDS = {
+    re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command
+    for command in (*_TASKS, *_OTHERS)
+}

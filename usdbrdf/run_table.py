@@ -27,7 +27,7 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
     Empty where a step is missing."""
     if not {"texture", "shade", "fit"} <= steps.keys():
         return []
-    statuses = _statuses(steps)
+    statuses = statuses_of(steps)
     rows = [("objects", f"{len(statuses)}: {', '.join(_counted(statuses))}")]
     rows += [("a look", line) for line in _worth_a_look(steps["fit"]["objects"], statuses)]
     rows += [("surface", line) for line in _of_surface(steps["texture"])]
@@ -44,7 +44,7 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
     ]
 
 
-def _statuses(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+def statuses_of(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Of each object; a lamp's is that it shines, a pane's that a person said so."""
     lamps = {name for part in _parts(steps["shade"]) for name in part.get("emitters", ())}
     return {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Any, TextIO, TypeVar
 
@@ -18,6 +18,7 @@ from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 T = TypeVar("T")
 _SECONDS_BETWEEN_LINES = 30.0
 _quiet = False
+_line_hearer: Callable[[str], None] | None = None
 
 
 def fill_closed_streams() -> None:
@@ -34,6 +35,13 @@ def set_quiet(quiet: bool) -> None:
     """Silence ``progress`` and ``say`` (the command line's -q)."""
     global _quiet
     _quiet = quiet
+
+
+def tell_lines_to(hearer: Callable[[str], None] | None) -> None:
+    """Give the lines in which ``progress`` tells how far it is to ``hearer``, where they go into a
+    log; None: to stderr again."""
+    global _line_hearer
+    _line_hearer = hearer
 
 
 def say(line: str) -> None:
@@ -107,7 +115,8 @@ def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Ite
         due = start + _SECONDS_BETWEEN_LINES
         for done, item in enumerate(iterable):
             if (now := time.monotonic()) >= due:
-                say(f"{label}: {done} of {total} {unit}{_left(now - start, done, total)}")
+                line = f"{label}: {done} of {total} {unit}{_left(now - start, done, total)}"
+                (_line_hearer or say)(line)
                 due = now + _SECONDS_BETWEEN_LINES
             yield item
 

@@ -38,6 +38,7 @@ from usdbrdf.page.pictures import (
     surface_maps,
 )
 from usdbrdf.page.room import room_model
+from usdbrdf.page.static_parts import static_part
 from usdbrdf.page.views import (
     SHOWN,
     SHOWN_WIDTH,
@@ -47,7 +48,6 @@ from usdbrdf.page.views import (
     unnamed,
 )
 
-_STATIC = Path(__file__).resolve().parent / "static"
 # Frames in which objects are looked for.
 _SEARCHED = 64
 
@@ -83,22 +83,18 @@ def page(data: Mapping[str, Any], served: str = "") -> str:
     """The document. served: the address that takes verdicts, "" for a file."""
     text = json.dumps({**data, "served": served}, separators=(",", ":"), allow_nan=False)
     parts = {
-        "STYLE": _part("page.css"),
+        "STYLE": static_part("page.css"),
         "DATA": text.replace("<", "\\u003c").replace("\u2028", "\\u2028"),
-        "ROOM": _part("room.bundle.js").replace("</script", "<\\/script"),
-        "SCRIPT": _part("page.js"),
-        "LICENCE": _part("room.bundle.LICENCE.txt"),
+        "ROOM": static_part("room.bundle.js").replace("</script", "<\\/script"),
+        "SCRIPT": static_part("page.js"),
+        "LICENCE": static_part("room.bundle.LICENCE.txt"),
     }
-    document = _part("page.html")
+    document = static_part("page.html")
     for name, content in parts.items():
         before, mark, after = document.partition(f"/*{name}*/")
         assert mark, name
         document = before + content + after
     return document
-
-
-def _part(name: str) -> str:
-    return (_STATIC / name).read_text("utf-8")
 
 
 def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:

@@ -1,0 +1,220 @@
+"""The bundle of a farm: OpenJD's own model takes it, and names of scans hold."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from usdbrdf.cli import main
+from usdbrdf.commands import COMMANDS
+from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.farm.bundle import bundle_of, write_bundle
+from usdbrdf.farm.options import FarmOptions
+from usdbrdf.farm.scans import list_of, listed_in, numbers_in, read_list
+from usdbrdf.options import (
+    ConvertOptions,
+    FitOptions,
+    IngestOptions,
+    Sampling,
+    ShadeOptions,
+    TextureOptions,
+)
+
+
+def folders(root: Path, *names: str) -> list[Path]:
+    made = [root / name for name in names]
+    for folder in made:
+        folder.mkdir(parents=True)
+    return made
+
+
+def job_of(folder: Path, values: dict[str, str]):
+    """The job that OpenJD makes of a bundle, and its steps by name."""
+    model = pytest.importorskip("openjd.model", reason="needs the extra farm")
+    text = json.loads((folder / "template.json").read_text())
+    extensions = ["TASK_CHUNKING"]
+    template = model.decode_job_template(template=text, supported_extensions=extensions)
+    known = model.preprocess_job_parameters(
+        job_template=template, job_parameter_values=values, job_template_dir=folder,
+        current_working_dir=folder,
+    )  # fmt: skip
+    return model.create_job(job_template=template, job_parameter_values=known)
+
+
+def test_openjd_makes_a_job_of_it(tmp_path):
+    scans = list_of(folders(tmp_path / "scans", "a", "b", "c", "d", "e"))
+    sky, outside = tmp_path / "sky.exr", tmp_path / "outside"
+    sky.touch(), outside.mkdir()
+    options = ConvertOptions(
+        ingest=IngestOptions(refine_poses=True, allow_outside=(outside, tmp_path)),
+        texture=TextureOptions(texel_size=0.25),
+        shade=ShadeOptions(sampling=Sampling(max_rays=64), environment=sky),
+        fit=FitOptions(environment=sky, mapping="measured"),
+    )
+    farm = FarmOptions(chunk=2, cores=4, ram=16)
+    made = bundle_of("street {1}", scans, options, farm, "transforms", plugins=False)
+    write_bundle(tmp_path / "bundle", scans, made)
+    job = job_of(tmp_path / "bundle", made.values)
+    model = pytest.importorskip("openjd.model")
+    work, table = job.steps
+    assert job.name == "usdbrdf street 1 (5 scans)"
+    chunks = [
+        str(p["Scan"].value) for p in model.StepParameterSpaceIterator(space=work.parameterSpace)
+    ]
+    assert [numbers_in(chunk, 5) for chunk in chunks] == [[1, 2], [3, 4], [5]]
+    needs = {one.name: one.min for one in work.hostRequirements.amounts}
+    assert {name: float(least) for name, least in needs.items()} == {
+        "amount.worker.vcpu": 4, "amount.worker.memory": 16 * 1024,
+    }  # fmt: skip
+    assert [one.dependsOn for one in table.dependencies] == [work.name]
+
+    # What its tasks run is a command line that means the same again.
+    words = [str(word) for word in work.script.actions.onRun.args]
+    values = {name: value.value for name, value in job.parameters.items()}
+    values = {"Param." + name: value for name, value in values.items()} | {"Task.Param.Scan": "1-2"}
+    said = [_resolved(word, values) for word in words]
+    from usdbrdf.command_parser import parsed
+
+    command = parsed(said, COMMANDS)
+    assert command.options == ConvertOptions(
+        ingest=IngestOptions(refine_poses=True, allow_outside=(outside, tmp_path)),
+        texture=TextureOptions(texel_size=0.25, memory=12),
+        shade=ShadeOptions(sampling=Sampling(max_rays=64), environment=sky),
+        fit=FitOptions(environment=sky, mapping="measured", memory=12),
+    )
+    assert (command.adapter, command.plugins, command.chosen) == ("transforms", False, "1-2")
+    assert command.root == scans.root
+    assert command.bundle == tmp_path / "bundle" / "scans.json"
+    assert command.results == tmp_path / "bundle" / "results"
+
+
+def _resolved(word: str, values: dict[str, str]) -> str:
+    if not word.startswith("{{"):
+        return word
+    return str(values[word.strip("{} ")])
+
+
+def test_paths_are_told_so_that_a_farm_can_map_them(tmp_path):
+    scans = list_of(folders(tmp_path, "scans/a", "scans/more/b"))
+    mesh = tmp_path / "mesh.ply"
+    mesh.touch()
+    made = bundle_of("x", scans, ConvertOptions(ingest=IngestOptions(mesh=mesh)), FarmOptions())
+    write_bundle(tmp_path / "bundle", scans, made)
+    told = json.loads((tmp_path / "bundle/parameter_values.json").read_text())["parameterValues"]
+    assert {one["name"]: one["value"] for one in told} == {
+        "Mesh": str(mesh), "ScanRoot": str(tmp_path / "scans"),
+    }  # fmt: skip
+    kinds = {one["name"]: one["type"] for one in made.template["parameterDefinitions"]}
+    assert {name for name, kind in kinds.items() if kind == "PATH"} == {
+        "Mesh", "Results", "ScanRoot", "Scans",
+    }  # fmt: skip
+    references = json.loads((tmp_path / "bundle/asset_references.json").read_text())
+    assert references["assetReferences"]["inputs"]["directories"] == [
+        str(tmp_path / "scans/a"), str(tmp_path / "scans/more/b"),
+    ]  # fmt: skip
+    # Nowhere else does the template name a place of this machine.
+    assert str(tmp_path) not in (tmp_path / "bundle/template.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (("one", "two"), ["one", "two"]),
+        (("x/room", "y/room", "hall"), ["x_room", "y_room", "hall"]),
+        (("a b", "a_b"), None),
+        (("Room", "room"), None),
+        (("Küche 1", "3rd floor"), ["Kuche_1", "_3rd_floor"]),
+    ],
+)
+def test_names_tell_scans_apart_whatever_their_order(tmp_path, given, names):
+    places = folders(tmp_path, *given)
+    found = dict(zip(given, list_of(places).names, strict=True))
+    again = dict(zip(reversed(given), list_of(places[::-1]).names, strict=True))
+    assert found == again
+    assert len({name.lower() for name in found.values()}) == len(given)
+    assert names is None or [*found.values()] == names
+
+
+def test_a_main_file_is_called_after_its_folder_too(tmp_path):
+    places = [folder / "transforms.json" for folder in folders(tmp_path, "a", "b")]
+    for place in places:
+        place.touch()
+    assert list_of(places).names == ("a_transforms", "b_transforms")
+    assert list_of([places[0], places[0]]).places == ("transforms.json",)
+
+
+def test_a_scan_that_is_not_there_is_said_at_once(tmp_path, capsys):
+    there = folders(tmp_path, "a")[0]
+    words = [
+        "farm",
+        str(there),
+        str(tmp_path / "b"),
+        str(tmp_path / "c"),
+        "-o",
+        str(tmp_path / "o"),
+    ]
+    assert main(words) == 3
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'b'}: no such file or folder (and 1 others of the list)" in said
+    assert not (tmp_path / "o").exists()
+    assert main(["farm", "-o", str(tmp_path / "o")]) == 2
+    assert main(["farm", str(there), "-o", str(tmp_path / "o"), "--texel-size", "0"]) == 2
+
+
+def test_scans_come_from_a_file_too(tmp_path):
+    places = folders(tmp_path, "scans/a b", "scans/c")
+    (tmp_path / "scans.txt").write_text(f"# of today\nscans/a b\n\n{places[1]}\n")
+    assert listed_in(tmp_path / "scans.txt") == places
+    with pytest.raises(InputRefused, match=r"\[document.missing\]"):
+        listed_in(tmp_path / "none.txt")
+
+
+def test_a_folder_keeps_its_names(tmp_path):
+    first, second = folders(tmp_path, "x/room", "y/room")
+    for scans in (list_of([first]), list_of([first, *folders(tmp_path, "x/hall")])):
+        write_bundle(
+            tmp_path / "bundle", scans, bundle_of("b", scans, ConvertOptions(), FarmOptions())
+        )
+    other = list_of([second])
+    with pytest.raises(OwnershipConflict, match=r"room is the scan .*x/room here.*\[farm.name\]"):
+        write_bundle(
+            tmp_path / "bundle", other, bundle_of("b", other, ConvertOptions(), FarmOptions())
+        )
+    assert read_list(tmp_path / "bundle/scans.json").names == ("room", "hall")
+
+
+def test_a_folder_of_somebody_else_stays(tmp_path):
+    scans = list_of(folders(tmp_path, "a"))
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs/letter.txt").touch()
+    made = bundle_of("b", scans, ConvertOptions(), FarmOptions())
+    with pytest.raises(OwnershipConflict, match=r"\[farm.folder\]"):
+        write_bundle(tmp_path / "theirs", scans, made)
+    with pytest.raises(OwnershipConflict, match=r"\[farm.folder\]"):
+        write_bundle(tmp_path / "theirs/letter.txt", scans, made)
+    assert [*(tmp_path / "theirs").iterdir()] == [tmp_path / "theirs/letter.txt"]
+
+
+@pytest.mark.parametrize("text", ["", "0-3", "4", "x", "3-1", "1-", "1-3:0", "-1"])
+def test_what_is_no_range(text):
+    with pytest.raises(UsageError, match=r"\[farm.range\]"):
+        numbers_in(text, 3)
+
+
+def test_ranges():
+    assert numbers_in("2", 9) == [2]
+    assert numbers_in("7,1-3, 9", 9) == [1, 2, 3, 7, 9]
+    assert numbers_in("1-9:4", 9) == [1, 5, 9]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ['{"schema": 2}', "[]", '{"schema": 1, "root": "/", "scans": [{"name": "../x", "place": "a"}]}',
+     '{"schema": 1, "root": "/", "scans": []}', '{"schema": 1, "root": 3, "scans": [{}]}'],
+)  # fmt: skip
+def test_a_list_that_is_none(tmp_path, damage):
+    (tmp_path / "scans.json").write_text(damage)
+    with pytest.raises(InputRefused, match=r"\[farm.list\]"):
+        read_list(tmp_path / "scans.json")

@@ -1,0 +1,1 @@
+"""Many scans on a farm: a job bundle of them, the work of its tasks, and what came of all."""
