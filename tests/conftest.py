@@ -17,6 +17,7 @@ SLOW = (
     "asset/test_previews.py",
     "asset/test_schema.py",
     "capture/test_adapters.py",
+    "cluster/test_workers.py",
     "dcc",
     "delivery/test_acescg.py",
     "delivery/test_glb.py",
@@ -80,6 +81,8 @@ SWEEPS = (
 
 # Tests of ten seconds and more that watch what seldom changes.
 NIGHTLY = (
+    "cluster/test_workers.py::"
+    "test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there",
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
     "faults/test_two_at_once.py::test_nobody_sees_half_a_run_and_an_artist_may_save",
     "faults/test_what_children_open.py::"

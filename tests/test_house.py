@@ -54,7 +54,9 @@ ARROWS: dict[str, set[str]] = {
     # A document of views is read by the adapter of the capture that they belong to.
     "asset": {"capture"},
     "tasks": SUBJECTS,
-    "pipeline": {"tasks"},
+    # Who does units of work; it finds them by name.
+    "cluster": {"job", "options"},
+    "pipeline": {"tasks", "cluster"},
     # Run by name, in a child.
     "warm_up": {"pipeline"},
     "delivery": {"asset"},
@@ -83,11 +85,13 @@ ARROWS: dict[str, set[str]] = {
 
 IMPORTERS: dict[str, set[str]] = {
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
+    "dask": {"cluster/"},
+    "distributed": {"cluster/"},
     "drjit": {"relighting/"},
     "embreex": {"transport/rays.py"},
     "filelock": {"job/ownership.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
-    "llvmlite": {"kernel.py", "transport/"},
+    "llvmlite": {"kernel.py", "cluster/unit.py", "transport/"},
     "matplotlib": {"evaluation/"},
     "mitsuba": {"relighting/"},
     "msgspec": {"files/documents.py"},
@@ -111,7 +115,7 @@ IMPORTERS: dict[str, set[str]] = {
     "PyOpenColorIO": {"files/colour.py"},
     "pyoidn": {"transport/denoise.py"},
     "subprocess": {"job/child.py"},
-    "threadpoolctl": {"material/fit_objects.py"},
+    "threadpoolctl": {"cluster/unit.py", "material/fit_objects.py"},
     "tqdm": {"job/progress.py"},
     "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
     "usd_validation_nvidia": {"validation/nvidia.py"},
@@ -127,6 +131,7 @@ OPENERS: dict[str, str] = {
     "asset/": "USD layers are written by USD",
     "delivery/": "packages are files",
     "calibration.py": "its own data",
+    "cluster/store.py": "arrays that workers find by their hash",
     "identity.py": "hashes the sources",
     "kernel.py": "compiled code",
     "page/": "the page's own parts",

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from usdbrdf.advice.advise import advise as advise
+    from usdbrdf.cluster.options import ClusterOptions as ClusterOptions
+    from usdbrdf.cluster.session import workers_of as workers_of
     from usdbrdf.delivery.package import package as package
     from usdbrdf.delivery.publish import publish as publish
     from usdbrdf.evaluation.compare_assets import compare as compare
@@ -52,6 +54,8 @@ _HOMES = {
     ),
     "usdbrdf.pipeline": ("convert", "fit", "ingest", "shade", "texture", "working_on"),
     "usdbrdf.advice.advise": ("advise",),
+    "usdbrdf.cluster.options": ("ClusterOptions",),
+    "usdbrdf.cluster.session": ("workers_of",),
     "usdbrdf.delivery.package": ("package",),
     "usdbrdf.delivery.publish": ("publish",),
     "usdbrdf.evaluation.compare_assets": ("compare",),

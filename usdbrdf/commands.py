@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from usdbrdf import options
+from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.command_kinds import Locking, OnCapture, Run, RunOnCapture, Talking, Waiting
 from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
@@ -47,6 +48,7 @@ class Convert(EditOptions, RunOnCapture):
     """Do all four steps: capture in, USD asset out."""
 
     options: options.ConvertOptions
+    cluster: ClusterOptions
 
     def run(self) -> int:
         with loading():
@@ -54,6 +56,7 @@ class Convert(EditOptions, RunOnCapture):
         results = convert(
             self.capture, self.output, self.options, adapter=self.adapter, plugins=self.plugins,
             hand_edits=self.hand_edits, wait_s=self.wait_s, without_lock=self.without_lock,
+            cluster=self.cluster,
         )  # fmt: skip
         return self.report(results, self.output)
 
@@ -128,9 +131,10 @@ class _RunOnAsset(Run):
     def run(self) -> int:
         with loading():
             from usdbrdf import pipeline
-        name = type(self).__name__.lower()
-        with self.working_on(self.asset) as asset:
-            done = getattr(pipeline, name)(asset, getattr(self, name))
+        name, cluster = type(self).__name__.lower(), getattr(self, "cluster", None)
+        with self.working_on(self.asset) as asset, pipeline.workers_of(cluster) as workers:
+            own = [workers] if cluster else []
+            done = getattr(pipeline, name)(asset, getattr(self, name), *own)
         return self.report({name: done}, self.asset)
 
 
@@ -144,12 +148,14 @@ class Shade(_RunOnAsset):
     """Trace irradiance S, divide for albedo, find the emitters."""
 
     shade: options.ShadeOptions
+    cluster: ClusterOptions
 
 
 class Fit(_RunOnAsset):
     """Fit roughness and specular of each object."""
 
     fit: options.FitOptions
+    cluster: ClusterOptions
 
 
 class _WithAsset(Waiting, Talking):
@@ -308,8 +314,7 @@ class Validate(Waiting):
         with loading():
             from usdbrdf.asset.layout import Asset
             from usdbrdf.validation.validate import has_errors, validate, write_cures
-        asset = Asset.made(self.asset)
-        root = asset.root_layer
+        root = (asset := Asset.made(self.asset)).root_layer
         with self.reading(root):
             findings = validate(root)
             cured = write_cures(asset, self.fix) if self.fix is not None else None

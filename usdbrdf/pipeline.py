@@ -22,18 +22,21 @@ from dataclasses import replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, ParamSpec
 
 from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
+from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.cluster.session import workers_of as workers_of
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.job.first_run import compiling_beside
 from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
+from usdbrdf.job.units import HERE, Workers
 from usdbrdf.options import ConvertOptions, HandEdits, ShadeOptions, TextureOptions
 from usdbrdf.tasks.fit import fit as fit_task
 from usdbrdf.tasks.fit import refuse_one_frame
@@ -56,6 +59,8 @@ def convert(
     hand_edits: HandEdits = "refuse",
     wait_s: float = 0.0,
     without_lock: bool = False,
+    cluster: ClusterOptions | None = None,
+    client: Any = None,
 ) -> dict[str, TaskResult]:
     """Do all of it: capture in, layered USD asset out; steps that are done already are kept.
 
@@ -65,6 +70,7 @@ def convert(
     adapter   name of the one that reads the capture; None: the first that recognises it, among
               those of other packages too if ``plugins``
     hand_edits, wait_s, without_lock   as of ``working_on``
+    cluster, client   as of ``workers_of``
     returns   what each step found, by name
 
     Raises UsdBrdfError (see ``usdbrdf.errors``); an interrupted or failed call leaves what was
@@ -75,12 +81,12 @@ def convert(
     if len(paths) > 1:
         refuse_one_frame(chosen.fit)
     working = working_on(output, hand_edits=hand_edits, wait_s=wait_s, without_lock=without_lock)
-    with working as asset, compiling_beside():
+    with working as asset, compiling_beside(), workers_of(cluster, client) as workers:
         return {
             "ingest": ingest([*map(Path, paths)], asset, chosen.ingest, adapter, plugins=plugins),
             "texture": texture(asset, chosen.texture),
-            "shade": shade(asset, chosen.shade),
-            "fit": fit(asset, chosen.fit),
+            "shade": shade(asset, chosen.shade, workers),
+            "fit": fit(asset, chosen.fit, workers),
         }
 
 
@@ -149,8 +155,8 @@ def _texture(asset: Asset, options: TextureOptions) -> TaskResult:
     return replace(found, reran=shared.reran or found.reran)
 
 
-def _shade(asset: Asset, options: ShadeOptions) -> TaskResult:
-    return in_each_lighting(shade_task, asset, options)
+def _shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskResult:
+    return in_each_lighting(shade_task, asset, options, workers)
 
 
 ingest = _on_its_folder(ingest_task)

@@ -170,7 +170,7 @@ class FrameReader:
     ``most_bytes`` decoded, are read once and kept, the others read each time."""
 
     def __init__(self, frames: Frames, most_bytes: int) -> None:
-        self.frames = frames
+        self.frames, self.most_bytes = frames, most_bytes
         sizes = _BYTES_OF_PIXEL * frames.resolution.prod(axis=1, dtype=np.int64)
         self._num_kept = int(np.searchsorted(sizes.cumsum(), most_bytes, side="right"))
         self._kept: dict[int, FramePixels] = {}

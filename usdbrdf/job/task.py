@@ -37,6 +37,7 @@ from usdbrdf.files.atomic import (
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.files.paths import inside
 from usdbrdf.job.memory import give_back_freed
+from usdbrdf.job.progress import progress
 from usdbrdf.job.stamp import (
     STATE_FOLDER,
     Stamp,
@@ -49,6 +50,7 @@ from usdbrdf.job.stamp import (
     why_rerun,
     write_stamp,
 )
+from usdbrdf.job.units import HERE, Unit, Workers
 from usdbrdf.model.arrays import Array
 
 # A checkpoint's name: key, index of a running computation's state, hash of its bytes.
@@ -76,9 +78,11 @@ class TaskRun:
     as none. Of the numbered states of one running computation only the newest is kept.
     """
 
-    def __init__(self, asset: Path, name: str, folder: Path) -> None:
+    def __init__(self, asset: Path, name: str, folder: Path, workers: Workers = HERE) -> None:
         self.asset = asset
         self.name = name
+        self._workers = workers
+        self._for_workers = folder / "shared"
         self.staged = folder / "staged"
         self.outputs: list[str] = []
         self.once: list[str] = []
@@ -157,6 +161,28 @@ class TaskRun:
         self.save(key, arrays)
         return arrays
 
+    def units(
+        self,
+        unit: Unit,
+        shared: Any,
+        pieces: Mapping[str, Any],
+        *,
+        label: str,
+        noun: str,
+        at_a_time: int = 1,
+    ) -> list[dict[str, Array]]:
+        """What ``unit`` returns for each of the ``pieces``, which their keys name as checkpoints;
+        those that are missing are done by this run's workers (see ``job.units``)."""
+        stored = {key: self.checkpoint_if(key) for key in pieces}
+        found = {key: arrays for key, arrays in stored.items() if arrays is not None}
+        rest = {key: piece for key, piece in pieces.items() if key not in found}
+        if rest:
+            results = self._workers.results(unit, shared, rest, self._for_workers, at_a_time)
+            for key, arrays in progress(results, total=len(rest), label=label, unit=noun):
+                self.save(key, arrays)
+                found[key] = dict(arrays)
+        return [found[key] for key in pieces]
+
     def checkpoint_if(self, key: str, index: int | None = None) -> dict[str, Array] | None:
         """The arrays saved under ``key`` by this or an interrupted run, bit for bit, or None."""
         key = self._part + key
@@ -219,6 +245,7 @@ def run_task(
     parameters: Mapping[str, Any],
     inputs: Mapping[str, str],
     work: Callable[[TaskRun], dict[str, Any]],
+    workers: Workers = HERE,
 ) -> TaskResult:
     """Bring what one task makes of an asset up to date.
 
@@ -226,6 +253,7 @@ def run_task(
     parameters   all options that its outputs depend on (JSON)
     inputs       label -> SHA-256 of all that it reads
     work         writes to ``TaskRun.output`` places and returns a summary (JSON)
+    workers      who does its units of work; no output depends on that
 
     A run that was interrupted and resumed gives the same bytes as one that was not, provided that
     ``work`` depends on nothing but parameters, inputs and checkpoints.
@@ -257,7 +285,7 @@ def run_task(
         if noted and interrupted and _can_publish(asset, folder / "staged", noted):
             _publish(asset, folder, noted, order)
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
-        run = TaskRun(asset, name, folder)
+        run = TaskRun(asset, name, folder, workers)
         summary = json.loads(json_text(work(run)))
         run.gather()
         for relative in (*run.outputs, *run.once):

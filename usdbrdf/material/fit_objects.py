@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,6 +17,7 @@ from usdbrdf.ahead import ahead
 from usdbrdf.files.frames import FramePixels, FrameReader
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
+from usdbrdf.job.units import Unit
 from usdbrdf.material.fit_lobe import first_seed
 from usdbrdf.material.fit_target import (
     FrameCounts,
@@ -229,17 +229,37 @@ def fitted_by_likelier_lobe(
     kinds = [PAPER]
     if options.method == "views":
         kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
-        looks = list(first_looks(run, lightings, reader, kinds, options.seed))
+        looks = list(first_looks(run, lightings, reader, kinds, options))
     clearer = sum(look.log_ratio for look in looks if look)
     paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
     lobe = PAPER if paper else DIELECTRIC
 
-    def work(i: int) -> dict[str, Array]:
-        word = asked.get(i, "")
-        return fit_object(lobe, lightings, reader, i, options, looks[i], asked=word).arrays()
-
-    found = _of_each_object(run, "object", sizes, work, label="fit")
+    given = _Scene(tuple(lightings), reader, options, (lobe,))
+    pieces = [(i, looks[i], asked.get(i, "")) for i in range(len(sizes))]
+    found = _of_each_object(run, "object", sizes, _fit, given, pieces, label="fit")
     return lobe, [ObjectFit.from_arrays(one).rounded() for one in found]
+
+
+class _Scene(NamedTuple):
+    """What objects are fitted in, and the kinds of lobe that are."""
+
+    lightings: tuple[Lighting, ...]
+    reader: FrameReader
+    options: FitOptions
+    kinds: tuple[int, ...]
+
+
+def _fit(scene: _Scene, piece: tuple[int, FirstLook | None, str]) -> dict[str, Array]:
+    index, look, asked = piece
+    lightings, reader, options, (lobe,) = scene
+    return fit_object(lobe, lightings, reader, index, options, look, asked=asked).arrays()
+
+
+def _look_at(scene: _Scene, index: int) -> dict[str, Array]:
+    sampled, number = _sampled(scene.lightings, scene.reader, index, MIXTURE)
+    fitted = fit_kinds(sampled, scene.kinds, first_seed(scene.options.seed)) if sampled else {}
+    lobes = {kind: one.lobe for kind, one in fitted.items()}
+    return FirstLook(lobes, number, sum(one.log_ratio for one in fitted.values())).arrays()
 
 
 def first_looks(
@@ -247,18 +267,13 @@ def first_looks(
     lightings: Sequence[Lighting],
     reader: FrameReader,
     kinds: Sequence[int],
-    seed: int,
+    options: FitOptions,
 ) -> list[FirstLook]:
     """Every object fitted once with the first kind of lobe, and where that shows with the others,
     whose rays are the same."""
-
-    def work(i: int) -> dict[str, Array]:
-        sampled, number = _sampled(lightings, reader, i, MIXTURE)
-        fitted = fit_kinds(sampled, kinds, first_seed(seed)) if sampled else {}
-        lobes = {kind: one.lobe for kind, one in fitted.items()}
-        return FirstLook(lobes, number, sum(one.log_ratio for one in fitted.values())).arrays()
-
-    found = _of_each_object(run, "look", _sizes(lightings), work, label="fit: first look")
+    given, sizes = _Scene(tuple(lightings), reader, options, tuple(kinds)), _sizes(lightings)
+    pieces = range(len(sizes))
+    found = _of_each_object(run, "look", sizes, _look_at, given, pieces, label="fit: first look")
     return [FirstLook.from_arrays(one) for one in found]
 
 
@@ -266,30 +281,22 @@ def _of_each_object(
     run: TaskRun,
     name: str,
     sizes: Sequence[int],
-    work: Callable[[int], dict[str, Array]],
+    unit: Unit,
+    given: _Scene,
+    pieces: Sequence[Any],
     label: str,
 ) -> list[dict[str, Array]]:
-    """``work`` of all objects, going on where an interrupted run was; the largest first, so that
-    none of them is worked on alone at the end."""
-    count = len(sizes)
-    stored = {i: run.checkpoint_if(f"{name}-{i}") for i in range(count)}
-    done = {i: found for i, found in stored.items() if found is not None}
-    with (
-        # With all cores for each object's small matrices BLAS's threads only wait for each other.
-        threadpool_limits(limits=1, user_api="blas"),
-        ThreadPoolExecutor(max_workers=_AT_A_TIME) as pool,
-    ):
-        order = sorted(range(count), key=lambda i: -sizes[i])
-        jobs = {pool.submit(work, i): i for i in order if i not in done}
-        try:
-            for job in progress(as_completed(jobs), total=len(jobs), label=label, unit="objects"):
-                i, found = jobs[job], job.result()
-                run.save(f"{name}-{i}", found)
-                done[i] = found
-        finally:
-            for job in jobs:
-                job.cancel()
-    return [done[i] for i in range(count)]
+    """A unit of work for each object; the largest first, so that none is worked on alone at the
+    end."""
+    order = sorted(range(len(sizes)), key=lambda i: -sizes[i])
+    # With all cores for each object's small matrices BLAS's threads only wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        found = run.units(
+            unit, given, {f"{name}-{i}": pieces[i] for i in order},
+            label=label, noun="objects", at_a_time=_AT_A_TIME,
+        )  # fmt: skip
+    of_object = dict(zip(order, found, strict=True))
+    return [of_object[i] for i in range(len(sizes))]
 
 
 def _sizes(lightings: Sequence[Lighting]) -> list[int]:

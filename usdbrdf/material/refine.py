@@ -23,7 +23,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
@@ -46,10 +46,11 @@ from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import ByAngle, irradiance_at
 from usdbrdf.transport.let_through import share_let_through, share_seen, table_let_through
-from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
 from usdbrdf.transport.sunlight import sunlight
+from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
@@ -73,6 +74,32 @@ class Lobes:
         return Lobes(self.phi[index], self.psi[index], self.conducts[index])
 
 
+class _Change(NamedTuple):
+    """What of the light is other than traced before: ``radiance`` by its texture, ``lights`` where
+    that shows, and the specular light of ``lobes``."""
+
+    lit: LitScene
+    radiance: SurfaceTexture
+    lights: Lights
+    lobes: Lobes
+    sampling: Sampling
+
+
+def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Array]:
+    """By how much S of some texels is other."""
+    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
+    position, normal = texels.position[index], texels.normal[index]
+    diffuse = irradiance_at(
+        lit.rays, given.radiance, given.lights, black_environment(), position, normal, patch,
+        given.sampling, lit.diagonal_m,
+    )  # fmt: skip
+    specular = specular_irradiance(
+        lit, position, normal, index, lobes.phi, lobes.psi,
+        rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=given.sampling.seed,
+    )  # fmt: skip
+    return {"change": diffuse.mean + specular}
+
+
 def refined_irradiance(
     run: TaskRun,
     lit: LitScene,
@@ -89,21 +116,42 @@ def refined_irradiance(
     lights = lights_from_radiance(lit.scene, texels, np.abs(change))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
 
-    def tile(index: Array, patch: Array) -> dict[str, Array]:
-        position, normal = texels.position[index], texels.normal[index]
-        diffuse = irradiance_at(
-            lit.rays, texture, lights, black_environment(), position, normal, patch, sampling,
-            lit.diagonal_m,
-        )  # fmt: skip
-        specular = specular_irradiance(
-            lit, position, normal, index, lobes.phi, lobes.psi,
-            rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed,
-        )  # fmt: skip
-        return {"change": diffuse.mean + specular}
-
-    found = by_tiles(run, texels, "refined", "fit: shade", tile)["change"]
+    given = _Change(lit, texture, lights, lobes, sampling)
+    found = by_tiles(run, texels, "refined", "fit: shade", _changed_irradiance, given)["change"]
     refined = np.maximum(traced + np.asarray(found, np.float32), 0)
     return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
+
+
+class _Scattering(NamedTuple):
+    """What light goes in by: ``radiance`` of all surfaces by its texture, ``lights`` where that is
+    bright, and by how much it ``differs`` from S at each angle (num_objects, C) of the objects that
+    are ``passing`` (num_objects,) some of it; owner (T,): the object of each texel."""
+
+    lit: LitScene
+    radiance: SurfaceTexture
+    lights: Lights
+    lobes: Lobes
+    sampling: Sampling
+    differs: Float
+    passing: Bool
+    owner: Int
+
+
+def _scattered(given: _Scattering, index: Long, patch: Int) -> dict[str, Array]:
+    """By how much the light that some texels scatter differs from S."""
+    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
+    owner = given.owner[index]
+    found, own = np.zeros((len(index), 3), np.float32), given.passing[owner]
+    inner, surface = index[own], owner[own]
+    if len(inner):
+        normal, sun = texels.normal[inner], lit.environment.sun
+        found[own] = irradiance_at(
+            lit.rays, given.radiance, given.lights, lit.environment, texels.position[inner], normal,
+            patch[own], given.sampling, lit.diagonal_m, by_angle=ByAngle(given.differs, surface),
+        ).mean  # fmt: skip
+        of_sun = share_let_through(lobes.phi[surface], lobes.psi[surface], normal @ sun.direction)
+        found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, given.sampling.seed)
+    return {"differs": found}
 
 
 def let_through_surfaces(
@@ -112,33 +160,21 @@ def let_through_surfaces(
     """By how much (T, 3), W/m^2, the light that dielectrics scatter below their surface differs
     from S: they let through what comes from the front, and mostly reflect what grazes them; see
     ``let_through``. light (T, 3): what all surfaces send out, W/(m^2 sr)."""
-    texels, owner, seed = lit.texels, lit.texels.object_index(), seed ^ _SEED
+    texels = lit.texels
     passing = ~lobes.conducts & (lobes.psi.mean(axis=1) > 0) & (lit.lobe == DIELECTRIC)
     if not passing.any():
         return np.zeros((len(texels), 3), np.float32)
-    differs = table_let_through(lobes.phi, lobes.psi) - 1
-    texture, lights = (
+    given = _Scattering(
+        lit,
         lit.radiance.showing(texels, light),
         lights_from_radiance(lit.scene, texels, light),
+        lobes,
+        Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
+        table_let_through(lobes.phi, lobes.psi) - 1,
+        passing,
+        texels.object_index(),
     )
-    sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
-
-    def tile(index: Array, patch: Array) -> dict[str, Array]:
-        found, own = np.zeros((len(index), 3), np.float32), passing[owner[index]]
-        inner, surface = index[own], owner[index[own]]
-        if len(inner):
-            normal, sun = texels.normal[inner], lit.environment.sun
-            found[own] = irradiance_at(
-                lit.rays, texture, lights, lit.environment, texels.position[inner], normal,
-                patch[own], sampling, lit.diagonal_m, by_angle=ByAngle(differs, surface),
-            ).mean  # fmt: skip
-            of_sun = share_let_through(
-                lobes.phi[surface], lobes.psi[surface], normal @ sun.direction
-            )
-            found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, sampling.seed)
-        return {"differs": found}
-
-    return by_tiles(run, texels, "let-through", "fit: surfaces", tile)["differs"]
+    return by_tiles(run, texels, "let-through", "fit: surfaces", _scattered, given)["differs"]
 
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames

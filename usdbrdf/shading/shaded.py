@@ -8,17 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import ndimage
 
 from usdbrdf import calibration
-from usdbrdf.job.progress import progress, say
+from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map
@@ -28,9 +27,10 @@ from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
-from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlight
+from usdbrdf.transport.surface_texture import SurfaceTexture
 
 EMITTER_RATIO = calibration.number("emitters.ratio")
 _WHOLE_LAMP = calibration.number("emitters.whole_lamp")
@@ -119,25 +119,62 @@ def _connected(texels: Texels, index: int, shines: Bool) -> Bool:
     return np.asarray(large[label.ravel()[local]], np.bool_)
 
 
-Arrays: TypeAlias = dict[str, Array]
 # Irradiance is traced and saved in pieces of this many texels: what a kill can cost, and what
 # bounds the memory of the ray buffers.
 _TILE = 1 << 15
+TileTrace: TypeAlias = Callable[[Any, Any, Any], Mapping[str, Array]]
+
+
+class _Tiles(NamedTuple):
+    """What is traced of texels, in their ``order`` (T,) of ``tiles_of_texels`` with the ``patch``
+    (T,) of each: ``trace`` is given ``scene``, and numbers and patches of some."""
+
+    trace: TileTrace
+    scene: Any
+    order: Long
+    patch: Int
+
+
+def _tile(tiles: _Tiles, ends: tuple[int, int]) -> Mapping[str, Array]:
+    part = slice(*ends)
+    return tiles.trace(tiles.scene, tiles.order[part], tiles.patch[part])
 
 
 def by_tiles(
-    run: TaskRun, texels: Texels, name: str, label: str, trace: Callable[[Array, Array], Arrays]
-) -> Arrays:
-    """Arrays of all texels, of which ``trace`` finds those of one tile after the other, given their
-    numbers and patches; each is kept under ``name``, for a run that goes on after a kill."""
+    run: TaskRun, texels: Texels, name: str, label: str, trace: TileTrace, scene: Any
+) -> dict[str, Array]:
+    """Arrays of all texels, of which ``trace``, a function at the top of a module, finds those of a
+    tile, given the ``scene``, their numbers and patches; each is kept under ``name``."""
     order, patch = tiles_of_texels(texels)
-    tiles = whole_tiles(patch, _TILE)
-    found = [
-        run.checkpoint(f"{name}-{number}", partial(trace, order[part], patch[part]))
-        for number, part in enumerate(progress(tiles, total=len(tiles), label=label, unit="tiles"))
-    ]
+    pieces = {
+        f"{name}-{number}": (part.start, part.stop)
+        for number, part in enumerate(whole_tiles(patch, _TILE))
+    }
+    tiles = _Tiles(trace, scene, order, patch)
+    found = run.units(_tile, tiles, pieces, label=label, noun="tiles")
     back = np.argsort(order)
     return {key: np.concatenate([some[key] for some in found])[back] for key in found[0]}
+
+
+class _LitTexels(NamedTuple):
+    """What irradiance is traced in; dark (T,) W/m^2, see ``irradiance_at``."""
+
+    surface: TexturedScene
+    radiance: SurfaceTexture
+    lights: Lights
+    environment: Environment
+    sampling: Sampling
+    dark: Float
+
+
+def _irradiance(given: _LitTexels, index: Long, patch: Int) -> dict[str, Array]:
+    surface, texels = given.surface, given.surface.texels
+    found = irradiance_at(
+        surface.rays, given.radiance, given.lights, given.environment, texels.position[index],
+        texels.normal[index], patch, given.sampling, surface.diagonal_m, given.dark[index],
+    )  # fmt: skip
+    mean = found.mean + sunlight(surface, index, given.environment.sun, given.sampling.seed)
+    return {**vars(found), "mean": mean}
 
 
 def trace_irradiance(
@@ -150,16 +187,8 @@ def trace_irradiance(
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)
     say(f"shade: {len(texels):,} texels, {len(lights.face):,} bright triangles")
-
-    def tile(index: Array, patch: Array) -> Arrays:
-        found = irradiance_at(
-            surface.rays, radiance, lights, environment, texels.position[index],
-            texels.normal[index], patch, sampling, surface.diagonal_m, dark[index],
-        )  # fmt: skip
-        mean = found.mean + sunlight(surface, index, environment.sun, sampling.seed)
-        return {**vars(found), "mean": mean}
-
-    return Irradiance(**by_tiles(run, texels, "tile", "shade", tile))
+    given = _LitTexels(surface, radiance, lights, environment, sampling, dark)
+    return Irradiance(**by_tiles(run, texels, "tile", "shade", _irradiance, given))
 
 
 def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:

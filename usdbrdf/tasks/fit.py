@@ -17,6 +17,7 @@ from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.errors import UsageError
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.job.units import HERE, Workers
 from usdbrdf.material.fit_objects import Lighting, fitted_by_likelier_lobe, survey_frames
 from usdbrdf.material.refine import frame_reader
 from usdbrdf.model.mesh import LEFT_OUT, OF_FIT
@@ -40,7 +41,7 @@ def refuse_one_frame(options: FitOptions) -> None:
         )
 
 
-def fit(asset: Asset, options: FitOptions) -> TaskResult:
+def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResult:
     """Choose target frames, fit every object, write material.usda and, of views, refined maps; of
     several lightings one material of all, and the maps of each."""
     maps = [AssetMaps(open_weaker(one, "material")) for one in asset.in_each_lighting]
@@ -105,4 +106,4 @@ def fit(asset: Asset, options: FitOptions) -> TaskResult:
         write_interface(run.output(f"layers/{asset.interface('material').name}"), layer)
         return {"objects": {item.identifier: item.summary for item in objects}}
 
-    return task.run(work)
+    return task.run(work, workers)

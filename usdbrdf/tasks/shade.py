@@ -17,6 +17,7 @@ from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
 from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.job.units import HERE, Workers
 from usdbrdf.model.mesh import LAMP, OF_SHADE
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
@@ -26,7 +27,7 @@ from usdbrdf.tasks.task import Task, warned
 from usdbrdf.transport.denoise import chosen_filter
 
 
-def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
+def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
     lightmap_filter = chosen_filter(options.denoise)
@@ -74,7 +75,7 @@ def shade(asset: Asset, options: ShadeOptions) -> TaskResult:
         summary = shaded.summary(identifiers) | found
         return summary | ({"outside": published.summary} if published else {})
 
-    return task.run(work)
+    return task.run(work, workers)
 
 
 def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> list[ShadedObject]:

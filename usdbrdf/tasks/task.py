@@ -4,32 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
+from usdbrdf.job.units import HERE, Workers
 
-Options = TypeVar("Options")
 # The input that later steps follow and a task only hands on: a layer that told of it would change
 # with it, and all steps after that.
 HANDED_ON = "directives"
 
 
-def in_each_lighting(
-    task: Callable[[Asset, Options], TaskResult], asset: Asset, options: Options
-) -> TaskResult:
-    """What a task finds that is done for each lighting apart: of several under their names, with
-    all their warnings."""
+def in_each_lighting(task: Callable[..., TaskResult], asset: Asset, *given: Any) -> TaskResult:
+    """What a task finds that is done for each lighting apart, each time with what is ``given``: of
+    several under their names, with all their warnings."""
     several = asset.in_each_lighting
     if not several[0].lighting:
-        return task(asset, options)
+        return task(asset, *given)
     found = {}
     for one in several:
         say(f"{task.__name__}: in the lighting {one.lighting}")
-        found[one.lighting] = task(one, options)
+        found[one.lighting] = task(one, *given)
     warnings = [w for each in found.values() for w in each.summary.get("warnings", ())]
     ran = [each for each in found.values() if each.reran]
     return TaskResult(
@@ -58,7 +56,7 @@ class Task:
     parameters: Mapping[str, Any]
     inputs: Mapping[str, str]
 
-    def run(self, work: Callable[[TaskRun], dict[str, Any]]) -> TaskResult:
+    def run(self, work: Callable[[TaskRun], dict[str, Any]], workers: Workers = HERE) -> TaskResult:
         """Do the work unless it is done already (see ``usdbrdf.job.task``); OwnershipConflict in an
         asset of an old layout."""
         refuse_old_layout(self.asset)
@@ -69,6 +67,7 @@ class Task:
             parameters=self.parameters,
             inputs=self.inputs,
             work=work,
+            workers=workers,
         )
 
     @property

@@ -18,7 +18,6 @@ Both are unbiased for the piecewise bilinear L_d that they are given, but for th
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from usdbrdf.kernel import loop
+from usdbrdf.kernel import loop, num_threads
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.texels import Texels
 from usdbrdf.options import Sampling
@@ -187,7 +186,7 @@ def irradiance_at(
         )  # fmt: skip
         return _irradiance_of(points, light, rounds, sampling.standard_error)
 
-    threads = os.cpu_count() or 1
+    threads = num_threads()
     count = min(_POINTS, max(1, len(tile) // (4 * threads)))
     with ThreadPoolExecutor(max_workers=threads) as pool:
         found = list(pool.map(traced, whole_tiles(tile, count)))

@@ -6,7 +6,6 @@ Rays are laid out in memory as Embree's headers say; no function tells these off
 from __future__ import annotations
 
 import ctypes
-import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
@@ -18,7 +17,7 @@ import numpy as np
 from numba import types
 
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
-from usdbrdf.kernel import loop
+from usdbrdf.kernel import loop, num_threads
 from usdbrdf.model.arrays import Bool, Float, Int, Long
 
 _TRIANGLES = 0  # RTC_GEOMETRY_TYPE_TRIANGLE
@@ -266,7 +265,7 @@ class RayScene:
         self.points: Float = padded[: 3 * len(points)].reshape(-1, 3)
         self.points[:] = points
         self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
-        self._pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(max_workers=num_threads())
         embree, device = _embree(), _device()
         mesh = embree.rtcNewGeometry(device, _TRIANGLES)
         for kind, form, values in (

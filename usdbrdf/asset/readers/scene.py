@@ -74,7 +74,8 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
         if fact.samples:
             read[field] = np.array([attribute.Get(time) for time in times], np.float64)
         else:
-            read[field] = attribute.Get()
+            value = attribute.Get()
+            read[field] = tuple(value) if fact.type == "double2" else value
     read["resolution"] = read["resolution"].astype(np.int32)
     image = camera.GetPrim().GetAttribute(_IMAGE)
     # Without the layer that tells where they lie, they have numbers.

@@ -1,0 +1,210 @@
+"""Units of work on other processes: the same bytes, whatever happens to those."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+import usdbrdf.shading.shaded
+from tests.scenes import make_capture
+from usdbrdf import pipeline
+from usdbrdf.asset.layout import Asset
+from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.cluster.session import workers_of
+from usdbrdf.errors import EnvironmentFailure, UsageError
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.job.task import TaskRun
+from usdbrdf.options import FitOptions, IngestOptions, Sampling, ShadeOptions, TextureOptions
+
+pytest.importorskip("distributed", reason="the extra cluster is not installed")
+
+SHADE = ShadeOptions(sampling=Sampling(max_rays=64), denoise="none")
+FIT = FitOptions(max_pixels=60)
+
+
+@pytest.fixture(autouse=True)
+def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough units for something to happen in between."""
+    monkeypatch.setattr(usdbrdf.shading.shaded, "_TILE", 128)
+
+
+@pytest.fixture(scope="module")
+def textured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cluster")
+    capture = make_capture(folder / "capture", frames=8)
+    with pipeline.working_on(folder / "room") as asset:
+        pipeline.ingest([capture.folder], asset, IngestOptions())
+        pipeline.texture(asset, TextureOptions(texel_size=0.15))
+    return folder / "room"
+
+
+def contents(asset: Path) -> dict[str, str]:
+    return {
+        path.relative_to(asset).as_posix(): sha256_of(path)
+        for path in sorted(asset.rglob("*"))
+        if path.is_file() and ".usdbrdf" not in path.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def alone(textured: Path) -> dict[str, str]:
+    """What one process makes."""
+    asset = copied(textured, textured.parent.with_name("alone"))
+    pipeline.shade(asset, SHADE)
+    pipeline.fit(asset, FIT)
+    return contents(asset.folder)
+
+
+@pytest.fixture
+def copy(textured: Path, tmp_path: Path) -> Asset:
+    return copied(textured, tmp_path / "copy")
+
+
+def copied(asset: Path, to: Path) -> Asset:
+    """With its capture, which lies beside it."""
+    return Asset.at(shutil.copytree(asset.parent, to) / asset.name)
+
+
+def workers_on_this_machine() -> list[int]:
+    """Their processes' numbers."""
+    children = psutil.Process().children(recursive=True)
+    return [child.pid for child in children if "spawn_main" in " ".join(child.cmdline())]
+
+
+def strike(monkeypatch: pytest.MonkeyPatch, number: int, blow: Callable[[], object]) -> None:
+    """Do that once so many units of work are stored."""
+    save, count = TaskRun.save, iter(range(1, 1 << 30))
+
+    def and_strike(*given: object, **named: object) -> None:
+        save(*given, **named)  # type: ignore[arg-type]
+        if next(count) == number:
+            blow()
+
+    monkeypatch.setattr(TaskRun, "save", and_strike)
+
+
+def test_the_bytes_are_the_same_though_workers_die_and_hang(
+    copy: Asset,
+    alone: dict[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    chosen = ClusterOptions(workers=2, unit_limit=4)
+    with workers_of(chosen) as workers:
+        strike(monkeypatch, 3, lambda: os.kill(workers_on_this_machine()[0], signal.SIGKILL))
+        pipeline.shade(copy, SHADE, workers)
+        assert all(
+            connection.laddr.ip == "127.0.0.1"
+            for connection in psutil.Process().net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        )
+        pids = workers_on_this_machine()
+        assert len(pids) == 2
+        monkeypatch.undo()
+        monkeypatch.setattr(usdbrdf.shading.shaded, "_TILE", 128)
+        strike(monkeypatch, 1, lambda: os.kill(pids[0], signal.SIGSTOP))
+        pipeline.fit(copy, FIT, workers)
+    assert contents(copy.folder) == alone
+    assert "[cluster.hangs]" in capfd.readouterr().err
+    assert not workers_on_this_machine()
+    assert not list(copy.folder.glob(".usdbrdf/work/*"))
+
+
+def test_workers_of_other_code_are_refused_in_a_sentence(
+    copy: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from usdbrdf.cluster import engine
+
+    monkeypatch.setattr(engine, "arithmetic", lambda: {"usdbrdf's code": "another"})
+    with (
+        workers_of(ClusterOptions(workers=1)) as workers,
+        pytest.raises(EnvironmentFailure, match=r"code \w+ instead of another.*cluster.stranger"),
+    ):
+        pipeline.shade(copy, SHADE, workers)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Address of a scheduler that is a process of its own, with a worker; and that process."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    port = address.rpartition(":")[2]
+
+    def started(program: str, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{program}", *words, "--no-dashboard"]
+        nowhere = subprocess.DEVNULL
+        return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, cwd=tmp_path)
+
+    scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", port)
+    worker = started("dask_worker", address, "--nthreads", "1", "--no-nanny")
+    try:
+        yield address, scheduler
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait()
+
+
+def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
+    copy: Asset,
+    alone: dict[str, str],
+    cluster: tuple[str, subprocess.Popen[bytes]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    address, scheduler = cluster
+    strike(monkeypatch, 3, scheduler.kill)
+    with (
+        workers_of(ClusterOptions(scheduler=address)) as workers,
+        pytest.raises(EnvironmentFailure, match=r"scheduler is gone.*\[cluster.scheduler\]"),
+    ):
+        pipeline.shade(copy, SHADE, workers)
+    assert len(list(copy.folder.glob(".usdbrdf/work/shade-*/checkpoints/tile-*"))) >= 1
+    with (
+        pytest.raises(EnvironmentFailure, match=r"no scheduler answers"),
+        workers_of(ClusterOptions(scheduler=address)) as workers,
+    ):
+        pipeline.shade(copy, SHADE, workers)
+    pipeline.shade(copy, SHADE)
+    pipeline.fit(copy, FIT)
+    assert contents(copy.folder) == alone
+
+
+def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    import distributed
+
+    from usdbrdf.cluster import session
+
+    tries = []
+
+    def dies(**_: object) -> None:
+        tries.append(1)
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(distributed, "LocalCluster", dies)
+    with (
+        pytest.raises(EnvironmentFailure, match=r"do not start.*\[cluster.workers\]"),
+        session._local_cluster(2),
+    ):
+        pass
+    assert len(tries) == 3
+
+
+def test_workers_of_two_kinds_exclude_each_other() -> None:
+    with pytest.raises(UsageError, match="exclude each other"):
+        ClusterOptions(workers=2, scheduler="tcp://127.0.0.1:8786")
+
+
+def test_one_process_needs_no_dask() -> None:
+    told = "import sys, usdbrdf.pipeline; print({'dask', 'distributed'} & {*sys.modules})"
+    found = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "set()"

@@ -1,0 +1,187 @@
+"""Dask does units of work: which go where, and what becomes of those whose worker dies or hangs.
+
+Neither arrays nor code go through the scheduler: it hands out names. A unit may be done several
+times and gives the same bytes each time, so nothing depends on which of them is heard of.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar
+
+from distributed import Client, Future, KilledWorker
+
+from usdbrdf.cluster.described import described
+from usdbrdf.cluster.store import Store
+from usdbrdf.cluster.unit import Stranger, arithmetic, done
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.job.progress import say
+from usdbrdf.job.units import Unit
+from usdbrdf.model.arrays import Array
+
+T = TypeVar("T")
+# Seconds: between looks at what has not come back; for which workers are waited for; in which a
+# name comes from a worker; and in which one that hangs is to be gone.
+_LOOK, _NO_WORKERS, _NAME, _STOPPING = 1.0, 120.0, 60.0, 30.0
+# How often a unit may fail with its worker, or for what a machine lacks, until that is believed.
+_TRIES = 5
+# What calls of a client raise where the scheduler is gone.
+_GONE = (OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
+
+
+@dataclass
+class _Sent:
+    """A unit that is out: how often it failed, and since when it is out."""
+
+    key: str
+    failed: int = 0
+    since: float = 0.0
+
+
+class DaskWorkers:
+    """Does units of work on the workers of a Dask cluster."""
+
+    def __init__(self, client: Client, shared_folder: Path | None, unit_limit_s: float) -> None:
+        """shared_folder: which all workers see under this name, None: the task's own, in the asset;
+        unit_limit_s: seconds after which a worker is taken to hang at a unit."""
+        self._client, self._folder, self._limit = client, shared_folder, unit_limit_s
+        self._address = str(client.scheduler.address)
+
+    def results(
+        self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
+    ) -> Iterator[tuple[str, Mapping[str, Array]]]:
+        """See ``job.units.Workers``. Raises EnvironmentFailure where scheduler or workers are gone
+        or workers are not like this process, and whatever the unit raises."""
+        store = Store((self._folder or folder).resolve())
+        work = store.keep_document(
+            {
+                "arithmetic": arithmetic(),
+                "unit": described(unit, store.keep),
+                "shared": described(shared, store.keep),
+            }
+        )
+        told = {key: described(piece, store.keep) for key, piece in pieces.items()}
+        waiting = [_Sent(key) for key in reversed(told)]
+        out: dict[Future, _Sent] = {}
+        back: SimpleQueue[Future] = SimpleQueue()
+        try:
+            while waiting or out:
+                # One more than can be worked on is out, so that its time tells how long it takes.
+                while waiting and len(out) <= self._at_once():
+                    sent = waiting.pop()
+                    future = self._submitted(str(store.folder), work, told[sent.key])
+                    out[future], sent.since = sent, time.monotonic()
+                    future.add_done_callback(back.put)
+                try:
+                    future = back.get(timeout=_LOOK)
+                except Empty:
+                    self._look_after(out)
+                    continue
+                sent = out.pop(future)
+                try:
+                    found = store.result(name := self._name(future))
+                except Stranger:
+                    raise
+                except EnvironmentFailure as failure:
+                    sent.failed += 1
+                    if sent.failed == _TRIES:
+                        raise
+                    say(f"{sent.key}: {failure} It is done again.")
+                    waiting.append(sent)
+                    continue
+                yield sent.key, found
+                (store.folder / name).unlink(missing_ok=True)
+        finally:
+            if out and self._client.status == "running":
+                with suppress(*_GONE):
+                    self._client.cancel([*out])
+
+    def _submitted(self, *given: Any) -> Future:
+        return self._asked(lambda: self._client.submit(done, *given, pure=False))
+
+    def _at_once(self) -> int:
+        """How many units can be worked on; waits for workers if there are none."""
+        threads = self._asked(self._client.nthreads)
+        if not threads:
+            try:
+                self._client.wait_for_workers(1, timeout=_NO_WORKERS)
+            except (TimeoutError, *_GONE) as error:
+                raise EnvironmentFailure(
+                    f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
+                    "scheduler, then run the same command again; finished work is kept. "
+                    "[cluster.workers]"
+                ) from error
+            threads = self._asked(self._client.nthreads)
+        return sum(threads.values())
+
+    def _name(self, future: Future) -> str:
+        """What a worker called the result of its unit; its failures in our words."""
+        if future.status != "error":
+            return str(self._asked(lambda: future.result(timeout=_NAME)))
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            worker = getattr(error.last_worker, "address", "unknown")
+            raise EnvironmentFailure(
+                f"{self._address}: workers died at a unit of work, the last was {worker}. See "
+                "whether their memory suffices. [cluster.died]"
+            ) from error
+        if isinstance(error, ImportError | AttributeError):
+            raise Stranger(
+                f"{self._address}: a worker cannot load its work ({error}). Install this version "
+                "of usdbrdf, with the extra cluster, for all workers. [cluster.stranger]"
+            ) from error
+        if isinstance(error, OSError | MemoryError):
+            raise EnvironmentFailure(
+                f"{self._address}: a worker failed ({error}). See whether its disk is full, and "
+                "whether it sees the folder of the asset or --shared-folder. [cluster.worker]"
+            ) from error
+        raise error
+
+    def _look_after(self, out: dict[Future, _Sent]) -> None:
+        """Restart workers that are at a unit for too long: what they had goes to others."""
+        now, workers = time.monotonic(), dict[Any, str]()
+        late = {future: sent for future, sent in out.items() if now - sent.since > self._limit}
+        if late:
+            found = self._asked(self._client.processing)
+            workers = {key: worker for worker, keys in found.items() for key in keys}
+        elif self._client.status != "running":
+            raise self._gone()
+        hung = dict.fromkeys(workers[future.key] for future in late if future.key in workers)
+        for sent in late.values():
+            sent.since, sent.failed = now, sent.failed + 1
+            if sent.failed == _TRIES:
+                raise EnvironmentFailure(
+                    f"{sent.key}: {_TRIES} workers did not finish it in {self._limit:g} s each. "
+                    "Allow more with --unit-limit. [cluster.hangs]"
+                )
+        for worker in hung:
+            say(
+                f"{worker}: this worker is at its unit of work for over {self._limit:g} s. It is "
+                "restarted, and others do its work. [cluster.hangs]"
+            )
+            self._restart(worker)
+
+    def _restart(self, worker: str) -> None:
+        how = {"timeout": _STOPPING, "raise_for_error": False}
+        with suppress(KeyError):  # gone meanwhile
+            self._asked(lambda: self._client.restart_workers([worker], **how))
+
+    def _gone(self) -> EnvironmentFailure:
+        return EnvironmentFailure(
+            f"{self._address}: the scheduler is gone. Start it, then run the same command again; "
+            "finished work is kept. [cluster.scheduler]"
+        )
+
+    def _asked(self, call: Callable[[], T]) -> T:
+        """What a call of the client gives; EnvironmentFailure where there is no scheduler."""
+        try:
+            return call()
+        except _GONE as error:
+            raise self._gone() from error

@@ -1,0 +1,34 @@
+"""What a user may say about who works."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from usdbrdf.errors import UsageError
+from usdbrdf.option import Options, option
+
+
+class ClusterOptions(Options):
+    """Who does the long parts of the work. No result depends on it."""
+
+    workers: int | None = option(
+        "--workers N", None, (1, 4096), unset="none, this process does all"
+    )
+    "do the work in N processes of this machine"
+    scheduler: str | None = option("--scheduler ADDRESS", None)
+    "do it on the workers of a Dask cluster, such as tls://HOST:8786, that are installed as this is"
+    shared_folder: Path | None = option("--shared-folder DIR", None, unset="in the asset")
+    "folder that all workers see under this name, for what they work with"
+    unit_limit: float = option("--unit-limit S", 1800.0, (1e-3, 1e9))
+    """seconds after which a worker is taken to hang at a unit of work, and is restarted while
+    others do it"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.workers is not None and self.scheduler is not None:
+            raise UsageError("--workers, --scheduler: they exclude each other. [usage.option]")
+
+    @property
+    def asked(self) -> bool:
+        """Whether others than this process are to work."""
+        return self.workers is not None or self.scheduler is not None

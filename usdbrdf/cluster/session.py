@@ -1,0 +1,139 @@
+"""A cluster for the time of a command: one of our own on this machine, or one that is there."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.job.progress import say
+from usdbrdf.job.units import HERE, Unit, Workers
+from usdbrdf.model.arrays import Array
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+# Seconds in which a scheduler answers.
+_ANSWER = 20.0
+# Dask looks at every thread's stack a hundred times a second, which takes time from the work.
+_UNWATCHED = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
+}
+
+
+@contextmanager
+def workers_of(options: ClusterOptions | None = None, client: Any = None) -> Iterator[Workers]:
+    """Who does units of work in here: this process, or the workers that the options name, or those
+    of ``client``, a ``distributed.Client`` that stays the caller's. Workers of our own start when
+    they are first needed. Raises EnvironmentFailure where Dask is not installed."""
+    chosen = options or ClusterOptions()
+    if client is None and not chosen.asked:
+        yield HERE
+        return
+    _need_dask()
+    with ExitStack() as stack:
+        yield _Session(chosen, client, stack)
+
+
+class _Session:
+    """Workers that are there once the first units are."""
+
+    def __init__(self, options: ClusterOptions, client: Any, stack: ExitStack) -> None:
+        self._options, self._client, self._stack = options, client, stack
+        self._workers: Workers | None = None
+
+    def results(
+        self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
+    ) -> Iterator[tuple[str, Mapping[str, Array]]]:
+        if self._workers is None:
+            from usdbrdf.cluster.engine import DaskWorkers
+
+            options = self._options
+            client = self._client or self._stack.enter_context(_client(options))
+            self._workers = DaskWorkers(client, options.shared_folder, options.unit_limit)
+        return self._workers.results(unit, shared, pieces, folder, at_a_time)
+
+
+def _need_dask() -> None:
+    if find_spec("distributed") is None:
+        raise EnvironmentFailure(
+            "workers need Dask, which is not installed. Run: pip install 'usdbrdf[cluster]'. "
+            "[environment.dask]"
+        )
+
+
+@contextmanager
+def _client(options: ClusterOptions) -> Iterator[Client]:
+    from distributed import Client
+
+    # What it logs of deaths and lost connections is told in our words.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if options.scheduler is None:
+        with _local_cluster(options.workers or 1) as cluster, Client(cluster) as client:
+            _say_dashboard(client)
+            yield client
+        return
+    try:
+        client = Client(options.scheduler, timeout=_ANSWER)
+    except (OSError, ValueError) as error:
+        raise EnvironmentFailure(
+            f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the address, "
+            "and for tls:// the certificates in Dask's configuration. [cluster.scheduler]"
+        ) from error
+    try:
+        _say_dashboard(client)
+        yield client
+    finally:
+        client.close(timeout=_ANSWER)
+
+
+@contextmanager
+def _local_cluster(count: int) -> Iterator[Any]:
+    """So many worker processes, whose threads are this machine's cores shared out. Nobody else can
+    reach them: they listen on this machine alone, and to who holds this session's certificate."""
+    threads = str(max(1, (os.cpu_count() or 1) // count))
+    with _started(count, {"NUMBA_NUM_THREADS": threads}) as cluster:
+        say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
+        yield cluster
+
+
+def _started(count: int, environment: Mapping[str, str]) -> Any:
+    """A LocalCluster. A worker that dies while it starts is no reason to give up."""
+    from dask import config
+    from distributed import LocalCluster, Security
+
+    for last in (False, False, True):
+        try:
+            with config.set(_UNWATCHED):
+                return LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    security=Security.temporary(),
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                    # Pages of mapped files would count, which the system may take back.
+                    memory_limit=0,
+                    env=environment,
+                )
+        except (OSError, RuntimeError, TimeoutError) as error:
+            if last:
+                raise EnvironmentFailure(
+                    f"--workers {count}: they do not start on this machine ({error}). Run the same "
+                    "command again, with fewer if memory is short. [cluster.workers]"
+                ) from error
+    raise AssertionError  # not reached
+
+
+def _say_dashboard(client: Client) -> None:
+    if "dashboard" in client.scheduler_info()["services"]:
+        say(f"cluster: its dashboard is {client.dashboard_link}")

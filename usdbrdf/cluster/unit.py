@@ -1,0 +1,97 @@
+"""What a worker does: one unit of work, from its description to a file with what it found."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from threading import RLock
+from typing import Any
+
+import llvmlite.binding
+from threadpoolctl import threadpool_limits
+
+from usdbrdf.cluster.described import Document, restored
+from usdbrdf.cluster.store import Store
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.identity import tasks_identity
+
+# What a worker keeps for its next units: of tasks that are done nothing is needed any more, and of
+# their scenes, which cost most, seldom more than one.
+_KEPT_SHARED, _KEPT_SCENES = 2, 2
+# Whose numbers become ours.
+_RECKONING = ("embreex", "llvmlite", "numba", "numpy", "scipy")
+
+
+@cache
+def arithmetic() -> dict[str, str]:
+    """What the bytes of a result depend on beside its unit: our code, who computes, and on which
+    processor, since libraries choose their loops by it."""
+    told = {"usdbrdf's code": tasks_identity(), "Python": platform.python_version()}
+    for name in _RECKONING:
+        try:
+            told[name] = version(name)
+        except PackageNotFoundError:
+            told[name] = "unknown"
+    told["processor"] = f"{llvmlite.binding.get_host_cpu_name()} ({sys.platform})"
+    return told
+
+
+class Stranger(EnvironmentFailure):
+    """A worker whose results would be others than ours."""
+
+
+class _Kept:
+    """The latest few of what is costly to make, each made once, whichever thread asks."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._lock = most, RLock()
+        self._found: OrderedDict[str, Any] = OrderedDict()
+
+    def get(self, key: str, make: Callable[[], Any]) -> Any:
+        with self._lock:
+            if key not in self._found:
+                self._found[key] = make()
+            self._found.move_to_end(key)
+            while len(self._found) > self._most:
+                self._found.popitem(last=False)
+            return self._found[key]
+
+
+_shared, _scenes = _Kept(_KEPT_SHARED), _Kept(_KEPT_SCENES)
+
+
+def _refuse_to_differ(wanted: Mapping[str, str]) -> None:
+    """Raise Stranger where this process would give other bytes than the one that asks."""
+    own = arithmetic()
+    differ = [f"{k} {own.get(k)} instead of {v}" for k, v in wanted.items() if own.get(k) != v]
+    if differ:
+        raise Stranger(
+            f"the worker {os.getpid()} on {platform.node()} has {', '.join(differ)}: its results "
+            "would not be the same. Give it the same installation and kind of processor, or leave "
+            "it out of the cluster. [cluster.stranger]"
+        )
+
+
+def done(folder: str, work: str, piece: Document) -> str:
+    """Do a unit: the name of what it found in the store ``folder``, where ``work`` is the name of
+    what all units of its kind share."""
+    store = Store(Path(folder))
+
+    def value(document: Document) -> Any:
+        return restored(document, store.array, lambda told, make: _scenes.get(str(told), make))
+
+    def read() -> Any:
+        told = store.document(work)
+        _refuse_to_differ(told["arithmetic"])
+        return value(told["unit"]), value(told["shared"])
+
+    unit, shared = _shared.get(work, read)
+    # As where units are done in one process: BLAS's threads only wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return store.keep_result(dict(unit(shared, value(piece))))
