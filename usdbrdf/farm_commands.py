@@ -35,9 +35,10 @@ class Farm(OnCapture):
     def run(self) -> int:
         with loading():
             from usdbrdf.farm.bundle import TEMPLATE, bundle_of, write_bundle
-            from usdbrdf.farm.scans import list_of, listed_in
+            from usdbrdf.farm.scans import known_in, list_of, listed_in, refuse_nested
         listed = listed_in(self.list_file) if self.list_file is not None else []
-        scans = list_of([*self.scans, *listed])
+        scans = list_of([*self.scans, *listed], known_in(self.output))
+        refuse_nested(self.output, scans)
         made = bundle_of(
             self.output.absolute().name, scans, self.options, self.farm, self.adapter,
             plugins=self.plugins,

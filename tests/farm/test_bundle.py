@@ -185,6 +185,55 @@ def test_a_folder_keeps_its_names(tmp_path):
     assert read_list(tmp_path / "bundle/scans.json").names == ("room", "hall")
 
 
+def names_after(bundle: Path, *scans: Path) -> dict[str, str]:
+    """Names of the places that the list holds after ``usdbrdf farm`` with these."""
+    assert main(["farm", *map(str, scans), "-o", str(bundle), "-q"]) == 0
+    listed = read_list(bundle / "scans.json")
+    return {str(listed.root / p): n for n, p in zip(listed.names, listed.places, strict=True)}
+
+
+def test_a_name_is_never_given_again(tmp_path):
+    first, hall, second = folders(tmp_path, "x/room", "z/hall", "y/room")
+    bundle = tmp_path / "bundle"
+    assert names_after(bundle, first) == {str(first): "room"}
+    assert names_after(bundle, hall) == {str(hall): "hall"}
+    # The results may hold an asset of x/room still.
+    assert names_after(bundle, second) == {str(second): "y_room"}
+    assert names_after(bundle, second, first) == {str(second): "y_room", str(first): "room"}
+    names_after(bundle, hall)
+    other = list_of([second])
+    made = bundle_of("b", other, ConvertOptions(), FarmOptions())
+    with pytest.raises(OwnershipConflict, match=r"room is the scan .*x/room here.*\[farm.name\]"):
+        write_bundle(bundle, other, made)
+
+
+def test_a_scan_that_is_added_renames_none(tmp_path):
+    first, second, third = folders(tmp_path, "x/room", "y/room", "Y_Room")
+    bundle = tmp_path / "bundle"
+    names_after(bundle, first)
+    state = (bundle / "scans.json").stat()
+    names_after(bundle, first)
+    assert (bundle / "scans.json").stat().st_mtime_ns == state.st_mtime_ns
+    assert (bundle / "scans.json").stat().st_ino == state.st_ino
+    after = names_after(bundle, first, second)
+    assert after == {str(first): "room", str(second): "y_room"}
+    more = names_after(bundle, third, first, second)
+    assert {place: more[place] for place in after} == after
+    assert len({name.lower() for name in more.values()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("scan", "bundle"),
+    [("scan", "scan/farm"), ("scan", "scan"), ("scan", "link/farm"), ("out/scan", "out")],
+)
+def test_scans_and_results_lie_apart(tmp_path, capsys, scan, bundle):
+    place = folders(tmp_path, scan)[0]
+    (tmp_path / "link").symlink_to(place)
+    assert main(["farm", str(place), "-o", str(tmp_path / bundle)]) == 2
+    assert "[farm.inside]" in capsys.readouterr().err
+    assert not [*tmp_path.rglob("scans.json")]
+
+
 def test_a_folder_of_somebody_else_stays(tmp_path):
     scans = list_of(folders(tmp_path, "a"))
     (tmp_path / "theirs").mkdir()
@@ -216,5 +265,16 @@ def test_ranges():
 )  # fmt: skip
 def test_a_list_that_is_none(tmp_path, damage):
     (tmp_path / "scans.json").write_text(damage)
+    with pytest.raises(InputRefused, match=r"\[farm.list\]"):
+        read_list(tmp_path / "scans.json")
+
+
+@pytest.mark.parametrize(
+    ("names", "retired"), [(["a", "A"], []), (["a"], ["A"]), (["x" * 300], []), ([""], [])]
+)
+def test_names_that_would_mix_or_be_no_files(tmp_path, names, retired):
+    rows, left = ([{"name": n, "place": f"/{n}"} for n in part] for part in (names, retired))
+    document = {"schema": 1, "root": "/", "scans": rows, "retired": left}
+    (tmp_path / "scans.json").write_text(json.dumps(document))
     with pytest.raises(InputRefused, match=r"\[farm.list\]"):
         read_list(tmp_path / "scans.json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,11 +25,14 @@ class ScanList:
     root    folder above all of them, where it was when the list was made
     names   of each: of its asset's folder, its page and its record
     places  of each, relative to ``root``
+    retired names of scans that are no longer in it, and their places: the results may hold what
+            they stood for
     """
 
     root: Path
     names: tuple[str, ...]
     places: tuple[str, ...]
+    retired: tuple[tuple[str, Path], ...] = ()
 
 
 def listed_in(file: Path) -> list[Path]:
@@ -40,10 +43,10 @@ def listed_in(file: Path) -> list[Path]:
     return [file.parent / line for line in lines if line and not line.startswith("#")]
 
 
-def list_of(scans: Sequence[Path]) -> ScanList:
+def list_of(scans: Sequence[Path], known: Mapping[str, Path] | None = None) -> ScanList:
     """The list of these capture folders or main files, each once, with names that depend on their
-    places alone and not on their order. UsageError where there are none, InputRefused where one is
-    not there."""
+    places alone and not on their order; a place that is ``known`` keeps its name, and no other gets
+    it. UsageError where there are none, InputRefused where one is not there."""
     places = [*dict.fromkeys(Path(os.path.abspath(scan)) for scan in scans)]
     if not places:
         raise UsageError("no scans: name some, or a --list FILE that does. [farm.scans]")
@@ -57,14 +60,16 @@ def list_of(scans: Sequence[Path]) -> ScanList:
     root = Path(os.path.commonpath([place.parent for place in places]))
     return ScanList(
         root=root,
-        names=tuple(_names(places)),
+        names=tuple(_names(places, known or {})),
         places=tuple(place.relative_to(root).as_posix() for place in places),
     )
 
 
-def _names(places: Sequence[Path]) -> list[str]:
+def _names(wanted: Sequence[Path], known: Mapping[str, Path]) -> list[str]:
     """A folder's name, a main file's behind that of its folder, with as many of the folders above
     as tell it from all others; identifiers, for they become names of files and prims."""
+    names = {place: name for name, place in known.items()}
+    places = [*dict.fromkeys([*wanted, *names])]
     files = [place.is_file() for place in places]
     parts = [
         (place.with_suffix("") if is_file else place).parts[1:] or ("scan",)
@@ -80,45 +85,78 @@ def _names(places: Sequence[Path]) -> list[str]:
         if deeper == depth:
             break
         depth = deeper
-    in_order = sorted(range(len(places)), key=lambda i: parts[i])
-    found = unique_identifiers([labels[i] for i in in_order])
-    names = dict(zip(in_order, found, strict=True))
-    return [names[i] for i in range(len(places))]
+    new = (i for i, place in enumerate(places) if place not in names)
+    in_order = sorted(new, key=lambda i: parts[i])
+    found = unique_identifiers([labels[i] for i in in_order], fallback="scan", known=known)
+    names |= dict(zip((places[i] for i in in_order), found, strict=True))
+    return [names[place] for place in wanted]
+
+
+def known_in(folder: Path) -> dict[str, Path]:
+    """The names that stand for scans in a bundle, those of earlier lists first, and their places;
+    none where there is no bundle yet. InputRefused for a list that is none."""
+    file = folder / SCANS_FILE
+    if not file.is_file():
+        return {}
+    scans = read_list(file)
+    return dict(scans.retired) | _placed(scans)
 
 
 def write_list(folder: Path, scans: ScanList) -> None:
-    """Write the list into a bundle. OwnershipConflict where a name stands for another scan there:
-    the asset that has it would be taken for that scan's."""
-    file = folder / SCANS_FILE
-    if file.is_file():
-        before = read_list(file)
-        known = dict(zip(before.names, (before.root / p for p in before.places), strict=True))
-        for name, place in zip(scans.names, scans.places, strict=True):
-            if known.get(name, scans.root / place) != scans.root / place:
-                raise OwnershipConflict(
-                    f"{file}: {name} is the scan {known[name]} here, not {scans.root / place}. "
-                    "Choose another folder with -o. [farm.name]"
-                )
+    """Write the list into a bundle, unless it is there. OwnershipConflict where a name stands for
+    another scan there, or did: the asset that has it would be taken for that scan's."""
+    file, known, now = folder / SCANS_FILE, known_in(folder), _placed(scans)
+    # Some file systems know no case.
+    owners = {name.lower(): place for name, place in known.items()}
+    for name, place in now.items():
+        if (owner := owners.pop(name.lower(), place)) != place:
+            raise OwnershipConflict(
+                f"{file}: {name} is the scan {owner} here, not {place}. Choose another folder with "
+                "-o. [farm.name]"
+            )
     rows = [{"name": n, "place": p} for n, p in zip(scans.names, scans.places, strict=True)]
-    write_json(file, {"schema": _SCHEMA, "root": str(scans.root), "scans": rows})
+    retired = [{"name": n, "place": str(p)} for n, p in known.items() if n.lower() in owners]
+    document = {"schema": _SCHEMA, "root": str(scans.root), "scans": rows, "retired": retired}
+    if not (file.is_file() and read_json(file) == document):
+        write_json(file, document)
+
+
+def _placed(scans: ScanList) -> dict[str, Path]:
+    return dict(zip(scans.names, (scans.root / place for place in scans.places), strict=True))
 
 
 def read_list(file: Path) -> ScanList:
     """The list of a bundle, or InputRefused."""
     document = read_json(file)
     try:
-        rows = document["scans"]
+        rows, left = document["scans"], document.get("retired", [])
         known = document["schema"] == _SCHEMA and isinstance(document["root"], str)
         names, places = (tuple(row[key] for row in rows) for key in ("name", "place"))
-        safe = all(re.fullmatch(r"\w+", name, re.ASCII) for name in names)
+        retired = tuple((row["name"], Path(row["place"])) for row in left)
+        used = [*names, *(name for name, _ in retired)]
+        safe = all(re.fullmatch(r"\w{1,64}", name, re.ASCII) for name in used)
+        safe &= len({name.lower() for name in used}) == len(used)
         safe &= all(isinstance(place, str) for place in places)
-    except (KeyError, TypeError):
+    except (AttributeError, KeyError, TypeError):
         known = safe = False
     if not (known and safe and rows):
         raise InputRefused(
             f"{file}: no list of scans that usdbrdf farm wrote. Write the bundle again. [farm.list]"
         )
-    return ScanList(root=Path(document["root"]), names=names, places=places)
+    return ScanList(root=Path(document["root"]), names=names, places=places, retired=retired)
+
+
+def refuse_nested(folder: Path, scans: ScanList) -> None:
+    """UsageError for a bundle inside a scan, which every result would change, or a scan inside the
+    bundle, where results are written; links are followed."""
+    bundle = folder.resolve()
+    for place in _placed(scans).values():
+        scan = place.resolve()
+        if (bundle.is_relative_to(scan) and scan.is_dir()) or scan.is_relative_to(bundle):
+            raise UsageError(
+                f"{folder}: lies inside the scan {place}, or it inside the folder. Choose a folder "
+                "beside the scans with -o. [farm.inside]"
+            )
 
 
 def numbers_in(text: str, count: int) -> list[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 _MAX_LENGTH = 64
 # Device names that Windows refuses as a file's stem, whatever the extension.
@@ -14,17 +14,20 @@ _RESERVED = frozenset(
 )
 
 
-def unique_identifiers(labels: Sequence[str]) -> list[str]:
+def unique_identifiers(
+    labels: Sequence[str], *, fallback: str = "object", known: Collection[str] = ()
+) -> list[str]:
     """One identifier per label: ASCII, legal in USD, unique even where case does not count.
 
     A label that is its own identifier keeps it; of labels that reduce to the same identifier the
     first keeps it and the others get a suffix, a hash of the label and of how often it occurred
-    before, so that the names depend on the labels alone.
+    before, so that the names depend on the labels alone; ``known`` names are nobody's. A label of
+    which nothing is left becomes ``fallback``.
     """
-    wanted = [identifier_from(label) for label in labels]
+    wanted = [identifier_from(label, fallback=fallback) for label in labels]
     exact_first = sorted(range(len(labels)), key=lambda i: wanted[i] != labels[i])
     names = [""] * len(labels)
-    taken: set[str] = set()
+    taken = {name.lower() for name in known}
     for i in exact_first:
         name, occurrence = wanted[i], list(labels[:i]).count(labels[i])
         while name.lower() in taken:
