@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from usdbrdf.command_kinds import OnCapture, Talking
+from usdbrdf.command_kinds import Locking, OnCapture, Talking
 from usdbrdf.errors import UsageError
 from usdbrdf.farm.options import FarmOptions
 from usdbrdf.job.interrupts import loading
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from usdbrdf.farm.scans import ScanList
 
 
-class Farm(OnCapture):
+class Farm(OnCapture, Locking):
     """Write a job bundle (Open Job Description) that converts many scans on a farm."""
 
     scans: tuple[Path, ...] = option("SCAN", ())
@@ -41,17 +42,22 @@ class Farm(OnCapture):
         refuse_nested(self.output, scans)
         made = bundle_of(
             self.output.absolute().name, scans, self.options, self.farm, self.adapter,
-            plugins=self.plugins,
+            plugins=self.plugins, wait_s=self.wait_s, without_lock=self.without_lock,
         )  # fmt: skip
         write_bundle(self.output, scans, made)
         template = self.output / TEMPLATE
         tasks = -(-len(scans.names) // self.farm.chunk)
-        needed = "".join(f" -p {n}={v}" for n, v in made.values.items() if n != "ScanRoot")
+        here = ["openjd", "run", str(template), "--step", "Table", "--run-dependencies"]
+        for name, value in made.values.items():
+            here += ["-p", f"{name}={value}"] if name != "ScanRoot" else []
+        counts = (len(scans.names), "scan"), (tasks, "task")
+        told = " in ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
+        cloud = ["deadline", "bundle", "submit", str(self.output)]
         return self.told(
             {"template": str(template), "tasks": tasks, "scans": [*scans.names]},
-            f"{template}: written, {len(scans.names)} scans in {tasks} tasks",
-            f"here:           openjd run {template} --step Table --run-dependencies{needed}",
-            f"Deadline Cloud: deadline bundle submit {self.output}",
+            f"{template}: written, {told}",
+            f"here:           {shlex.join(here)}",
+            f"Deadline Cloud: {shlex.join(cloud)}",
         )
 
 
@@ -75,7 +81,7 @@ class _InBundle(Talking):
         return scans if self.root is None else replace(scans, root=self.root.absolute()), results
 
 
-class FarmWork(OnCapture, _InBundle):
+class FarmWork(OnCapture, Locking, _InBundle):
     """Convert, validate and report scans of a bundle, as its tasks do."""
 
     chosen: str | None = option("--scans RANGE", None, unset="all")
@@ -104,7 +110,7 @@ class FarmWork(OnCapture, _InBundle):
             tell_lines_to(lambda line: show(openjd_lines(line)))
         work = Work(
             results=results, options=self.options, adapter=self.adapter, plugins=self.plugins,
-            photographs=self.photographs,
+            photographs=self.photographs, wait_s=self.wait_s, without_lock=self.without_lock,
         )  # fmt: skip
         chosen = [(scans.names[n - 1], scans.root / scans.places[n - 1]) for n in numbers]
         try:

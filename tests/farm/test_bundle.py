@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -91,9 +93,37 @@ def test_openjd_makes_a_job_of_it(tmp_path):
 
 
 def _resolved(word: str, values: dict[str, str]) -> str:
-    if not word.startswith("{{"):
-        return word
-    return str(values[word.strip("{} ")])
+    return re.sub(r"\{\{ *([\w.]+) *\}\}", lambda found: str(values[found[1]]), word)
+
+
+def test_values_may_begin_with_a_dash(tmp_path):
+    from usdbrdf.command_parser import parsed
+
+    scans = list_of(folders(tmp_path, "a"))
+    given = Path("-meshes/mesh.ply")
+    options = ConvertOptions(ingest=IngestOptions(allow_outside=(given,)))
+    made = bundle_of("b", scans, options, FarmOptions(), "-mine", wait_s=90, without_lock=True)
+    words = made.template["steps"][0]["script"]["actions"]["onRun"]["args"]
+    # As whoever submits the job may write them.
+    values = {"Param.AllowOutside": str(given), "Param.Adapter": "-mine", "Param.Scans": "b"}
+    values |= {"Param.ScanRoot": "/", "Param.Results": "r", "Task.Param.Scan": "1"}
+    command = parsed([_resolved(word, values) for word in words], COMMANDS)
+    assert command.options.ingest.allow_outside == (given,)
+    assert (command.adapter, command.wait_s, command.without_lock) == ("-mine", 90, True)
+
+
+def test_what_is_told_can_be_pasted_into_a_shell(tmp_path, capsys):
+    scan, mesh = folders(tmp_path, "a")[0], tmp_path / "the mesh; x.ply"
+    mesh.touch()
+    bundle = tmp_path / "our bundle"
+    assert main(["farm", str(scan), "-o", str(bundle), "--mesh", str(mesh)]) == 0
+    written, here, cloud = capsys.readouterr().err.splitlines()
+    assert written.endswith("written, 1 scan in 1 task")
+    assert shlex.split(here.partition(":")[2]) == [
+        "openjd", "run", str(bundle / "template.json"), "--step", "Table", "--run-dependencies",
+        "-p", f"Mesh={mesh}",
+    ]  # fmt: skip
+    assert shlex.split(cloud.partition(":")[2]) == ["deadline", "bundle", "submit", str(bundle)]
 
 
 def test_paths_are_told_so_that_a_farm_can_map_them(tmp_path):

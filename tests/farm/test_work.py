@@ -142,6 +142,51 @@ def one(tmp_path, monkeypatch):
     return run, results, heard
 
 
+def test_no_line_begins_with_what_a_scan_is_called(tmp_path, monkeypatch, capsys):
+    worked = []
+
+    def convert(place, folder, options, **told):
+        worked.append((folder.name, told["wait_s"], told["without_lock"]))
+        raise InputRefused(f"{place}: bad. [x]")
+
+    monkeypatch.setattr(module, "convert", convert)
+    places = [tmp_path / name for name in ("openjd_fail", "a\nopenjd_env: A=B")]
+    for place in places:
+        place.mkdir()
+    assert main(["farm", *map(str, places), "-o", str(tmp_path / "b"), "-q"]) == 0
+    words = ["farm-work", str(tmp_path / "b"), "--wait", "7", "--without-lock", "--openjd"]
+    assert main(words) == 0
+    assert worked == [("openjd_fail", 7, True), ("a_openjd_env_A_B", 7, True)]
+    assert main(["farm-table", str(tmp_path / "b")]) == 3
+    said = capsys.readouterr()
+    lines = [line for line in (said.out + said.err).splitlines() if line.startswith("openjd_")]
+    assert {line.partition(":")[0] for line in lines} == {"openjd_status", "openjd_progress"}
+
+
+def test_a_page_is_made_anew_without_its_photographs(tmp_path, monkeypatch):
+    (tmp_path / "scan").mkdir()
+    pages = []
+
+    def report(_, page, options):
+        pages.append(options.photographs)
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.touch()
+
+    monkeypatch.setattr(module, "convert", lambda *_, **__: {})
+    monkeypatch.setattr(module, "validate", lambda _: [])
+    monkeypatch.setattr(module, "report", report)
+    monkeypatch.setattr(module, "_counts", lambda _: {})
+    for photographs in (True, True, False, False):
+        (tmp_path / "results/assets/scan").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "results/assets/scan/scan.usda").touch()
+        work = Work(
+            results=Results(tmp_path / "results"), options=ConvertOptions(), photographs=photographs
+        )
+        records, _ = work_on([("scan", tmp_path / "scan")], work, lambda *_: None)
+        assert records["scan"].status == "good", records
+    assert pages == [True, False]
+
+
 def test_only_what_trying_again_may_help_fails_the_task(one):
     run, results, heard = one
     assert run(InputRefused("bad."), ValueError("x"), InputRefused("bad too.")) == (

@@ -52,6 +52,8 @@ def bundle_of(
     adapter: str | None = None,
     *,
     plugins: bool = True,
+    wait_s: float = 0.0,
+    without_lock: bool = False,
 ) -> Bundle:
     """The documents of the job that converts ``scans``.
 
@@ -62,14 +64,18 @@ def bundle_of(
     """
     words, parameters, values = _handed_through(convert)
     if adapter is not None:
-        words += ["--adapter", "{{Param.Adapter}}"]
+        words.append(_word("--adapter", "Adapter"))
         parameters.append(_text_parameter("Adapter", "--adapter", adapter))
     if not plugins:
         words.append("--no-plugins")
     if not farm.photographs:
         words.append("--no-photographs")
-    if "--memory" not in words and farm.ram is not None:
-        words += ["--memory", f"{0.75 * farm.ram:g}"]
+    if wait_s:
+        words.append(f"--wait={wait_s:g}")
+    if without_lock:
+        words.append("--without-lock")
+    if _word("--memory", "Memory") not in words and farm.ram is not None:
+        words.append(f"--memory={0.75 * farm.ram:g}")
     definitions = [*_own_parameters(farm), *parameters]
     if len(definitions) > _MAX_PARAMETERS:
         raise UsageError(
@@ -203,11 +209,16 @@ def _handed_through(
         for number, one in enumerate(several, 1):
             base = "".join(part.capitalize() for part in option.name.strip("-").split("-"))
             name = base if number == 1 else f"{base}{number}"
-            words += [option.name, f"{{{{Param.{name}}}}}"]
+            words.append(_word(option.name, name))
             parameters.append(_parameter(name, field, option, one))
             if isinstance(one, Path):
                 values[name] = str(one.absolute())
     return words, parameters, values
+
+
+def _word(option: str, parameter: str) -> str:
+    """An option with a parameter's value: one word, in which the value may begin with a dash."""
+    return f"{option}={{{{Param.{parameter}}}}}"
 
 
 def _given(

@@ -69,19 +69,20 @@ def counted(rows: Sequence[Row]) -> str:
     """ "40 scans: 37 good, 3 refused"."""
     found = [row.status for row in rows]
     counts = ", ".join(f"{found.count(s)} {s}" for s in _STATUSES if s in found)
-    return f"{len(rows)} scans: {counts}"
+    return f"{len(rows)} scan{'s' * (len(rows) != 1)}: {counts}"
 
 
 def table_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """The table in text, good scans with their figures, others with their sentence."""
+    """The table in text, good scans with their figures, others with their sentence. Lines begin
+    with blanks: OpenJD obeys those that begin with words of its own, and scans may be called so."""
     wide = max(len(row.name) for row in rows)
-    yield f"{'scan':{wide}}  {'status':10}  measured  warnings     time"
+    yield f"  {'scan':{wide}}  {'status':10}  measured  warnings     time"
     for row in rows:
-        start = f"{row.name:{wide}}  {row.status:10}"
+        start = f"  {row.name:{wide}}  {row.status:10}"
         if row.status in ("good", "invalid"):
             measured = f"{row.measured} of {row.objects}"
             start += f"  {measured:>8}  {row.warnings:>8}  {time_told(row.seconds):>7}"
-        yield f"{start}  {row.sentence}".rstrip()
+        yield f"{start}  {' '.join(row.sentence.split())}".rstrip()
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:

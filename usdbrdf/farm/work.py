@@ -33,13 +33,15 @@ _RETRY = (EnvironmentFailure.exit_code, FolderBusy.exit_code)
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """What all scans of a task have in common; the options are those of ``convert``."""
+    """What all scans of a task have in common; options, wait and lock are those of ``convert``."""
 
     results: Results
     options: ConvertOptions
     adapter: str | None = None
     plugins: bool = True
     photographs: bool = True
+    wait_s: float = 0.0
+    without_lock: bool = False
 
 
 def work_on(
@@ -50,11 +52,11 @@ def work_on(
     that of the first scan for which trying again may help."""
     records, status = {}, 0
     for done, (name, place) in enumerate(scans):
-        say(f"{name}: {place}")
+        say(_line(f"scan {name}: {place}"))
         told(done, f"{name}: begun")
         record, code = _worked_on(name, place, work)
         if record.sentence:
-            tell(f"{name}: {record.status}: {record.sentence}")
+            tell(_line(f"scan {name}: {record.status}: {record.sentence}"))
         told(done + 1, f"{name}: {record.status}")
         records[name] = record
         status = status or (code if code in _RETRY else 0)
@@ -107,11 +109,14 @@ def _failed(before: Record, sentence: str, code: int) -> Record:
 def _converted(name: str, place: Path, work: Work, before: Record) -> Record:
     """All of it; validation and page only where something changed since they were made."""
     folder, start = work.results.asset(name), time.monotonic()
-    steps = convert(place, folder, work.options, adapter=work.adapter, plugins=work.plugins)
+    steps = convert(
+        place, folder, work.options, adapter=work.adapter, plugins=work.plugins,
+        wait_s=work.wait_s, without_lock=work.without_lock,
+    )  # fmt: skip
     asset, page = Asset.at(folder), work.results.page(name)
-    seal = _seal(asset)
+    seal = _seal(asset, work.photographs)
     if seal == before.seal and page.is_file():
-        say(f"{name}: up to date")
+        say(f"scan {name}: up to date")
         return replace(before, status="good" if not before.sentence else "invalid", begun=0)
     errors = [str(finding) for finding in validate(asset.root_layer) if has_errors([finding])]
     environment = work.options.shade.environment
@@ -136,16 +141,22 @@ def _counts(steps: dict[str, TaskResult]) -> dict[str, int]:
     }
 
 
-def _seal(asset: Asset) -> str:
+def _seal(asset: Asset, photographs: bool) -> str:
     """Of the stamps, and so of all that the steps wrote; of people's layers; of the version that
-    makes page and findings."""
+    makes page and findings, and of what the page shows."""
     stamps = (asset.folder / STATE_FOLDER / "stamps").glob("*.json")
     files = sorted([*stamps, *asset.folder.glob("*.usda")])
-    return f"{code_version()} {hash_of_files(files, asset.folder)}"
+    shown = "with" if photographs else "without"
+    return f"{code_version()} {shown} photographs {hash_of_files(files, asset.folder)}"
+
+
+def _line(text: str) -> str:
+    """The text in one line: a second could begin with a word that OpenJD obeys."""
+    return " ".join(text.split())
 
 
 def openjd_lines(sentence: str, share: float | None = None) -> str:
     """What an OpenJD session takes out of a task's output: a sentence about what it does, and the
     share of its scans, 0 to 1, that is done."""
-    said = f"openjd_status: {' '.join(printable(sentence).split())}"
+    said = f"openjd_status: {_line(printable(sentence))}"
     return said if share is None else f"openjd_progress: {100 * share:.1f}\n{said}"
