@@ -27,7 +27,8 @@ class Farm(OnCapture, Locking):
     scans: tuple[Path, ...] = option("SCAN", ())
     "capture folders or their main files"
     list_file: Path | None = option("--list FILE", None, file=True)
-    """text file that names scans, one a line, relative to its folder; after "#" comments"""
+    """text file that names scans, one a line, relative to its folder; lines that begin with "#" are
+    comments"""
     output: Path = option("-o --output DIR", REQUIRED)
     "folder of the bundle, made if it is not there; the job's results go into it too"
     farm: FarmOptions
@@ -64,26 +65,23 @@ class Farm(OnCapture, Locking):
 class _InBundle(Talking):
     bundle: Path = option("BUNDLE", REQUIRED)
     "folder that usdbrdf farm wrote, or its scans.json in any place"
-    root: Path | None = option("--root DIR", None, unset="as when the list was written")
-    "folder above all scans"
     results: Path | None = option("--results DIR", None, unset="results, beside the list")
     "folder of assets, pages and records, made if it is not there"
 
     def list_and_results(self) -> tuple[ScanList, Results]:
-        from dataclasses import replace
-
         from usdbrdf.farm.records import Results
         from usdbrdf.farm.scans import RESULTS_FOLDER, SCANS_FILE, read_list
 
         file = self.bundle / SCANS_FILE if self.bundle.is_dir() else self.bundle
-        scans = read_list(file)
         results = Results((self.results or file.parent / RESULTS_FOLDER).absolute())
-        return scans if self.root is None else replace(scans, root=self.root.absolute()), results
+        return read_list(file), results
 
 
 class FarmWork(OnCapture, Locking, _InBundle):
     """Convert, validate and report scans of a bundle, as its tasks do."""
 
+    root: Path | None = option("--root DIR", None, unset="as when the list was written")
+    "folder above all scans"
     chosen: str | None = option("--scans RANGE", None, unset="all")
     "their numbers in the list, such as 3 or 1-5,8"
     openjd: bool = option("--openjd", False)
@@ -112,7 +110,8 @@ class FarmWork(OnCapture, Locking, _InBundle):
             results=results, options=self.options, adapter=self.adapter, plugins=self.plugins,
             photographs=self.photographs, wait_s=self.wait_s, without_lock=self.without_lock,
         )  # fmt: skip
-        chosen = [(scans.names[n - 1], scans.root / scans.places[n - 1]) for n in numbers]
+        root = scans.root if self.root is None else self.root.absolute()
+        chosen = [(scans.names[n - 1], root / scans.places[n - 1]) for n in numbers]
         try:
             records, status = work_on(chosen, work, told)
         finally:

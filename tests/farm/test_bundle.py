@@ -156,6 +156,7 @@ def test_paths_are_told_so_that_a_farm_can_map_them(tmp_path):
         (("a b", "a_b"), None),
         (("Room", "room"), None),
         (("Küche 1", "3rd floor"), ["Kuche_1", "_3rd_floor"]),
+        (("部屋",), ["scan"]),
     ],
 )
 def test_names_tell_scans_apart_whatever_their_order(tmp_path, given, names):
@@ -197,6 +198,10 @@ def test_scans_come_from_a_file_too(tmp_path):
     places = folders(tmp_path, "scans/a b", "scans/c")
     (tmp_path / "scans.txt").write_text(f"# of today\nscans/a b\n\n{places[1]}\n")
     assert listed_in(tmp_path / "scans.txt") == places
+    (tmp_path / "scans.txt").write_text("one\x85name\r\nanother # with a sign\n")
+    assert [place.name for place in listed_in(tmp_path / "scans.txt")] == [
+        "one\x85name", "another # with a sign",
+    ]  # fmt: skip
     with pytest.raises(InputRefused, match=r"\[document.missing\]"):
         listed_in(tmp_path / "none.txt")
 
@@ -273,6 +278,9 @@ def test_a_folder_of_somebody_else_stays(tmp_path):
         write_bundle(tmp_path / "theirs", scans, made)
     with pytest.raises(OwnershipConflict, match=r"\[farm.folder\]"):
         write_bundle(tmp_path / "theirs/letter.txt", scans, made)
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OwnershipConflict, match=r"\[farm.folder\]"):
+        write_bundle(tmp_path / "link", scans, made)
     assert [*(tmp_path / "theirs").iterdir()] == [tmp_path / "theirs/letter.txt"]
 
 

@@ -86,7 +86,7 @@ def test_good_scans_become_assets_and_a_bad_one_a_sentence(farm):
 
 def test_the_table_says_what_came_of_each(farm, capsys):
     here, said, _ = farm
-    words = [str(here / "bundle"), "--root", str(here / "there")]
+    words = [str(here / "bundle")]
     assert main(["farm-table", *words]) == 3
     text = capsys.readouterr().out
     assert text.splitlines()[-1] == "3 scans: 2 good, 1 refused"
@@ -213,6 +213,14 @@ def test_a_scan_that_kills_its_tasks_is_left_out(one):
     assert run(InputRefused("bad.")) == (["refused"], 0)
 
 
+def test_a_busy_scan_keeps_the_record_of_the_task_that_is_at_it(one):
+    run, results, _ = one
+    file, other = results.record("scan_0"), Record(status="begun", begun=1, seconds=3.0)
+    write_record(file, other)
+    assert run(FolderBusy("busy.")) == (["unfinished"], 5)
+    assert read_record(file) == other
+
+
 def test_what_stops_a_task_from_outside_is_no_try(one):
     run, results, _ = one
     for _ in range(5):
@@ -249,6 +257,20 @@ def test_the_whole_is_as_good_as_its_worst(tmp_path):
     assert code("refused", "defect", "good") == 1
     assert code("refused", "crashed", "unfinished") == 4
     assert code("begun", "good", "good") == 4
+
+
+@pytest.mark.parametrize("code", [0, 1, 2, 3, 4, 5, 7])
+def test_snakemake_keeps_the_page_of_scans_that_are_not_good(tmp_path, code):
+    snakefile = Path(__file__).parents[2] / "docs/packaging/snakemake/Snakefile"
+    line = next(
+        line for line in snakefile.read_text().splitlines() if '"usdbrdf farm-table' in line
+    )
+    told = line.strip().strip('"').replace("{params.bundle:q}", "'a b'")
+    told = told.replace("{log:q}", f"'{tmp_path}/the log'")
+    command = f"usdbrdf() {{ echo $*; return {code}; }}; set -euo pipefail; {told}"
+    done = subprocess.run(["bash", "-c", command], check=False)
+    assert (done.returncode == 0) is (code in (0, 1, 3, 7))
+    assert (tmp_path / "the log").read_text() == "farm-table a b\n"
 
 
 def test_the_page_escapes_what_others_wrote(tmp_path):

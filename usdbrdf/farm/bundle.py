@@ -13,6 +13,7 @@ refused is written into its record, and its task is done.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,9 +98,10 @@ def write_bundle(folder: Path, scans: ScanList, bundle: Bundle) -> None:
     """Write the documents into ``folder``, made if it is not there. OwnershipConflict where it
     holds what is no bundle of ours."""
     with environment_failures(str(folder)):
-        if folder.exists() and not folder.is_dir():
+        if os.path.lexists(folder) and not folder.is_dir():
             raise OwnershipConflict(
-                f"{folder}: a file has this name. Choose another. [farm.folder]"
+                f"{folder}: a file, or a link that leads nowhere, has this name. Choose another. "
+                "[farm.folder]"
             )
         if folder.is_dir() and any(folder.iterdir()) and not (folder / SCANS_FILE).is_file():
             raise OwnershipConflict(
@@ -159,12 +161,13 @@ def _work_step(count: int, farm: FarmOptions, words: Sequence[str]) -> dict[str,
         amounts.append({"name": "amount.worker.vcpu", "min": farm.cores})
     if farm.ram is not None:
         amounts.append({"name": "amount.worker.memory", "min": math.ceil(1024 * farm.ram)})
+    chosen = ("--root", "{{Param.ScanRoot}}", "--scans", "{{Task.Param.Scan}}")
     system = {"name": "attr.worker.os.family", "anyOf": ["linux"]}
     return {
         "name": _WORK,
         "parameterSpace": {"taskParameterDefinitions": [definition]},
         "hostRequirements": {"attributes": [system], **({"amounts": amounts} if amounts else {})},
-        "script": _script("farm-work", "--scans", "{{Task.Param.Scan}}", "--openjd", *words),
+        "script": _script("farm-work", *chosen, "--openjd", *words),
     }
 
 
@@ -173,7 +176,7 @@ def _table_step() -> dict[str, Any]:
 
 
 def _script(command: str, *words: str) -> dict[str, Any]:
-    places = ["{{Param.Scans}}", "--root", "{{Param.ScanRoot}}", "--results", "{{Param.Results}}"]
+    places = ["{{Param.Scans}}", "--results", "{{Param.Results}}"]
     cancelation = {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": _SECONDS_TO_STOP}
     run = {"command": "usdbrdf", "args": [command, *places, *words], "cancelation": cancelation}
     return {"actions": {"onRun": run}}

@@ -36,10 +36,11 @@ class ScanList:
 
 
 def listed_in(file: Path) -> list[Path]:
-    """The scans that a text file names, one a line, relative to its folder; "#" begins a comment.
+    """The scans that a text file names, one a line, relative to its folder; lines that begin with
+    "#" are comments.
 
     InputRefused for a file that cannot be read."""
-    lines = (line.strip() for line in read_text(file).splitlines())
+    lines = (line.strip() for line in read_text(file).split("\n"))
     return [file.parent / line for line in lines if line and not line.startswith("#")]
 
 

@@ -75,6 +75,12 @@ def _worked_on(name: str, place: Path, work: Work) -> tuple[Record, int]:
             with environment_failures(str(file)):
                 write_record(file, replace(before, status="begun", begun=begun + 1))
             record, code = _converted(name, place, work, before), 0
+        except FolderBusy as error:
+            record, code = _failed(before, str(error), error.exit_code), error.exit_code
+            if before.status == "begun" and before.begun:
+                # Of the task that is at it: what came of the scan is for that one to say.
+                write_record(file, before)
+                return record, code
         except UsdBrdfError as error:
             record, code = _failed(before, str(error), error.exit_code), error.exit_code
         except MemoryError:
