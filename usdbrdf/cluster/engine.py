@@ -60,7 +60,7 @@ class DaskWorkers:
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
         """See ``job.units.Workers``. Raises EnvironmentFailure where scheduler or workers are gone
         or workers are not like this process, and whatever the unit raises."""
-        store = Store((self._folder or folder).resolve())
+        store = Store((self._folder or folder).absolute())
         work = store.keep_document(
             {
                 "arithmetic": arithmetic(),
