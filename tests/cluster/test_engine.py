@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import usdbrdf.cluster.unit
 from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.cluster.session import workers_of
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, ImageRefused
 from usdbrdf.model.arrays import Array
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
@@ -36,10 +35,12 @@ def client() -> Iterator[Any]:
 def as_ours(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Any]:
     """Makes a function one that workers may be told of."""
 
+    from usdbrdf.cluster import unit as module
+
     def named(unit: Any) -> Any:
-        unit.__module__, unit.__qualname__ = "usdbrdf.cluster.unit", "of_this_test"
-        monkeypatch.setattr(usdbrdf.cluster.unit, "of_this_test", unit, raising=False)
-        monkeypatch.setattr(usdbrdf.cluster.unit, "_shared", usdbrdf.cluster.unit._Kept(1))
+        unit.__module__, unit.__qualname__ = module.__name__, "of_this_test"
+        monkeypatch.setattr(module, "of_this_test", unit, raising=False)
+        monkeypatch.setattr(module, "_shared", module._Kept(1))
         return unit
 
     return named
@@ -129,3 +130,16 @@ def test_without_workers_a_run_ends_though_all_is_sent(
                 next(results)
     finally:
         ended.set()
+
+
+def test_a_photograph_that_a_worker_cannot_read_is_told_with_the_worker(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        raise ImageRefused("/capture/1.exr: cannot be read. [image.unreadable]")
+
+    with (
+        workers_of(client=client) as workers,
+        pytest.raises(EnvironmentFailure, match=r"inproc://\S+ cannot .*/1.exr.*image.unreadable"),
+    ):
+        dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1))
