@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +32,7 @@ from usdbrdf.material.refine import Lighting, Lobes, Refined, refined_irradiance
 from usdbrdf.model.capture import Frames
 from usdbrdf.shading import shaded
 from usdbrdf.texturing.robust_mean import RobustMean
+from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
@@ -207,6 +208,23 @@ def test_with_the_right_lobes_the_diffuse_radiance_comes_back(room: Room, tmp_pa
     before = _off(atlas.map("lit")[which], truth)
     assert before > 0.05
     assert _off(found.diffuse[which], truth) < 0.1 * before
+
+
+def test_base_colour_scatters_the_published_irradiance_of_either_kind_of_lobe(
+    room: Room, tmp_path: Path
+):
+    stage = open_measured(room.glossy)
+    atlas, frames = AssetMaps(stage), frames_from_stage(stage)
+    which, colours = _reflecting(room, atlas), []
+    for kind in (PAPER, DIELECTRIC):
+        run = TaskRun(tmp_path, "fit", tmp_path / str(kind))
+        lit = replace(atlas.lit_scene(black_environment()), lobe=kind)
+        found = _refined_light(run, atlas, lit, frames)
+        scattered = found.base_color * found.irradiance / np.pi
+        whole = which & (found.base_color < 0.99).all(axis=1)
+        np.testing.assert_allclose(scattered[whole], found.diffuse[whole], rtol=1e-3)
+        colours.append(found.base_color[whole].mean())
+    assert abs(colours[1] / colours[0] - 1) > 0.003
 
 
 def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset):

@@ -98,6 +98,26 @@ def test_diffuse_light_passes_the_surface_of_a_dielectric_twice(mi: Any, phi: fl
     assert below == pytest.approx(rho / np.pi * through[0] * through[1] / seen, rel=2e-3)
 
 
+@pytest.mark.parametrize("f0", [0.3, 0.85, 1.0])
+def test_what_is_partly_a_metal_scatters_no_more_than_its_colour(mi: Any, f0: float) -> None:
+    import drjit as dr
+
+    cosines = np.cos(np.radians([5.0, 45.0, 75.0, 85.0]))
+    cos_i, cos_o = (grid.ravel() for grid in np.meshgrid(cosines, cosines))
+    zero, sine = np.zeros_like(cos_i), np.sqrt(1 - cos_o**2)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(cos_i))
+    si.wi = mi.Vector3f(np.sqrt(1 - cos_i**2), zero, cos_i)
+
+    def value(colour: float) -> np.ndarray:
+        bsdf = _plugin(0.2, f0 / 0.08, colour) | {"lobe": DIELECTRIC}
+        found = mi.load_dict(bsdf).eval(mi.BSDFContext(), si, mi.Vector3f(zero, sine, cos_o))
+        return np.array(found)[0] / cos_o
+
+    below = (value(0.1) - value(0.0)) * np.pi / 0.1
+    assert (below > 0).all()
+    assert below.max() < 1.2
+
+
 @pytest.mark.parametrize(("phi", "psi", "rho"), _CASES[1:])
 def test_samples_follow_the_density(mi: Any, phi: float, psi: float, rho: float) -> None:
     sample, density = mi.chi2.BSDFAdapter(

@@ -236,8 +236,9 @@ class Lighting(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Refined:
     """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
-    of the lobes; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal; of several
-    lightings the mean of what each tells, the same for all."""
+    of the lobes, as it counts for what dielectrics scatter below their surface and is seen from the
+    front; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal; of several lightings
+    the mean of what each tells, the same for all."""
 
     diffuse: Float
     irradiance: Float
@@ -293,23 +294,19 @@ def refined_light(
         ]
 
     _, first = reflected([one.before.irradiance for one in lightings])
-    irradiance, scattered = [], []
+    irradiance, seen = [], np.ones((len(texels), 1), np.float32)
+    if lightings[0].lit.lobe == DIELECTRIC:
+        seen[~metal] = share_seen(lobes.phi, lobes.psi)[owner[~metal], None]
     for (name, lit, before, _), diffuse in zip(lightings, first, strict=True):
         change = np.where(before.emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
         traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
         own = run.part(name)
-        irradiance.append(
-            refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
-        )
+        refined = refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
         light = np.where(before.emissive[:, None], before.emission, diffuse).astype(np.float32)
-        scattered.append(
-            np.maximum(irradiance[-1] + let_through_surfaces(own, lit, light, lobes, seed), 0)
-        )
+        refined = refined + let_through_surfaces(own, lit, light, lobes, seed)
+        irradiance.append(np.asarray(np.maximum(refined, 0) / seen, np.float32))
     found = [(diffuse, error) for diffuse, (_, error) in zip(first, found, strict=True)]
-    base_color, shown = reflected(scattered)
-    if lightings[0].lit.lobe == DIELECTRIC:
-        base_color = base_color * share_seen(lobes.phi, lobes.psi)[owner, None]
-        base_color = np.clip(base_color, 0, 1).astype(np.float32)
+    base_color, shown = reflected(irradiance)
     reflects = metal & ~np.all([one.before.emissive for one in lightings], axis=0)
     base_color[reflects] = F0_OF_PSI * lobes.psi[owner[reflects]]
     return [

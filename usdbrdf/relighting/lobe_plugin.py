@@ -9,6 +9,7 @@ import numpy as np
 
 from usdbrdf.transport.brdf import (
     DIELECTRIC,
+    F0_OF_PSI,
     MIN_ALPHA,
     PAPER,
     distribution,
@@ -69,7 +70,8 @@ def register(mi: Any) -> None:
             """t(wi) t(wo) over t as seen from the front."""
             if self.kind != DIELECTRIC:
                 return 1.0
-            mean = dr.mean(f0)
+            # What reflects more is partly a metal; the rest of it is a dielectric.
+            mean = dr.minimum(dr.mean(f0), F0_OF_PSI)
             of_base = share_of_base(mean, DIELECTRIC, dr.minimum)
 
             def place(x: Any, knots: int) -> Any:  # of knots from 0 to 1, in pixels' middles
