@@ -100,6 +100,14 @@ def test_what_was_damaged_is_not_taken(store: Store) -> None:
         store.array(name)
 
 
+def test_what_was_damaged_is_kept_anew(store: Store) -> None:
+    array = np.arange(1000.0)
+    file = store.folder / store.keep(array)
+    file.write_bytes(file.read_bytes()[:-1])
+    assert store.keep(array) == file.name
+    np.testing.assert_array_equal(store.array(file.name), array)
+
+
 @pytest.mark.parametrize("name", ["os:system", "usdbrdf.cli:main.x", "usdbrdfx.cli:main"])
 def test_no_names_but_ours_are_followed(store: Store, name: str) -> None:
     with pytest.raises(UsdBrdfError, match=r"\[cluster.value\]"):

@@ -38,11 +38,10 @@ _GONE = (OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 
 @dataclass
 class _Sent:
-    """A unit that is out: how often it failed, and since when it is out."""
+    """A unit that is out, and how often it failed."""
 
     key: str
     failed: int = 0
-    since: float = 0.0
 
 
 class DaskWorkers:
@@ -53,13 +52,15 @@ class DaskWorkers:
         unit_limit_s: seconds after which a worker is taken to hang at a unit."""
         self._client, self._folder, self._limit = client, shared_folder, unit_limit_s
         self._address = str(client.scheduler.address)
+        # What each worker had to do at the last look, and since when it gave nothing back.
+        self._at_work: dict[str, tuple[frozenset[Any], float]] = {}
 
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
         """See ``job.units.Workers``. Raises EnvironmentFailure where scheduler or workers are gone
         or workers are not like this process, and whatever the unit raises."""
-        store = Store((self._folder or folder).resolve())
+        store = Store((self._folder or folder).absolute())
         work = store.keep_document(
             {
                 "arithmetic": arithmetic(),
@@ -73,11 +74,11 @@ class DaskWorkers:
         back: SimpleQueue[Future] = SimpleQueue()
         try:
             while waiting or out:
-                # One more than can be worked on is out, so that its time tells how long it takes.
+                # One more than can be worked on is out, so that no worker waits for its next.
                 while waiting and len(out) <= self._at_once():
                     sent = waiting.pop()
                     future = self._submitted(str(store.folder), work, told[sent.key])
-                    out[future], sent.since = sent, time.monotonic()
+                    out[future] = sent
                     future.add_done_callback(back.put)
                 try:
                     future = back.get(timeout=_LOOK)
@@ -145,33 +146,57 @@ class DaskWorkers:
         raise error
 
     def _look_after(self, out: dict[Future, _Sent]) -> None:
-        """Restart workers that are at a unit for too long: what they had goes to others."""
-        now, workers = time.monotonic(), dict[Any, str]()
-        late = {future: sent for future, sent in out.items() if now - sent.since > self._limit}
-        if late:
-            found = self._asked(self._client.processing)
-            workers = {key: worker for worker, keys in found.items() for key in keys}
-        elif self._client.status != "running":
+        """Restart workers that give nothing back for too long: what they had goes to others."""
+        if self._client.status != "running":
             raise self._gone()
-        hung = dict.fromkeys(workers[future.key] for future in late if future.key in workers)
-        for sent in late.values():
-            sent.since, sent.failed = now, sent.failed + 1
+        self._at_once()
+        found = self._asked(self._client.processing)
+        now, before = time.monotonic(), self._at_work
+        self._at_work = {}
+        for worker, keys in found.items():
+            held = frozenset(keys)
+            earlier, since = before.get(worker, (held, now))
+            if held:
+                self._at_work[worker] = (held, since if earlier <= held else now)
+        ours = {future.key: sent for future, sent in out.items()}
+        for worker, (held, since) in [*self._at_work.items()]:
+            late = [ours[key] for key in held if key in ours]
+            if late and now - since > self._limit:
+                self._give_up(worker, late)
+
+    def _give_up(self, worker: str, late: list[_Sent]) -> None:
+        """Restart a worker that hangs, unless others hung at its units before."""
+        for sent in late:
+            sent.failed += 1
             if sent.failed == _TRIES:
                 raise EnvironmentFailure(
                     f"{sent.key}: {_TRIES} workers did not finish it in {self._limit:g} s each. "
                     "Allow more with --unit-limit. [cluster.hangs]"
                 )
-        for worker in hung:
-            say(
-                f"{worker}: this worker is at its unit of work for over {self._limit:g} s. It is "
-                "restarted, and others do its work. [cluster.hangs]"
-            )
-            self._restart(worker)
+        say(
+            f"{worker}: this worker is at its unit of work for over {self._limit:g} s. It is "
+            "restarted, or dropped where it has no nanny, and others do its work. [cluster.hangs]"
+        )
+        self._restart(worker)
+        del self._at_work[worker]
 
     def _restart(self, worker: str) -> None:
         how = {"timeout": _STOPPING, "raise_for_error": False}
-        with suppress(KeyError):  # gone meanwhile
+        try:
             self._asked(lambda: self._client.restart_workers([worker], **how))
+        except KeyError:  # gone meanwhile
+            pass
+        except ValueError:  # it has no nanny: the scheduler forgets it, and tells it to end
+            scheduler = self._client.scheduler
+            self._asked(
+                lambda: self._client.sync(
+                    scheduler.restart_workers,
+                    workers=[worker],
+                    wait_for_workers=False,
+                    on_error="return",
+                    stimulus_id="usdbrdf-hangs",
+                )
+            )
 
     def _gone(self) -> EnvironmentFailure:
         return EnvironmentFailure(

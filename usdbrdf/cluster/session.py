@@ -27,6 +27,8 @@ _UNWATCHED = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
+# Of a terminal's Ctrl-C, which all its processes get, this one tells and ends the others.
+_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
 
 @contextmanager
@@ -124,6 +126,7 @@ def _started(count: int, environment: Mapping[str, str]) -> Any:
                     # Pages of mapped files would count, which the system may take back.
                     memory_limit=0,
                     env=environment,
+                    preload=[_DEAF],
                 )
         except (OSError, RuntimeError, TimeoutError) as error:
             if last:

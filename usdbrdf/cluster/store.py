@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.atomic import sha256_of, temporary_beside
 from usdbrdf.files.documents import load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
+
+# Of a SHA-256, with which every name begins.
+_DIGITS = 64
 
 
 class Store:
@@ -47,7 +51,7 @@ class Store:
         for part in parts:
             digest.update(part)
         path = self.folder / f"{digest.hexdigest()}{ending}"
-        if not path.is_file():
+        if not (path.is_file() and sha256_of(path) == digest.hexdigest()):
             self.folder.mkdir(parents=True, exist_ok=True)
             with temporary_beside(path) as staged:
                 with staged.open("wb") as file:
@@ -71,7 +75,8 @@ class Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         with temporary_beside(self.folder / "result.npz") as staged:
             save_arrays(staged, arrays)
-            name = f"{sha256_of(staged)}.npz"
+            # A name of its own: whoever reads it deletes it, and others may have found the same.
+            name = f"{sha256_of(staged)}-{secrets.token_hex(8)}.npz"
             staged.replace(self.folder / name)
         return name
 
@@ -90,7 +95,7 @@ class Store:
                 f"{path}: cannot be read here ({error.strerror}). Give a folder that all workers "
                 "see, under the same name, as --shared-folder. [cluster.folder]"
             ) from error
-        if found != name.partition(".")[0]:
+        if found != name[:_DIGITS]:
             raise EnvironmentFailure(
                 f"{path}: is not what its name tells. See whether its disk is full or damaged. "
                 "[cluster.folder]"

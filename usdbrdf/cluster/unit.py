@@ -14,11 +14,12 @@ from threading import RLock
 from typing import Any
 
 import llvmlite.binding
+from distributed import get_worker
 from threadpoolctl import threadpool_limits
 
 from usdbrdf.cluster.described import Document, restored
 from usdbrdf.cluster.store import Store
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, ImageRefused
 from usdbrdf.identity import tasks_identity
 
 # What a worker keeps for its next units: of tasks that are done nothing is needed any more, and of
@@ -94,4 +95,10 @@ def done(folder: str, work: str, piece: Document) -> str:
     unit, shared = _shared.get(work, read)
     # As where units are done in one process: BLAS's threads only wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
-        return store.keep_result(dict(unit(shared, value(piece))))
+        try:
+            return store.keep_result(dict(unit(shared, value(piece))))
+        except ImageRefused as error:  # which ingest could read, where this run was started
+            raise EnvironmentFailure(
+                f"the worker {get_worker().address} cannot read a photograph of the capture. Let "
+                f"all workers see the capture's folder under the same name. {error}"
+            ) from error

@@ -1,0 +1,145 @@
+"""What becomes of units: each once, also where results are equal or workers hang."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+
+from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.cluster.session import workers_of
+from usdbrdf.errors import EnvironmentFailure, ImageRefused
+from usdbrdf.model.arrays import Array
+
+pytest.importorskip("distributed", reason="the extra cluster is not installed")
+
+
+@pytest.fixture
+def client() -> Iterator[Any]:
+    """Of two workers without nannies, which are threads of this process."""
+    from distributed import Client
+
+    with Client(
+        processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as client:
+        yield client
+
+
+@pytest.fixture
+def as_ours(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Any]:
+    """Makes a function one that workers may be told of."""
+
+    from usdbrdf.cluster import unit as module
+
+    def named(unit: Any) -> Any:
+        unit.__module__, unit.__qualname__ = module.__name__, "of_this_test"
+        monkeypatch.setattr(module, "of_this_test", unit, raising=False)
+        monkeypatch.setattr(module, "_shared", module._Kept(1))
+        return unit
+
+    return named
+
+
+def test_units_that_find_the_same_are_done_once_each(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    done = Counter[int]()
+
+    def unit(shared: float, piece: int) -> dict[str, Array]:
+        done[piece] += 1
+        return {"found": np.full(300, shared)}
+
+    pieces = {f"piece-{i}": i for i in range(40)}
+    with workers_of(client=client) as workers:
+        found = dict(workers.results(as_ours(unit), 2.5, pieces, tmp_path / "shared", 1))
+    assert found.keys() == pieces.keys()
+    assert all(np.array_equal(arrays["found"], np.full(300, 2.5)) for arrays in found.values())
+    assert done == Counter(range(40))
+    assert "done again" not in capfd.readouterr().err
+    assert not list((tmp_path / "shared").glob("*.npz"))
+
+
+def test_a_worker_that_hangs_without_a_nanny_is_dropped(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    begun, ended = Counter[int](), Event()
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        begun[piece] += 1
+        if piece == 1 and begun[1] == 1:
+            ended.wait(20)
+        return {"found": np.array([piece])}
+
+    pieces = {f"piece-{i}": i for i in range(6)}
+    options = ClusterOptions(unit_limit=1.0)
+    try:
+        with workers_of(options, client) as workers:
+            found = dict(workers.results(as_ours(unit), None, pieces, tmp_path / "shared", 1))
+    finally:
+        ended.set()
+    assert {key: int(arrays["found"][0]) for key, arrays in found.items()} == pieces
+    assert capfd.readouterr().err.count("[cluster.hangs]") == 1
+    assert len(client.nthreads()) == 1
+
+
+def test_a_worker_that_gives_back_in_time_is_left_alone_though_units_wait(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        time.sleep(1.2)
+        return {"found": np.array([piece])}
+
+    client.retire_workers([next(iter(client.nthreads()))])
+    with workers_of(ClusterOptions(unit_limit=1.8), client) as workers:
+        pieces = {f"piece-{i}": i for i in range(3)}
+        assert len(dict(workers.results(as_ours(unit), None, pieces, tmp_path / "s", 1))) == 3
+    assert "[cluster.hangs]" not in capfd.readouterr().err
+
+
+def test_without_workers_a_run_ends_though_all_is_sent(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from usdbrdf.cluster import engine
+
+    monkeypatch.setattr(engine, "_NO_WORKERS", 0.5)
+    ended = Event()
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        if piece:
+            ended.wait(10)
+        return {"found": np.array([piece])}
+
+    try:
+        with workers_of(client=client) as workers:
+            pieces = {"0": 0, "1": 1}
+            results = workers.results(as_ours(unit), None, pieces, tmp_path / "shared", 1)
+            assert next(results)[0] == "0"
+            client.sync(
+                client.scheduler.restart_workers,
+                workers=[*client.nthreads()],
+                wait_for_workers=False,
+                stimulus_id="test",
+            )
+            with pytest.raises(EnvironmentFailure, match=r"no worker came.*\[cluster.workers\]"):
+                next(results)
+    finally:
+        ended.set()
+
+
+def test_a_photograph_that_a_worker_cannot_read_is_told_with_the_worker(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        raise ImageRefused("/capture/1.exr: cannot be read. [image.unreadable]")
+
+    with (
+        workers_of(client=client) as workers,
+        pytest.raises(EnvironmentFailure, match=r"inproc://\S+ cannot .*/1.exr.*image.unreadable"),
+    ):
+        dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1))
