@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from usdbrdf.job.task import TaskRun
+from usdbrdf.job.units import HERE
 from usdbrdf.material import fit_views
 from usdbrdf.material.conductor import conductor_of
 from usdbrdf.material.fit_lobe import FittedKind
@@ -119,13 +122,14 @@ def test_a_metal_is_published_as_one():
 EVIDENCE = {PAPER: 0.7, DIELECTRIC: 0.6}
 
 
-class _Run:
+class _Run(TaskRun):
     """One object that shows a lobe, and one with too few samples."""
 
     def __init__(self, clearer: float) -> None:
+        self._workers, self._for_workers = HERE, Path()
         self.clearer = clearer
 
-    def checkpoint_if(self, name: str) -> dict[str, np.ndarray] | None:
+    def checkpoint_if(self, name: str, index: int | None = None) -> dict[str, np.ndarray] | None:
         if "look" not in name:
             return None
         if not name.endswith("0"):
@@ -133,7 +137,7 @@ class _Run:
         shows = {kind: _lobe(evidence) for kind, evidence in EVIDENCE.items()}
         return FirstLook(shows, 40, self.clearer).arrays()
 
-    def save(self, name: str, found: dict[str, np.ndarray]) -> None:
+    def save(self, name: str, found: dict[str, np.ndarray], index: int | None = None) -> None:
         assert name.startswith("object")
 
 

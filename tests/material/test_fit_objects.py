@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from usdbrdf.job.task import TaskRun
+from usdbrdf.job.units import HERE
 from usdbrdf.material import fit_objects
 from usdbrdf.material.fit_objects import ObjectFit
 from usdbrdf.transport.lit_scene import LitScene
 
 
-class _Run:
+class _Run(TaskRun):
     def __init__(self) -> None:
+        self._workers, self._for_workers = HERE, Path()
         self.saved: dict[str, dict[str, np.ndarray]] = {}
 
-    def checkpoint_if(self, name: str) -> dict[str, np.ndarray] | None:
+    def checkpoint_if(self, name: str, index: int | None = None) -> dict[str, np.ndarray] | None:
         return ObjectFit(cost=-1.0).arrays() if name == "object-1" else None
 
-    def save(self, name: str, found: dict[str, np.ndarray]) -> None:
+    def save(self, name: str, found: dict[str, np.ndarray], index: int | None = None) -> None:
         self.saved[name] = found
 
 

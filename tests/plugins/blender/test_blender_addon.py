@@ -279,7 +279,7 @@ def test_a_missing_program(session, tmp_path):
 def test_cancel(session, program, tmp_path):
     scan = make_capture(tmp_path / FOLDER / "scan").folder
     # Fine enough that tracing has not ended when the texture step says it has.
-    told = session("cancel", program, scan, tmp_path / "asset", 0.02)
+    told = session("cancel", program, scan, tmp_path / "asset", 0.01)
     assert told["state"] == "cancelled"
     assert told["line"] == "terminated; the same command goes on from here."
     assert labels(told["panel"]).startswith("Cancelled")
