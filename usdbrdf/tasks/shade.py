@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -52,7 +52,10 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
-        objects = _write_maps(writer, shaded, asked)
+        objects = [
+            replace(item, directive=asked.get(item.identifier, ""))
+            for item in _write_maps(writer, shaded)
+        ]
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
         lamps = [
@@ -78,7 +81,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     return task.run(work, workers)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> list[ShadedObject]:
+def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
     """Every object's pictures, and the record that names them."""
     traced = shaded.traced
     maps = {
@@ -110,7 +113,6 @@ def _write_maps(writer: MapWriter, shaded: Shaded, asked: dict[str, str]) -> lis
                 rays_per_texel=float(traced.rays[own].mean()),
                 standard_error=float(np.median(shaded.relative_error[own])),
                 escaped_fraction=float(mean(traced.escaped)),
-                directive=asked.get(obj.identifier, ""),
             )
         )
     return objects
