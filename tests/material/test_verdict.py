@@ -111,7 +111,7 @@ def test_a_lobe_that_explains_less_is_less_certain_of_phi():
 @pytest.mark.fault("L2")
 def test_what_no_frame_sees_is_unseen():
     found = verdict_on_views(None, False)
-    assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.5, 1.0, "unseen")
+    assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.0, 1.0, "unseen")
     assert found.phi_error == found.psi_error == pytest.approx(NOTHING_KNOWN)
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.

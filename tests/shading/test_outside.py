@@ -10,6 +10,7 @@ from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import outside
 from usdbrdf.shading.outside import Outside, light_from_outside
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
+from usdbrdf.texturing.footprints import blurred
 from usdbrdf.transport.environment import (
     NO_SUN,
     Environment,
@@ -238,3 +239,32 @@ def test_the_ground_beyond_may_be_darker_than_the_sky_over_it(yard, monkeypatch)
     monkeypatch.setattr(outside, "_ALIKE_OVER_HORIZON", outside._ALIKE)
     assert found < 0.25
     assert found < 0.5 * of_sky()
+
+
+@pytest.fixture(scope="module")
+def pergola():
+    """A yard of 6 m with walls on two sides, and slats of 42 cm above it."""
+    slats = [quad((0, y, 2.2), (6, 0, 0), (0, 0.42, 0), (24, 2)) for y in np.arange(0, 6, 0.84)]
+    return world_of([
+        quad((0, 0, 0), (6, 0, 0), (0, 6, 0), (72, 72)),
+        quad((0, 6, 0), (6, 0, 0), (0, 0, 2), (60, 20)),
+        quad((0, 0, 0), (0, 6, 0), (0, 0, 2), (60, 20)),
+        *box((3, 3, 0.01), (4, 4.5, 1.0), (24, 24)),
+        *slats,
+    ])  # fmt: skip
+
+
+def test_stripes_of_shadow_that_pixels_blur_are_not_taken_for_light_around_the_sun(pergola):
+    surface, lit, _ = _lit(pergola, Environment(SKY, True).under(SUN), texture=0.05)
+    texels = surface.texels
+    pixels = np.tile(np.float32([0.7, 0, 0.7]), (len(texels), 1))
+    shown = blurred(texels, lit, pixels)
+    every = np.ones(len(lit), np.bool_)
+    # All of the sky but what lies within 25 degrees of the sun.
+    seen = _seen(directions_of_pixels(HEIGHT, WIDTH, True) @ TOWARDS < np.cos(np.radians(25)))
+    found = light_from_outside(surface, shown, CoverageMap.of(every, ~every), seen, True, seed=3)
+    assert found is not None
+    unseen = ~seen.coverage.measured.reshape(HEIGHT, WIDTH) & (_UP > 0)
+    around = found.environment.image[unseen].mean(axis=0) / SKY[unseen].mean(axis=0)
+    assert (around < 2.5).all()
+    np.testing.assert_allclose(found.environment.sun.irradiance, SUN.irradiance, rtol=0.15)

@@ -87,7 +87,7 @@ def likely_lobes(
         log = log + np.where(known.psi > psi_upper, np.log(_BEYOND_BOUND), 0.0)
     density = np.exp(log - log.max())
     # All that is known then is that the chance of a lobe lies between none and this.
-    chance = (1 - NO_LOBE) / 2 if psi == 0 else 1.0
+    chance = (1 - NO_LOBE) / 2 if psi == 0 and psi_upper < 1 else 1.0
     return np.asarray(chance * density / density.sum(), np.float64)
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from usdbrdf import calibration
 from usdbrdf.errors import EnvironmentFailure
@@ -25,7 +26,7 @@ from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.base_color import Reflection, base_color_of
 from usdbrdf.shading.shaded import by_tiles, denoised_irradiance
@@ -187,6 +188,8 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
+# Texels around what was seen that are like it.
+_RIM = 3
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
@@ -270,6 +273,7 @@ def refined_light(
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
     owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
+    out_of_sight = [_out_of_sight(texels, one.before) for one in lightings]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
         """Base colour, and of each lighting L_d with what it reflects where nobody looked."""
@@ -285,12 +289,8 @@ def refined_light(
         ]
         base_color = base_color_of(texels, shown)
         return base_color, [
-            np.where(
-                ~(one.known | one.emissive)[:, None],
-                base_color * one.irradiance / np.pi,
-                one.radiance,
-            )
-            for one in shown
+            np.where(unseen[:, None], base_color * one.irradiance / np.pi, one.radiance)
+            for one, unseen in zip(shown, out_of_sight, strict=True)
         ]
 
     _, first = reflected([one.before.irradiance for one in lightings])
@@ -313,6 +313,16 @@ def refined_light(
         Refined(diffuse=own.astype(np.float32), irradiance=incoming, base_color=base_color)
         for own, incoming in zip(shown, irradiance, strict=True)
     ]
+
+
+def _out_of_sight(texels: Texels, before: LightBefore) -> Bool:
+    """Texels (T,) that no frame shows and that nothing seen is read together with: beyond the foot
+    of a wall they may lie in the sun, and the last texels before it few frames show."""
+    shown, found = before.coverage.observed | before.emissive, np.zeros(len(texels), np.bool_)
+    for i in range(len(texels.resolution)):
+        near = binary_dilation(texels.image(i, shown), np.ones((3, 3)), iterations=_RIM)
+        found[texels.of_object(i)] = ~texels.from_image(i, near)
+    return found
 
 
 def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tuple[Float, Float]:

@@ -150,8 +150,8 @@ def _deviation(density: Double, values: Double, about: float) -> float:
     return float(np.sqrt((density * (values - about) ** 2).sum()))
 
 
-# Of [0, 1], where nothing is known.
-NEUTRAL = (0.5, 0.5)
+# What is shown of what could not be asked: no lobe, which was as likely as one.
+NEUTRAL = (0.5, 0.0)
 _OF_WORD = calibration.pairs("prior.classes")
 
 

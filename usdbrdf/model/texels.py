@@ -113,6 +113,17 @@ class Texels:
     def of_object(self, index: int) -> slice:
         return slice(int(self.first_texel[index]), int(self.first_texel[index + 1]))
 
+    def beside(self, index: Long, right: int, down: int) -> Int:
+        """(N,): the texels that lie so many pixels to the right and down of texels ``index`` in
+        their atlas; each itself where none does."""
+        owner = self.object_index()[index]
+        width, height = self.resolution[owner].T
+        row, column = np.divmod(self.pixel[index] - self.first_pixel[owner], width)
+        column = np.clip(column + right, 0, width - 1)
+        row = np.clip(row + down, 0, height - 1)
+        texel = self.nearest_texel[self.first_pixel[owner] + row * width + column]
+        return np.where(texel >= 0, texel, index).astype(np.int32)
+
     def image(self, index: int, values: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """(H, W, ...) picture of per-texel values (T, ...) of one object, gutters dilated."""
         width, height = self.resolution[index]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -40,6 +41,9 @@ from usdbrdf.transport.warps import cosine_rays
 # the rays by which each of them meets the sky: at first, and where it does.
 _PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS = 240, 30, 80
 _FIRST_RAYS, _RAYS = 32, 1024
+# To be chosen from, and texels to the side of one that see, up to this difference of their cosine
+# to it, as much of the sun.
+_MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
 # Lower and upper elevation of a band of patches, degrees, and their number.
 _BANDS = (
     (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
@@ -150,7 +154,7 @@ def light_from_outside(
         share, open_share = _shares(surface, asked, unseen, z_up, seed, rays)
         if open_share < _LEAST_OPEN:
             return None
-    asked = asked._replace(irradiance=_light_of_seen(surface, lit, asked, seen, z_up, seed))
+    asked = _under_what_was_seen(surface, lit, asked, seen, z_up, seed)
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     sky = _sky(asked, seen, patches, share, used, z_up)
@@ -165,12 +169,19 @@ def light_from_outside(
     assert sun is not None
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     error = jackknife(*with_sun, found)
-    found = levelled(*with_sun, found)
-    sun_error = float(error[-1].max())
     # What no texel sees keeps what was thought of it before, and errs by nothing.
-    sees = int(np.count_nonzero(with_sun[1].share[-1]))
-    shines = sees >= _LEAST_OF_SEGMENT and sun_error < _MOST_SUN_ERROR and strength > _LEAST_SUN
+    sees = np.count_nonzero(with_sun[1].share[-1]) >= _LEAST_OF_SEGMENT
+    shines = sees and error[-1].max() < _MOST_SUN_ERROR and strength > _LEAST_SUN
     if shines:
+        many = asked_texels(surface.texels, lit, coverage, seed, _MANY_PER_SEGMENT)
+        assert many is not None
+        if (clear := _clearly_lit(surface, many, sun, seed)) is not None:
+            share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
+            clear = _under_what_was_seen(surface, lit, clear, seen, z_up, seed)
+            with_sun = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
+            found = solved(*with_sun)
+            error = jackknife(*with_sun, found)
+        found = levelled(*with_sun, found)
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
         sun, found = NO_SUN, solved(asked, sky)
@@ -187,13 +198,15 @@ def light_from_outside(
         confidence=seen.coverage.stored().reshape(HEIGHT, WIDTH),
         open_share=open_share,
         sky_error=sky_error,
-        sun_error=sun_error if shines else math.nan,
+        sun_error=float(error[-1].max()) if shines else math.nan,
     )
 
 
-def asked_texels(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -> Asked | None:
-    """Texels of the largest segments that were measured, with some of them that clip, and no light
-    yet; None where there are too few."""
+def asked_texels(
+    texels: Texels, lit: Float, coverage: CoverageMap, seed: int, most: int = _PER_SEGMENT
+) -> Asked | None:
+    """Texels of the largest segments that were measured, with some of them that clip, ``most`` of
+    each, and no light yet; None where there are too few."""
     usable = np.flatnonzero(coverage.observed & texels.interior & (lit > 0).all(axis=1))
     segment = texels.segments(usable)
     measured = coverage.measured[usable]
@@ -206,7 +219,7 @@ def asked_texels(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -
     if not len(largest):
         return None
     rank = np.random.default_rng(seed ^ _SEED).permutation(len(usable))
-    kept = first_of_segments(rank, segment, largest, _PER_SEGMENT)
+    kept = first_of_segments(rank, segment, largest, most)
     many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= _LEAST_OF_SEGMENT / 2
     kept = kept[many]
     if not len(kept):
@@ -221,14 +234,37 @@ def asked_texels(texels: Texels, lit: Float, coverage: CoverageMap, seed: int) -
     )
 
 
-def _light_of_seen(
+def _under_what_was_seen(
     surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
-) -> Double:
-    """S (N, 3), W/m^2, of the texels asked by all that frames measured."""
+) -> Asked:
+    """The texels asked with S, W/m^2, of all that frames measured."""
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
     irradiance = irradiance_of_texels(surface, lit, environment, asked.texel, seed)
-    return np.maximum(irradiance, _DARK * np.median(asked.reflected)).astype(np.float64)
+    least = _DARK * np.median(asked.reflected)
+    return asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
+
+
+def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> Asked | None:
+    """Of the texels asked those around which all see as much of the sun, as many of each segment in
+    its light as in shadow where there are; None if hardly one is in the sun.
+
+    Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
+    shadows passes for light from all around the sun."""
+    share, clear = sunlit(surface, asked.texel, sun, seed), np.ones(len(asked.texel), np.bool_)
+    for down, right in product((-_AROUND, 0, _AROUND), repeat=2):
+        beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
+        clear &= np.abs(sunlit(surface, beside, sun, seed) - share) < _AS_SUNLIT
+    every = np.arange(int(asked.segment.max()) + 1)
+    halves = [
+        first_of_segments(np.flatnonzero(clear & part), asked.segment, every, _PER_SEGMENT // 2)
+        for part in (share > 0, share <= 0)
+    ]
+    if len(halves[0]) < _LEAST_OF_SEGMENT:
+        return None
+    chosen = asked.of(np.sort(np.concatenate(halves)))
+    segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
+    return chosen._replace(segment=segment)
 
 
 def _patches(clipped: Bool, z_up: bool) -> Int:
