@@ -409,7 +409,16 @@ def realityscan(folder: Path) -> list[Seed]:
 
 def e57(folder: Path) -> list[Seed]:
     survey = test_scan_from_e57.write_survey(folder / "survey", _room())
-    return _capture(survey / "scan.e57", "scan.e57")
+    more = test_scan_from_e57.write_survey(folder / "more", _room())
+    pinholes = test_scan_from_e57._pinholes(_room())
+    sphere = {"imageWidth": 32, "imageHeight": 16, "pixelWidth": np.pi / 16,
+              "pixelHeight": np.pi / 16}  # fmt: skip
+    around = {"name": "around", "pose": pinholes[0]["pose"], "sphericalRepresentation": sphere}
+    absent = {**pinholes[0], "name": "not there"}
+    test_scan_from_e57._write(more / "scan.e57", [*pinholes, around, absent])
+    pixels = np.random.default_rng(0).random((16, 32, 3), np.float32)
+    write_image(more / "images" / "around.jpg", pixels)
+    return [*_capture(survey / "scan.e57", "scan.e57"), *_capture(more, "scan.e57")]
 
 
 # --- USD -----------------------------------------------------------------------------------------
@@ -574,19 +583,24 @@ def package(path: Path, entries: Mapping[str, bytes]) -> Path:
 
 
 def stage_with_pictures(folder: Path) -> list[Seed]:
-    """A stage as a capture: cameras by the names of their pictures, and one with back plates."""
+    """A stage as a capture: cameras by the names of their pictures, one with back plates, one by
+    the numbers of its pictures."""
     room, found = _room(), []
-    for name in ("still", "moving"):
+    for name in ("still", "moving", "numbered"):
         stage = test_scan_from_usd_stage.make_stage(folder / name / "room.usda", room)
         if name == "still":
             test_scan_from_usd_stage.many_cameras(stage, room)
         else:
-            plates = [f"./images/IMG-{i:03d}.exr" for i in range(len(room.images))]
-            test_scan_from_usd_stage.moving_camera(stage, room, plates)
+            plates = [f"./images/IMG-{i:03d}.exr" for i in range(101, 101 + len(room.images))]
+            named = plates if name == "moving" else None
+            test_scan_from_usd_stage.moving_camera(stage, room, named)
         stage.Save()
-        for i, image in enumerate(room.images):
+        first = 0 if name == "still" else 101
+        for i, image in enumerate(room.images, first):
             write_image(folder / name / "images" / f"IMG-{i:03d}.exr", image)
-        found += _alone(folder / name / "room.usda")
+        alone = name == "numbered"  # the only stage in its folder
+        entry = folder / name if alone else folder / name / "room.usda"
+        found.append(Seed(entry=entry, targets=(folder / name / "room.usda",)))
     return found
 
 
