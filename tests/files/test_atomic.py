@@ -7,6 +7,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -96,6 +97,15 @@ def test_kill_around_the_rename(tmp_path, side):
     assert path.read_text() == ("old" if side == "before" else "new")
 
 
+NOBODY = 2**22 + 1  # no process has a higher number than 2^22
+
+
+def named(process):
+    """As temporary files of a process of this machine are."""
+    machine = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+    return f".tmp-{machine}-{process}-00000000"
+
+
 def killed_while(tmp_path, work):
     """Have a process killed while something temporary lies in ``tmp_path``; what it leaves."""
     code = (
@@ -114,7 +124,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write_beside_it(tmp_path,
     assert len(left) == 1
     # As USD names what it writes under a name of ours, and what only looks like one.
     (tmp_path / f"{left.pop().removesuffix('.usda')}.2YgHvW").touch()
-    others = {".tmp-mine", ".tmp-12-notours", "tmp-1-00000000"}
+    others = {".tmp-mine", ".tmp-12-notours", ".tmp-0badf00d-4194305-00000000", "tmp-1-00000000"}
     for name in others:
         (tmp_path / name).touch()
     write_text_atomic(tmp_path / "b.txt", "new")
@@ -123,12 +133,12 @@ def test_what_a_killed_process_left_goes_with_the_next_write_beside_it(tmp_path,
 
 def test_what_another_process_is_writing_stays(tmp_path):
     """Whether it can be seen, or only its lock: it may run in another container."""
-    seen = tmp_path / "seen" / f".tmp-{os.getpid()}-00000000"
+    seen = tmp_path / "seen" / named(os.getpid())
     seen.mkdir(parents=True)
     write_text_atomic(tmp_path / "seen" / "a.txt", "new")
     assert seen.is_dir()
     (tmp_path / "locked").mkdir()
-    unseen = tmp_path / "locked" / f".tmp-{2**22 + 1}-00000000"
+    unseen = tmp_path / "locked" / named(NOBODY)
     unseen.touch()
     with temporary_folder(tmp_path / "locked" / "mine"):
         unseen.touch()
@@ -146,7 +156,7 @@ def test_without_locks_nothing_is_swept_and_all_is_written(tmp_path, monkeypatch
     def failing(_descriptor, _operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    left = tmp_path / f".tmp-{2**22 + 1}-00000000.txt"
+    left = tmp_path / f"{named(NOBODY)}.txt"
     left.touch()
     monkeypatch.setattr(fcntl, "flock", failing)
     write_text_atomic(tmp_path / "a.txt", "new")

@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +22,11 @@ from usdbrdf.errors import EnvironmentFailure
 
 TEMPORARY_PREFIX = ".tmp-"
 _BLOCK = 1 << 20  # bytes hashed at a time
-# What we name so, and what a library that writes it names so on the way.
-_TEMPORARY = re.compile(rf"{re.escape(TEMPORARY_PREFIX)}(?P<process>[1-9]\d*)-[0-9a-f]{{8}}(\..*)?")
+# Names of ours tell machine and process; what a library names so on the way ends otherwise.
+_MACHINE = hashlib.sha256(socket.gethostname().encode("utf-8", "replace")).hexdigest()[:8]
+_TEMPORARY = re.compile(
+    rf"{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}}(\..*)?"
+)
 _swept: set[Path] = set()  # once in a process is enough
 
 
@@ -79,8 +83,7 @@ def write_text_atomic(path: Path, text: str) -> None:
 @contextmanager
 def temporary_beside(path: Path) -> Iterator[Path]:
     """A fresh name in the folder of ``path``, with its suffix; gone at the end unless published."""
-    name = f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}"
-    staged = path.with_name(name)
+    staged = path.with_name(f"{_new_name()}{path.suffix}")
     with _at_work_in(staged.parent):
         try:
             yield staged
@@ -93,7 +96,7 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 def temporary_folder(final: Path) -> Iterator[Path]:
     """A fresh folder beside ``final``; gone at the end unless published."""
     final.parent.mkdir(parents=True, exist_ok=True)
-    staged = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
+    staged = final.with_name(_new_name())
     with _at_work_in(staged.parent):
         staged.mkdir()
         try:
@@ -102,12 +105,17 @@ def temporary_folder(final: Path) -> Iterator[Path]:
             shutil.rmtree(staged, ignore_errors=True)
 
 
+def _new_name() -> str:
+    return f"{TEMPORARY_PREFIX}{_MACHINE}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
 @contextmanager
 def _at_work_in(folder: Path) -> Iterator[None]:
     """Hold a lock on a folder, with all others who have something temporary in it; who comes when
     nobody does removes what killed ones left.
 
-    Where a file system has no such locks nobody removes anything.
+    Where a file system has no such locks nobody removes anything; where it has them for each
+    machine apart, none removes what another made.
     """
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -130,7 +138,7 @@ def _at_work_in(folder: Path) -> Iterator[None]:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove this user's temporary files and folders whose processes are no more."""
+    """Remove temporary files and folders of this user and machine whose processes are no more."""
     for place in folder.iterdir():
         named = _TEMPORARY.fullmatch(place.name)
         if named is None or place.lstat().st_uid != os.geteuid() or _lives(int(named["process"])):
