@@ -140,8 +140,11 @@ def test_what_another_process_is_writing_stays(tmp_path):
     (tmp_path / "locked").mkdir()
     unseen = tmp_path / "locked" / named(NOBODY)
     unseen.touch()
-    with temporary_folder(tmp_path / "locked" / "mine"):
-        unseen.touch()
+    with contextlib.ExitStack() as longest:
+        # Two at once, of which the one that came first, and swept, ends first.
+        with temporary_folder(tmp_path / "locked" / "mine"):
+            unseen.touch()
+            longest.enter_context(temporary_folder(tmp_path / "locked" / "mine"))
         code = (
             "import sys; from pathlib import Path; from usdbrdf.files.atomic import *;"
             "write_text_atomic(Path(sys.argv[1]), 'new')"
