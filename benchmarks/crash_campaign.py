@@ -479,6 +479,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     print(f"{fault}, {start.name}: {time.monotonic() - began:.0f} s", flush=True)
             print(f"round {number + 1} of {chosen.rounds}")
             status = told(campaign, chosen.json)
+            if time.monotonic() > end:
+                break
     return status
 
 
