@@ -1,26 +1,34 @@
 """Does a step that was disturbed anywhere end in the same bytes when it is run again?
 
-    python benchmarks/crash_campaign.py [--runs 10] [--cuts 20] [--steps shade fit]
-        [--faults kill terminate ...] [--minutes 60] [--seed 0] [--json FILE]
+    python benchmarks/crash_campaign.py [--runs 10] [--cuts 20] [--rounds 1] [--steps shade fit]
+        [--faults kill terminate ...] [--minutes 60] [--seed 0] [--work DIR] [--json FILE]
 
 A tiny generated room is converted, one step at a time, each from an asset that lacks the step and
 from one that has it with other options. The step runs in a forked process, whose calls of the file
-system are counted (`system_calls.py`); at the n-th write, flush, rename, removal or creation,
-spread evenly over all calls of each kind, it is killed (SIGKILL), told to end (SIGTERM, SIGINT),
-stopped while the same command runs beside it, finds its disk full, an input that cannot be read,
-its mount gone, little memory, a clock that jumps, or the power off (`power_loss.py`: `--cuts` for
-each start). Then the same command runs again: every file of the asset must have the bytes of an
-undisturbed run, the artist's `edits.usda` those that it had, and no file of ours may be left
-beside. What a run has finished must survive the power as it is. Exit code 1 if anything differs.
+system are counted (`system_calls.py`); at the n-th write, flush, rename, removal or creation, one
+in each equal share of all calls of each kind, it is killed (SIGKILL), told to end (SIGTERM,
+SIGINT), stopped while the same command runs beside it, finds its disk full, an input that cannot
+be read, its mount gone, little memory, a clock that jumps, or the power off (`power_loss.py`:
+`--cuts` for each start). Then the same command runs again: every file of the asset must have the
+bytes of an undisturbed run, the artist's `edits.usda` those that it had, and no file of ours may be
+left beside. What a run has finished must survive the power as it is. Exit code 1 if anything
+differs.
+
+A run of a step takes as long as its own work: it is forked from a process that has imported what
+the steps import, and the asset before it is made once. In memory (`--work /dev/shm`) flushes take
+no time. A run that ended before its call came counts for nothing. With `--rounds` all is done
+several times, each at other calls, and what was found is written after each.
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import importlib
 import itertools
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -30,7 +38,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,9 +48,6 @@ from kill_sweep import STEPS, contents, verdict
 from power_loss import LOSSES, WATCHED, Disk
 from system_calls import Call, can_watch, run_watched
 
-# Loaded once, for all processes that are forked.
-import usdbrdf.commands
-import usdbrdf.pipeline  # noqa: F401
 from usdbrdf.cli import main as usdbrdf_main
 from usdbrdf.identity import tasks_identity
 from usdbrdf.job.child import scratch_folder
@@ -93,11 +98,34 @@ class Campaign:
 
     def __init__(self, work: Path, seed: int) -> None:
         self.work, self.capture = work, work / "scan"
-        self._cases = itertools.count()
+        self.cases = itertools.count()
         self.rng = np.random.default_rng(seed)
         self.tally: dict[tuple[str, str], list[str]] = {}
+        self.missed = 0
         # In a process of its own: it starts threads, and those of us who fork may have none.
         assert in_fork(lambda: write_tiny(self.capture) or 0) == 0
+
+    def load(self) -> None:
+        """Import what the steps import, once for all processes that are forked."""
+        names, before = self.work / "imported", self.work / "start"
+        before.mkdir()
+        for step in STEPS:
+            case = self.copy_of(before)
+            work = self.work_of(case, step)
+
+            def noted(work: Callable[[], int] = work) -> int:
+                status = work()
+                names.write_text(" ".join(sys.modules))
+                return status
+
+            if (status := in_fork(noted)) != 0:
+                raise SystemExit(f"{step} ended with {status}: {said(case)}")
+            for name in names.read_text().split():
+                with suppress(ImportError):  # the program's own "__mp_main__" and the like
+                    importlib.import_module(name)
+            shutil.rmtree(before)
+            before = case
+        shutil.rmtree(before)
 
     def starts(self, steps: Sequence[str]) -> Iterator[Start]:
         """Each step, where it has not been done and where it was done with other options."""
@@ -142,7 +170,7 @@ class Campaign:
 
     def copy_of(self, before: Path) -> Path:
         """A new case that begins as another."""
-        case = self.work / f"case-{next(self._cases):05d}"
+        case = self.work / f"case-{next(self.cases):05d}"
         shutil.copytree(before, case)
         (case / "tmp").mkdir(exist_ok=True)
         return case
@@ -173,7 +201,12 @@ class Campaign:
         return in_fork(self.work_of(case, step, options))
 
     def ended(self, start: Start, fault: str, where: str, case: Path, status: int) -> None:
-        """Run the same command again where a disturbed one ended, and note the result."""
+        """Run the same command again where a disturbed one ended, and note the result; ``where``
+        is "" if nothing disturbed it."""
+        if not where:
+            self.missed += 1
+            shutil.rmtree(case)
+            return
         problem = ""
         if status not in ENDS[fault] and status != 0:
             problem = f"ended with {status}; "
@@ -189,7 +222,7 @@ class Campaign:
         in_fork(lambda: swept(case / "tmp"))
         if left := sorted({*os.listdir(case)} - {"room", "tmp", "said"}):
             problem += f"left {left}; "
-        if left := os.listdir(case / "tmp"):
+        if left := [file.name for file in (case / "tmp").iterdir() if not is_probe(file)]:
             problem += f"left {left}; "
         problem += "" if result == "identical" else result
         self.note(start, fault, "" if not problem else f"{where}: {problem} {said(case)[-300:]}")
@@ -221,19 +254,28 @@ def swept(temporary: Path) -> int:
         return 0
 
 
+def is_probe(file: Path) -> bool:
+    """Whether Python's own tempfile left it, which writes four bytes to see that it can."""
+    named = re.fullmatch("[a-z0-9_]{8}", file.name)
+    return bool(named) and file.is_file() and file.read_bytes() in (b"", b"blat")
+
+
 def said(case: Path) -> str:
     file = case / "said"
     return file.read_text(errors="replace") if file.is_file() else ""
 
 
-def spread(start: Start, kinds: Sequence[str], runs: int) -> list[tuple[str, int]]:
-    """Kind and number, from 1, of so many calls: each kind its share, evenly over its calls."""
+def spread(
+    campaign: Campaign, start: Start, kinds: Sequence[str], runs: int
+) -> list[tuple[str, int]]:
+    """Kind and number, from 1, of so many calls: each kind its share, and of its calls one in each
+    equal part."""
     there = [kind for kind in kinds if start.calls[kind]]
     chosen = []
     for i, kind in enumerate(there):
         share = len(range(i, runs, len(there)))
-        count = start.calls[kind]
-        chosen += [(kind, 1 + int((k + 0.5) * count / share)) for k in range(share)]
+        places = (np.arange(share) + campaign.rng.random(share)) / max(share, 1)
+        chosen += [(kind, 1 + int(place * start.calls[kind])) for place in places]
     return sorted(set(chosen))
 
 
@@ -243,7 +285,7 @@ class At:
 
     def __init__(self, kind: str, number: int, act: Callable[[Call], int | None]) -> None:
         self._kind, self._left, self._act = kind, number, act
-        self.struck = f"{kind} {number}, not reached"
+        self.struck = ""
 
     def __call__(self, call: Call) -> int | None:
         if call.kind != self._kind:
@@ -256,7 +298,7 @@ class At:
 
 
 def disturb_by_signals(campaign: Campaign, start: Start, fault: str, runs: int) -> None:
-    for kind, number in spread(start, CHANGES, runs):
+    for kind, number in spread(campaign, start, CHANGES, runs):
         case = campaign.copy_of(start.before)
 
         def strike(call: Call) -> None:
@@ -269,7 +311,7 @@ def disturb_by_signals(campaign: Campaign, start: Start, fault: str, runs: int) 
 
 def stop(campaign: Campaign, start: Start, runs: int) -> None:
     """SIGSTOP, the same command beside it, which has to be refused, and SIGCONT."""
-    for kind, number in spread(start, CHANGES, runs):
+    for kind, number in spread(campaign, start, CHANGES, runs):
         case = campaign.copy_of(start.before)
         refused = []
 
@@ -283,14 +325,15 @@ def stop(campaign: Campaign, start: Start, runs: int) -> None:
         # Before the lock is taken and after it is given back there is nobody to meet.
         if refused not in ([], [5], [0]):
             status = 1
-        campaign.ended(start, "stop", f"{where.struck}, beside it {refused}", case, status)
+        what = where.struck and f"{where.struck}, beside it {refused}"
+        campaign.ended(start, "stop", what, case, status)
 
 
 def fill(campaign: Campaign, start: Start, fault: str, runs: int) -> None:
     """From the n-th call on, a disk that is full or a mount that is gone."""
     failing = FULL if fault == "full" else (*CHANGES, "open", "read")
     error = errno.ENOSPC if fault == "full" else errno.ESTALE
-    for kind, number in spread(start, failing, runs):
+    for kind, number in spread(campaign, start, failing, runs):
         case, state = campaign.copy_of(start.before), {"failed": False}
 
         def fail(_: Call, state: dict[str, bool] = state) -> int:
@@ -312,7 +355,7 @@ def fill(campaign: Campaign, start: Start, fault: str, runs: int) -> None:
 
 def make_unreadable(campaign: Campaign, start: Start, runs: int) -> None:
     """One read of an input, or of what an earlier step wrote, fails."""
-    for kind, number in spread(start, ("read", "open"), runs):
+    for kind, number in spread(campaign, start, ("read", "open"), runs):
         case = campaign.copy_of(start.before)
         status = run_watched(
             campaign.work_of(case, start.step), ("read", "open"), campaign.work,
@@ -359,20 +402,20 @@ def cut(campaign: Campaign, start: Start, cuts: int) -> None:
     """One run, of which the disk is kept as it may be were the power off at some of its calls."""
     case = campaign.copy_of(start.before)
     disk, passed, disks = Disk(case), Counter[str](), []
-    wanted = set(spread(start, CHANGES, cuts))
+    wanted = set(spread(campaign, start, CHANGES, cuts))
 
     def see(call: Call) -> int | None:
         passed[call.kind] += 1
         if (moment := (call.kind, passed[call.kind])) in wanted:
             loss = LOSSES[len(disks) % len(LOSSES)]
-            place = campaign.work / f"cut-{start.step}-{int(start.again)}-{len(disks):05d}"
+            place = campaign.work / f"cut-{next(campaign.cases):05d}"
             disk.after(place, loss, campaign.rng)
             disks.append((place, f"{moment[0]} {moment[1]}, {loss} lost"))
         disk.see(call)
         return None
 
     run_watched(campaign.work_of(case, start.step), WATCHED, case, see)
-    ended = campaign.work / f"cut-{start.step}-{int(start.again)}-ended"
+    ended = campaign.work / f"cut-{next(campaign.cases):05d}"
     disk.after(ended, LOSSES[0], campaign.rng)
     found = contents(ended / "room")
     lost = [file for file, sha256 in start.expected.items() if found.get(file) != sha256]
@@ -411,6 +454,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--runs", type=int, default=10, help="of each fault, for each start")
     parser.add_argument("--cuts", type=int, default=20, help="of the power, for each start")
+    parser.add_argument("--rounds", type=int, default=1, help="how many times all that")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS)
     parser.add_argument("--minutes", type=float, default=1e9, help="no new fault after these")
@@ -426,12 +470,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     end = began + 60 * chosen.minutes
     with working_folder(chosen.work) as work:
         campaign = Campaign(work, chosen.seed)
+        campaign.load()
         starts = list(campaign.starts(chosen.steps))
-        for fault, start in itertools.product(chosen.faults, starts):
-            if time.monotonic() < end:
-                disturb(campaign, start, fault, chosen.runs, chosen.cuts)
-                print(f"{fault}, {start.name}: {time.monotonic() - began:.0f} s", flush=True)
-    return told(campaign, chosen.json)
+        for number in range(chosen.rounds):
+            for fault, start in itertools.product(chosen.faults, starts):
+                if time.monotonic() < end:
+                    disturb(campaign, start, fault, chosen.runs, chosen.cuts)
+                    print(f"{fault}, {start.name}: {time.monotonic() - began:.0f} s", flush=True)
+            print(f"round {number + 1} of {chosen.rounds}")
+            status = told(campaign, chosen.json)
+            if time.monotonic() > end:
+                break
+    return status
 
 
 def told(campaign: Campaign, file: Path | None) -> int:
@@ -439,7 +489,11 @@ def told(campaign: Campaign, file: Path | None) -> int:
     for (step, fault), problems in sorted(campaign.tally.items()):
         print(f"{step:<10} {fault:<12} {len(problems):>5} {problems.count(''):>5}")
     every = [problem for problems in campaign.tally.values() for problem in problems]
-    print(f"{every.count('')} of {len(every)} disturbed runs ended in the same bytes")
+    print(
+        f"{every.count('')} of {len(every)} disturbed runs ended in the same bytes; "
+        f"{campaign.missed} more had ended before",
+        flush=True,
+    )
     if file is not None:
         table = [
             {"step": step, "fault": fault, "runs": len(problems), "same": problems.count(""),

@@ -148,3 +148,15 @@ def test_a_layer_that_does_not_compose_is_not_published(tmp_path):
     with pytest.raises(UsdBrdfError, match=r"missing\.usda.+\[stage\.composition\]"):
         export(layer, tmp_path / "scan.usda", folder=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.fault("R1")
+def test_a_layer_whose_neighbour_cannot_be_read_may_be_written_later(tmp_path):
+    neighbour = tmp_path / "neighbour.usda"
+    neighbour.write_text("what a disk gave instead of it")
+    layer = new_layer(StageHeader(name="room"), Provenance(role="scan", version="1"))
+    prim = Sdf.CreatePrimInLayer(layer, "/room")
+    prim.referenceList.prependedItems = [Sdf.Reference("./neighbour.usda")]
+    with pytest.raises(EnvironmentFailure, match=r"neighbour\.usda: .+\[environment\.io\]"):
+        export(layer, tmp_path / "scan.usda", folder=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["neighbour.usda"]

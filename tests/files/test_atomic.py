@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -21,6 +23,7 @@ from usdbrdf.files.atomic import (
     publish,
     sha256_of,
     temporary_beside,
+    temporary_folder,
     write_text_atomic,
 )
 
@@ -92,6 +95,76 @@ def test_kill_around_the_rename(tmp_path, side):
     )
     assert run_python(code, path, fault=f"kill@publish:{side}_replace").returncode == -9
     assert path.read_text() == ("old" if side == "before" else "new")
+
+
+NOBODY = 2**22 + 1  # no process has a higher number than 2^22
+
+
+def named(process):
+    """As temporary files of a process of this machine are."""
+    machine = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+    return f".tmp-{machine}-{process}-00000000"
+
+
+def killed_while(tmp_path, work):
+    """Have a process killed while something temporary lies in ``tmp_path``; what it leaves."""
+    code = (
+        "import os, sys; from pathlib import Path; from usdbrdf.files import atomic;"
+        f"held = atomic.{work}(Path(sys.argv[1])); place = held.__enter__();"
+        "(place / 'x' if place.is_dir() else place).write_text('half'); os.kill(os.getpid(), 9)"
+    )
+    assert run_python(code, tmp_path / "a.usda").returncode == -9
+    return {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.fault("R2")
+@pytest.mark.parametrize("work", ["temporary_beside", "temporary_folder"])
+def test_what_a_killed_process_left_goes_with_the_next_write_beside_it(tmp_path, work):
+    left = killed_while(tmp_path, work)
+    assert len(left) == 1
+    # As USD names what it writes under a name of ours, and what only looks like one.
+    (tmp_path / f"{left.pop().removesuffix('.usda')}.2YgHvW").touch()
+    others = {".tmp-mine", ".tmp-12-notours", ".tmp-0badf00d-4194305-00000000", "tmp-1-00000000"}
+    for name in others:
+        (tmp_path / name).touch()
+    write_text_atomic(tmp_path / "b.txt", "new")
+    assert {path.name for path in tmp_path.iterdir()} == {"b.txt", *others}
+
+
+def test_what_another_process_is_writing_stays(tmp_path):
+    """Whether it can be seen, or only its lock: it may run in another container."""
+    seen = tmp_path / "seen" / named(os.getpid())
+    seen.mkdir(parents=True)
+    write_text_atomic(tmp_path / "seen" / "a.txt", "new")
+    assert seen.is_dir()
+    (tmp_path / "locked").mkdir()
+    unseen = tmp_path / "locked" / named(NOBODY)
+    unseen.touch()
+    with contextlib.ExitStack() as longest:
+        # Two at once, of which the one that came first, and swept, ends first.
+        with temporary_folder(tmp_path / "locked" / "mine"):
+            unseen.touch()
+            longest.enter_context(temporary_folder(tmp_path / "locked" / "mine"))
+        code = (
+            "import sys; from pathlib import Path; from usdbrdf.files.atomic import *;"
+            "write_text_atomic(Path(sys.argv[1]), 'new')"
+        )
+        assert run_python(code, tmp_path / "locked" / "a.txt").returncode == 0
+        assert unseen.is_file()
+    assert run_python(code, tmp_path / "locked" / "a.txt").returncode == 0
+    assert not unseen.exists()
+
+
+def test_without_locks_nothing_is_swept_and_all_is_written(tmp_path, monkeypatch):
+    def failing(_descriptor, _operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    left = tmp_path / f"{named(NOBODY)}.txt"
+    left.touch()
+    monkeypatch.setattr(fcntl, "flock", failing)
+    write_text_atomic(tmp_path / "a.txt", "new")
+    assert (tmp_path / "a.txt").read_text() == "new"
+    assert left.is_file()
 
 
 def test_fault_at_the_kth_pass():

@@ -28,6 +28,23 @@ _INTEGERS = (0, 1, -1, 2, 3, 127, 128, 255, 256, 32767, 65535, 65536, 2**31 - 1,
              2**32 - 1, 2**33, 2**62, 2**63 - 1, -(2**63))  # fmt: skip
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, float("nan"), float("inf"), -float("inf"), 1e-40, 1e38,
            3.5e38, 1e300, -1e9)  # fmt: skip
+# Of stages: what prims, tokens and asset paths may say.
+_TYPES = (
+    "Mesh", "PointInstancer", "Camera", "Sphere", "Xform", "GeomSubset", "Cube", "Scope", "Nothing",
+    "DomeLight", "Material", "BasisCurves", "Points", "Skeleton",
+)  # fmt: skip
+_TOKENS = (
+    "invisible", "inherited", "guide", "proxy", "render", "default", "perspective", "orthographic",
+    "Y", "Z", "X", "none", "catmullClark", "leftHanded", "rightHanded", "constant", "uniform",
+    "vertex", "varying", "faceVarying", "face", "class", "category", "materialBind", "",
+)  # fmt: skip
+_ASSETS = (
+    "./part.usda", "part.usda", "./root.usda", "./below.usda", "../x.usda", "sub/../../x.usda",
+    "/etc/passwd", "file:///etc/passwd", "http://localhost:9/x.usda", "\\\\server\\share.usda",
+    "./package.usdz", "./package.usdz[room.usda]", "./layers.usdz[../x.usda]", "none.usda", "",
+    "./part.usda:SDF_FORMAT_ARGS:a=b", "`\"./${WHICH}.usda\"`", "`${NO}`", "./plates/one.exr",
+    "./one.####.exr", "./é.usda", "anon:0x1", "./part.usda[part.usda]",
+)  # fmt: skip
 _NUMBER_WORDS = (
     "0", "-0", "1", "-1", "2", "0.5", "nan", "NaN", "inf", "-Infinity", "1e999", "1e308", "-1e308",
     "1e-320", "1e38", "2147483648", "-2147483649", "4294967296", "18446744073709551616", "9" * 400,
@@ -227,6 +244,38 @@ def _xml(content: bytes, rng: Rng) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
+def _usda(content: bytes, rng: Rng) -> bytes:
+    """A word of the kind that stands there in the place of another, or a whole statement gone,
+    twice, or in another prim."""
+    text = content.decode("utf-8", "surrogateescape")
+    pattern, pool = (
+        (r"(?<=def )[A-Z]\w+", _TYPES),
+        (r'(?<=")\w*(?=")', _TOKENS),
+        (r"(?<=@)[^@]*(?=@)", _ASSETS),
+        (r"[-+]?\d[\d.eE+-]*", _NUMBER_WORDS),
+        (r"\b(true|false)\b", ("true", "false")),
+    )[int(rng.integers(5))]
+    found = list(re.finditer(pattern, text))
+    if found and rng.random() < 0.7:
+        match = found[int(rng.integers(len(found)))]
+        word = pool[int(rng.integers(len(pool)))]
+        return (text[: match.start()] + word + text[match.end() :]).encode(
+            "utf-8", "surrogateescape"
+        )
+    lines = text.split("\n")
+    statements = [i for i, line in enumerate(lines) if "=" in line and line.startswith("    ")]
+    if not statements:
+        return _text(content, rng)
+    at, other = (statements[int(rng.integers(len(statements)))] for _ in range(2))
+    if rng.random() < 0.5:
+        del lines[at]
+    elif rng.random() < 0.5:
+        lines.insert(other, lines[at])
+    else:
+        lines[at], lines[other] = lines[other], lines[at]
+    return "\n".join(lines).encode("utf-8", "surrogateescape")
+
+
 # --- Containers with checksums and lengths -------------------------------------------------------
 
 
@@ -343,5 +392,5 @@ def _number_of_xml(document: bytes, rng: Rng) -> bytes:
 
 _STRUCTURED: dict[str, Callable[[bytes, Rng], bytes]] = {
     ".json": _json, ".sur": _json, ".xml": _xml, ".xmp": _xml, ".png": _png, ".glb": _glb,
-    ".usdz": _zip, ".npz": _zip, ".npy": _npy, ".e57": _e57,
+    ".usda": _usda, ".usdz": _zip, ".npz": _zip, ".npy": _npy, ".e57": _e57,
 }  # fmt: skip

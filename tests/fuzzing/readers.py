@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,6 +41,7 @@ from usdbrdf.untrusted import (
     mesh_files,
     raw_files,
     replica_files,
+    usd_cameras,
     usd_files,
 )
 
@@ -94,7 +96,8 @@ def _published(path: Path) -> object:
 
 
 def _scan(adapter: str, *, photographs: bool = False) -> Callable[[Path], object]:
-    options = IngestOptions(assume_srgb=photographs)
+    # Nothing of any capture lies in the folder that is allowed too.
+    options = IngestOptions(assume_srgb=photographs, allow_outside=(Path("/nowhere/at/all"),))
     return lambda path: read_scan(path, options, adapter, plugins=False)
 
 
@@ -110,9 +113,12 @@ def _stage(reader: str) -> Callable[[Path], object]:
 
 
 def _whole_stage(path: Path) -> object:
-    """Its meshes both ways, and its cameras."""
-    whole, parts = _stage("meshes")(path), _stage("parts")(path)
-    return whole, parts, _stage("usdbrdf.untrusted.usd_cameras:read_here")(path)
+    """Its layers, its meshes both ways and once more, and its cameras."""
+    layers = [os.fspath(layer) for layer in usd_files.layers_of_usd(path, ())]
+    whole = usd_files.meshes_from_usd(path)
+    parts = usd_files.meshes_from_usd(path, subsets=True)
+    usd_files.refuse_broken_meshes(path)
+    return layers, whole, parts, usd_cameras.cameras_from_usd(path)
 
 
 def _review(folder: Path) -> object:
@@ -266,6 +272,7 @@ READERS = {
             in_child=True,
         ),
         _of_capture("transforms"),
+        _of_capture("transforms", called="photographs", photographs=True, seeds=seeds.photographs),
         _of_capture(
             "transforms",
             called="objects",

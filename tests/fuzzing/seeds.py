@@ -36,6 +36,7 @@ from tests.relighting.test_model import STAGE_OF_MATERIALS
 from tests.scenes import make_capture, write_ply
 from usdbrdf.asset.manifest import Manifest, write_manifest
 from usdbrdf.files.documents import save_arrays
+from usdbrdf.files.images import read_exr, write_preview_png
 from usdbrdf.job.stamp import Stamp, write_stamp
 
 
@@ -205,7 +206,7 @@ def _capture(entry: Path, *names: str) -> list[Seed]:
 
 
 def transforms(folder: Path) -> list[Seed]:
-    """Our own document, one with a lens, and one as nerfstudio writes them."""
+    """Our own document, one with a lens, one as nerfstudio writes them, and of other lenses."""
     made = [
         make_capture(folder / name, frames=8, size=(12, 10), subdivisions=1)
         for name in ("own", "lens", "nerfstudio")
@@ -217,7 +218,56 @@ def transforms(folder: Path) -> list[Seed]:
     document |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0, "k1": 0.0}
     document["frames"][0] |= {"mask_path": "frames/0001.exr", "distortion_params": [0.0] * 6}
     made[2].manifest.write_text(json.dumps(document))
-    return [s for each in made for s in _capture(each.folder, "transforms.json")]
+    folders = [each.folder for each in made]
+    folders += [_other_lens(folder / name, changes) for name, changes in OTHER_LENSES.items()]
+    return [s for each in folders for s in _capture(each, "transforms.json")]
+
+
+# What documents say of other cameras; what is None they leave out.
+OTHER_LENSES: dict[str, dict[str, object]] = {
+    "fisheye": {
+        "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k4": 1e-4, "encoding": "lin_rec709_scene",
+    },
+    "listed": {"camera_model": "FISHEYE624", "distortion_params": [1e-3] * 12},
+    "rational": {"camera_model": "FULL_OPENCV", "k4": 0.01, "k5": 0.0, "k6": 0.001},
+    "sphere": {"camera_model": "EQUIRECTANGULAR", "up_axis": "Z", "meters_per_unit": 1.0},
+    "angles": {
+        "w": None, "h": None, "fl_x": None, "camera_angle_x": 1.39, "camera_angle_y": 1.2,
+        "objects": "objects.json", "mesh": "mesh.ply",
+    },
+    "unsized": {"w": None, "h": None, "camera_angle_x": 1.39},
+}  # fmt: skip
+
+
+def _other_lens(folder: Path, changes: Mapping[str, object]) -> Path:
+    size = (32, 16) if changes.get("camera_model") == "EQUIRECTANGULAR" else (12, 10)
+    made = make_capture(folder, frames=8, size=size, subdivisions=1)
+    document = json.loads(made.manifest.read_text("utf-8")) | changes
+    told = {key: value for key, value in document.items() if value is not None}
+    told["frames"][0] |= {"captured_transform_matrix": told["frames"][0]["transform_matrix"]}
+    made.manifest.write_text(json.dumps(told))
+    if "fl_x" in told:
+        return folder
+    # As of nerfstudio before it said what it did to COLMAP's axes.
+    (folder / "colmap" / "sparse" / "0").mkdir(parents=True)
+    return folder
+
+
+def photographs(folder: Path) -> list[Seed]:
+    """8-bit frames, which say so, found without their suffix, with what they leave out."""
+    made = make_capture(folder / "a", frames=8, size=(12, 10), subdivisions=1)
+    document = json.loads(made.manifest.read_text("utf-8")) | {"encoding": "srgb_rec709_scene"}
+    for frame in document["frames"]:
+        picture = folder / "a" / frame["file_path"]
+        shown = read_exr(picture)[..., :3]
+        shown = np.round(255 * shown / shown.max()).astype(np.uint8)
+        write_preview_png(picture.with_suffix(".png"), shown)
+        picture.unlink()
+        for key in ("exposure_time", "saturation_radiance", "noise_floor_radiance"):
+            frame.pop(key)
+        frame["file_path"] = frame["file_path"].removesuffix(".exr")
+    made.manifest.write_text(json.dumps(document))
+    return _capture(made.folder, "transforms.json")
 
 
 def objects(folder: Path) -> list[Seed]:
@@ -254,8 +304,50 @@ def colmap_binary(folder: Path) -> list[Seed]:
 
 
 def colmap(folder: Path) -> list[Seed]:
-    """As text and as binary files."""
-    return [*colmap_text(folder / "text"), *colmap_binary(folder / "binary")]
+    """As text and as binary files, and with every lens that COLMAP knows."""
+    return [
+        *colmap_text(folder / "text"),
+        *colmap_binary(folder / "binary"),
+        *_colmap_lenses(folder / "lenses"),
+        *_colmap_beside(folder / "beside"),
+    ]
+
+
+def _colmap_lenses(folder: Path) -> list[Seed]:
+    """An image through each lens, whose distortion is none, with a mask, and a second model."""
+    import pycolmap
+
+    from tests.capture import test_scan_from_colmap
+
+    names = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"})
+    made = make_capture(folder, frames=len(names) + 8, size=(12, 10), subdivisions=1)
+    cameras = []
+    for name in (*names, *["PINHOLE"] * 8):
+        model = pycolmap.CameraModelId.__members__[name]
+        cameras.append(pycolmap.Camera.create_from_model_id(1, model, 9.0, 12, 10))
+    (folder / "images").mkdir()
+    pictures = [f"{i:04d}.exr" for i in range(len(cameras))]
+    for i, name in enumerate(pictures):
+        made.image(i).rename(folder / "images" / name)
+    made.manifest.unlink()
+    whole = test_scan_from_colmap.reconstruction(made, cameras, pictures)
+    test_scan_from_colmap.write_model(folder / "sparse" / "0", whole, text=True)
+    part = test_scan_from_colmap.reconstruction(made, cameras[:3], pictures[:3])
+    test_scan_from_colmap.write_model(folder / "sparse" / "1", part, text=True)
+    (folder / "masks").mkdir()
+    write_preview_png(folder / "masks" / "0003.exr.png", np.full((10, 12, 3), 255, np.uint8))
+    return _capture(folder, "sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/1/cameras.txt")
+
+
+def _colmap_beside(folder: Path) -> list[Seed]:
+    """A model with a lens, and that of its images undistorted in dense/."""
+    from tests.capture import test_scan_from_colmap
+
+    made = test_scan_from_colmap.colmap_capture(folder, text=True)
+    dense = test_scan_from_colmap.undistorted_beside(made)
+    targets = [folder / "sparse" / "0" / name for name in ("cameras.txt", "images.txt")]
+    targets += sorted((dense / "sparse").glob("*.bin"))[:2]
+    return [Seed(entry=folder, targets=tuple(targets))]
 
 
 def scanner_app(folder: Path) -> list[Seed]:
@@ -317,7 +409,16 @@ def realityscan(folder: Path) -> list[Seed]:
 
 def e57(folder: Path) -> list[Seed]:
     survey = test_scan_from_e57.write_survey(folder / "survey", _room())
-    return _capture(survey / "scan.e57", "scan.e57")
+    more = test_scan_from_e57.write_survey(folder / "more", _room())
+    pinholes = test_scan_from_e57._pinholes(_room())
+    sphere = {"imageWidth": 32, "imageHeight": 16, "pixelWidth": np.pi / 16,
+              "pixelHeight": np.pi / 16}  # fmt: skip
+    around = {"name": "around", "pose": pinholes[0]["pose"], "sphericalRepresentation": sphere}
+    absent = {**pinholes[0], "name": "not there"}
+    test_scan_from_e57._write(more / "scan.e57", [*pinholes, around, absent])
+    pixels = np.random.default_rng(0).random((16, 32, 3), np.float32)
+    write_image(more / "images" / "around.jpg", pixels)
+    return [*_capture(survey / "scan.e57", "scan.e57"), *_capture(more, "scan.e57")]
 
 
 # --- USD -----------------------------------------------------------------------------------------
@@ -339,7 +440,133 @@ def stages(folder: Path) -> list[Seed]:
         )
         stage.Save()
     packed = package(folder / "package.usdz", {"room.usda": paths[0].read_bytes()})
-    return _alone(*paths, packed)
+    several = folder / "several"
+    several.mkdir()
+    for name, text in LAYERS.items():
+        (several / name).write_text(text)
+    together = package(
+        folder / "layers.usdz", {name: text.encode() for name, text in LAYERS.items()}
+    )
+    targets = tuple(several / name for name in LAYERS)
+    return [*_alone(*paths, packed, together), Seed(entry=targets[0], targets=targets)]
+
+
+# What stages are made of: layers that name each other in all ways, meshes with all that they may
+# say, what is not one, labels of both kinds, cameras with plates.
+LAYERS = {
+    "root.usda": """#usda 1.0
+(
+    defaultPrim = "scan"
+    metersPerUnit = 0.01
+    upAxis = "Y"
+    subLayers = [@./below.usda@]
+)
+def Xform "scan" (
+    prepend apiSchemas = ["SemanticsAPI:kind"]
+)
+{
+    string semantic:kind:params:semanticType = "class"
+    string semantic:kind:params:semanticData = "room"
+    def Xform "first" (instanceable = true
+        prepend references = @./part.usda@</part>) {}
+    def Xform "second" (instanceable = true
+        prepend payload = @part.usda@) {
+        float3 xformOp:scale = (1, -1, 2)
+        uniform token[] xformOpOrder = ["xformOp:scale"]
+    }
+    def PointInstancer "copies" (active = false) {}
+    def Mesh "hidden"
+    {
+        token visibility = "invisible"
+    }
+    def Mesh "guide"
+    {
+        uniform token purpose = "guide"
+    }
+    def Sphere "ball" {}
+    def Camera "eye" (prepend apiSchemas = ["BackPlateAPI:still"])
+    {
+        float focalLength = 35
+        float verticalAperture = 24
+        asset backPlate:still:image = @./plates/one.exr@
+        asset houdini:backgroundimage = @plates/two.exr@
+        float exposure = 1
+    }
+    def Camera "moving"
+    {
+        asset usdBrdf:capture:image.timeSamples = { 1: @./a.exr@, 2: @./b.exr@ }
+        double3 xformOp:translate.timeSamples = { 1: (0, 0, 0), 2: (1, 0, 0) }
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+    def Camera "flat"
+    {
+        token projection = "orthographic"
+    }
+}
+""",
+    "below.usda": """#usda 1.0
+(
+    expressionVariables = { string WHICH = "part" }
+)
+over "scan"
+{
+    over "first" (variants = { string look = "a" }
+        prepend variantSets = "look")
+    {
+        variantSet "look" = {
+            "a" {
+                float a = 1
+            }
+            "b" (prepend references = @./part.usda@) {
+                float a = 2
+            }
+        }
+    }
+}
+""",
+    "part.usda": """#usda 1.0
+(
+    defaultPrim = "part"
+)
+def Xform "part"
+{
+    def Mesh "cage" (prepend apiSchemas = ["SkelBindingAPI"])
+    {
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1)]
+        int[] faceVertexCounts = [4, 3, 4]
+        int[] faceVertexIndices = [0, 1, 2, 3, 0, 4, 5, 0, 1, 5, 4]
+        int[] holeIndices = [1]
+        uniform token orientation = "leftHanded"
+        normal3f[] normals = [(0, 0, 1)] (interpolation = "constant")
+        uniform token[] semantics:labels:category = ["wall", "plaster"]
+        def GeomSubset "some"
+        {
+            uniform token elementType = "face"
+            uniform token familyName = "materialBind"
+            int[] indices = [0]
+        }
+        def GeomSubset "others"
+        {
+            uniform token elementType = "face"
+            uniform token familyName = "objects"
+            int[] indices = [0, 2]
+            token[] semantics:labels:class = ["floor"]
+        }
+    }
+    def Mesh "plain"
+    {
+        point3f[] points.timeSamples = {
+            1: [(0, 0, 0), (1, 0, 0), (0, 1, 0)], 2: [(0, 0, 0), (2, 0, 0), (0, 1, 0)],
+        }
+        int[] faceVertexCounts = [3]
+        int[] faceVertexIndices = [0, 1, 2]
+        uniform token subdivisionScheme = "none"
+        normal3f[] primvars:normals = [(0, 0, 1), (0, 1, 1), (1, 0, 1)] (interpolation = "vertex")
+        int[] primvars:normals:indices = [0, 1, 2]
+    }
+}
+""",
+}
 
 
 def package(path: Path, entries: Mapping[str, bytes]) -> Path:
@@ -356,19 +583,24 @@ def package(path: Path, entries: Mapping[str, bytes]) -> Path:
 
 
 def stage_with_pictures(folder: Path) -> list[Seed]:
-    """A stage as a capture: cameras by the names of their pictures, and one with back plates."""
+    """A stage as a capture: cameras by the names of their pictures, one with back plates, one by
+    the numbers of its pictures."""
     room, found = _room(), []
-    for name in ("still", "moving"):
+    for name in ("still", "moving", "numbered"):
         stage = test_scan_from_usd_stage.make_stage(folder / name / "room.usda", room)
         if name == "still":
             test_scan_from_usd_stage.many_cameras(stage, room)
         else:
-            plates = [f"./images/IMG-{i:03d}.exr" for i in range(len(room.images))]
-            test_scan_from_usd_stage.moving_camera(stage, room, plates)
+            plates = [f"./images/IMG-{i:03d}.exr" for i in range(101, 101 + len(room.images))]
+            named = plates if name == "moving" else None
+            test_scan_from_usd_stage.moving_camera(stage, room, named)
         stage.Save()
-        for i, image in enumerate(room.images):
+        first = 0 if name == "still" else 101
+        for i, image in enumerate(room.images, first):
             write_image(folder / name / "images" / f"IMG-{i:03d}.exr", image)
-        found += _alone(folder / name / "room.usda")
+        alone = name == "numbered"  # the only stage in its folder
+        entry = folder / name if alone else folder / name / "room.usda"
+        found.append(Seed(entry=entry, targets=(folder / name / "room.usda",)))
     return found
 
 

@@ -403,7 +403,13 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
             raise EnvironmentFailure(f"{failed} ({in_one_line(error)}). {remedy}") from error
         if not done or not staged.is_file():
             raise EnvironmentFailure(f"{failed}. {remedy}")
-        stage = Usd.Stage.Open(str(staged))
+        try:
+            stage = Usd.Stage.Open(str(staged))
+        except Tf.ErrorException as error:
+            raise EnvironmentFailure(
+                f"{path}: the package could not be read back ({in_one_line(error)}). Check the "
+                "disk, then run the same command again. [environment.io]"
+            ) from error
         problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
         for attribute in (a for prim in stage.TraverseAll() for a in prim.GetAuthoredAttributes()):
             value = attribute.Get()

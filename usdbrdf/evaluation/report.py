@@ -6,10 +6,8 @@ from __future__ import annotations
 import csv
 import io
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,7 +15,7 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, OwnershipConflict
-from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, publish, temporary_beside, temporary_folder
 from usdbrdf.files.documents import read_json
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Bool, Byte, Float
@@ -202,10 +200,9 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
             f"{folder}: holds files but no {document} of ours. Name an empty or a new folder with "
             "-o. [evaluate.output]"
         )
-    with environment_failures(str(folder)):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=folder.parent))
-    try:
+    with ExitStack() as held:
+        with environment_failures(str(folder)):
+            work = held.enter_context(temporary_folder(folder))
         yield work
         with environment_failures(str(folder)):
             made = files_of(work)
@@ -216,8 +213,6 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
                 stale = (folder / relative).resolve()
                 if stale.is_relative_to(folder.resolve()) and stale.is_file():
                     stale.unlink()
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def files_of(work: Path) -> list[str]:

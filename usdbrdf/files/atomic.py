@@ -1,16 +1,19 @@
 """Files appear whole or not at all: write beside, flush, rename, and only then believe it.
 
-A killed process leaves at most a file whose name starts with ``TEMPORARY_PREFIX``; a full disk
-leaves the previous file as it was.
+A killed process leaves at most files and folders whose names start with ``TEMPORARY_PREFIX``, which
+the next one that writes beside them removes; a full disk leaves the previous file as it was.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
+import re
 import secrets
 import shutil
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +22,12 @@ from usdbrdf.errors import EnvironmentFailure
 
 TEMPORARY_PREFIX = ".tmp-"
 _BLOCK = 1 << 20  # bytes hashed at a time
+# Names of ours tell machine and process; what a library names so on the way ends otherwise.
+_MACHINE = hashlib.sha256(socket.gethostname().encode("utf-8", "replace")).hexdigest()[:8]
+_TEMPORARY = re.compile(
+    rf"{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}}(\..*)?"
+)
+_swept: set[Path] = set()  # once in a process is enough
 
 
 def publish(staged: Path, final: Path) -> None:
@@ -74,25 +83,80 @@ def write_text_atomic(path: Path, text: str) -> None:
 @contextmanager
 def temporary_beside(path: Path) -> Iterator[Path]:
     """A fresh name in the folder of ``path``, with its suffix; gone at the end unless published."""
-    name = f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}{path.suffix}"
-    staged = path.with_name(name)
-    try:
-        yield staged
-    finally:
-        with suppress(OSError):
-            staged.unlink()
+    staged = path.with_name(f"{_new_name()}{path.suffix}")
+    with _at_work_in(staged.parent):
+        try:
+            yield staged
+        finally:
+            with suppress(OSError):
+                staged.unlink()
 
 
 @contextmanager
 def temporary_folder(final: Path) -> Iterator[Path]:
     """A fresh folder beside ``final``; gone at the end unless published."""
     final.parent.mkdir(parents=True, exist_ok=True)
-    staged = final.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(4)}")
-    staged.mkdir()
+    staged = final.with_name(_new_name())
+    with _at_work_in(staged.parent):
+        staged.mkdir()
+        try:
+            yield staged
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+
+
+def _new_name() -> str:
+    return f"{TEMPORARY_PREFIX}{_MACHINE}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+@contextmanager
+def _at_work_in(folder: Path) -> Iterator[None]:
+    """Hold a lock on a folder, with all others who have something temporary in it; who comes when
+    nobody does removes what killed ones left.
+
+    Where a file system has no such locks nobody removes anything; where it has them for each
+    machine apart, none removes what another made.
+    """
     try:
-        yield staged
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:  # who is about to write there will say so
+        yield
+        return
+    try:
+        # Never waited for: what is there belongs to somebody, or to the one who is sweeping, who
+        # spares what a living process has.
+        with suppress(OSError):
+            if folder not in _swept:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _swept.add(folder)
+                _sweep(folder)
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        yield
     finally:
-        shutil.rmtree(staged, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove temporary files and folders of this user and machine whose processes are no more."""
+    for place in folder.iterdir():
+        named = _TEMPORARY.fullmatch(place.name)
+        if named is None or place.lstat().st_uid != os.geteuid() or _lives(int(named["process"])):
+            continue
+        if place.is_dir() and not place.is_symlink():
+            shutil.rmtree(place, ignore_errors=True)
+        else:
+            place.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def publish_folder(staged: Path, final: Path) -> None:

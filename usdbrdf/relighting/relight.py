@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from usdbrdf.asset.readers.render_scene import (
 )
 from usdbrdf.asset.readers.views import cameras_of_views
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures
+from usdbrdf.files.atomic import environment_failures, temporary_folder
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
 from usdbrdf.job.ownership import reads_asset
@@ -92,11 +92,11 @@ def _write_pictures(
     else:
         # One exposure for all, so that they can be compared. Until it is known the pictures wait on
         # disk: many would not fit into memory.
-        beside, levels = targets[0].parent, []
-        with environment_failures(str(beside)):
-            folder = TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=beside)
-        with folder as waiting:
-            spilled = [Path(waiting) / f"{i}.exr" for i in range(len(targets))]
+        levels = []
+        with ExitStack() as held:
+            with environment_failures(str(targets[0].parent)):
+                waiting = held.enter_context(temporary_folder(targets[0]))
+            spilled = [waiting / f"{i}.exr" for i in range(len(targets))]
             for spill, picture in zip(spilled, rendered, strict=True):
                 levels.append(exposure_levels(picture))
                 write_exr(spill, picture, half=False)

@@ -7,6 +7,7 @@ anywhere but these calls, and equal calls give equal bytes."""
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.files.atomic import temporary_beside
 
 Types = Sdf.ValueTypeNames
+# As USD names a file that it was to compose; where the file is there, its disk did not give it.
+_NOT_OPENED = re.compile(r"Could not open asset @(?P<file>[^@]+)@")
 
 
 def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
@@ -163,6 +166,13 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
         stored.subLayerPaths = []
         stage = Usd.Stage.Open(stored, Usd.Stage.LoadNone)
         problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
+        for named in filter(None, map(_NOT_OPENED.search, problems)):
+            if os.path.isfile(named["file"]):
+                raise EnvironmentFailure(
+                    f"{named['file']}: USD could not read the layer, on which {path.name} rests. "
+                    "Check the disk, then run the same command again; finished work is kept. "
+                    "[environment.io]"
+                )
         if problems:
             raise UsdBrdfError(
                 f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of "
