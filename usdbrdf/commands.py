@@ -237,7 +237,8 @@ class Relight(_WithAsset):
     """Path trace the published asset in its own or in other light."""
 
     output: Path = option("-o --output IMAGE", REQUIRED)
-    ".exr: linear float radiance; .png, .jpg: exposed, sRGB; with --views a folder"
+    """.exr: linear float radiance; .png, .jpg: exposed, sRGB; with --views a folder; .xml: the
+    scene itself for Mitsuba, with meshes and pictures beside it"""
     options: options.RelightOptions
 
     def run(self) -> int:

@@ -13,6 +13,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
+from tests.json_schemas import check
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.review import write_review
@@ -45,6 +46,7 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     edit(room, RED)
     here = surfaces_of(stage_in_look(room.asset, "shaded"))
     told = publish(room.asset.folder, tmp_path / "dest")
+    check(told, "publish")
     assert (told["version"], told["new"]) == ("v001", True)
     shutil.move(tmp_path / "dest/v001", moved := tmp_path / "elsewhere")
     shutil.rmtree(room.asset.folder)

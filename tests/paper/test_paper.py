@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import usdbrdf
+from tests.json_schemas import checked
 from usdbrdf.cli import main
 from usdbrdf.errors import UsageError
 from usdbrdf.evaluation.evaluate_views import ScoredView
@@ -86,12 +87,13 @@ def test_relit_in_the_others_light_it_is_as_the_other_is(made):
     assert found["relighting"]["b_in_light_of_a"] < 0.02
 
 
-def test_the_same_again_is_the_same(made, room, brighter, tmp_path):
+def test_the_same_again_is_the_same(made, room, brighter, tmp_path, capsys):
     output = made[0]
     options = ["--no-relight", "--json", *SMALL]
     place = tmp_path / "out"
     command = ["paper", str(room.asset), str(brighter.asset), "-o", str(place), *options]
     assert main(command) == 0
+    assert checked(capsys.readouterr().out, "paper")["relighting"] is None
     again = json.loads((place / "paper.json").read_text("utf-8"))
     assert again["relighting"] is None
     assert "fig10" not in (place / "paper.md").read_text("utf-8")
