@@ -273,6 +273,68 @@ def test_what_lies_elsewhere_is_not_published(room, tmp_path):
     assert camera.HasAPI("UsdBrdfCaptureAPI")
 
 
+def test_components_have_the_number_of_their_version(room, tmp_path):
+    dest = tmp_path / "dest"
+    publish(room.asset.folder, dest)
+    edit(room, RED)
+    publish(room.asset.folder, dest)
+    for version in versions_in(dest):
+        stage = Usd.Stage.Open(str(dest / version / "room.usd"), Usd.Stage.LoadNone)
+        chair = stage.GetPrimAtPath("/room/geo/Stuhl_No_1").GetAssetInfo()
+        assert chair["version"] == version
+        assert chair["name"] == "Stuhl_No_1"
+        assert {*stage.GetDefaultPrim().GetAssetInfo()} >= {"version", "payloadAssetDependencies"}
+        found = {p.GetAssetInfo().get("version") for p in stage.TraverseAll() if p.GetAssetInfo()}
+        assert found == {version}
+    # Nothing but the root says which version it is: the same again is none.
+    assert publish(room.asset.folder, dest)["new"] is False
+
+
+GRAPE = """#usda 1.0
+(
+    defaultPrim = "grape"
+)
+def Xform "grape"
+{
+}
+"""
+
+
+def test_file_formats_keep_what_they_are_told(room, tmp_path):
+    (room.asset.folder / "grape.usda").write_text(GRAPE)
+    edit(
+        room,
+        """over "room" { def "grape" (references = @./grape.usda:SDF_FORMAT_ARGS:a=b@) { } }""",
+    )
+    publish(room.asset.folder, tmp_path / "dest")
+    version = tmp_path / "dest/v001"
+    assert (version / "grape.usda").read_text() == GRAPE
+    edits = Sdf.Layer.OpenAsAnonymous(str(version / "layers/edits.usda")).ExportToString()
+    assert "grape.usda:SDF_FORMAT_ARGS:a=b@" in edits
+    stage = Usd.Stage.Open(str(version / "room.usd"))
+    assert stage.GetPrimAtPath("/room/grape").GetTypeName() == "Xform"
+
+
+def test_what_a_copy_cannot_follow_is_refused(room, tmp_path):
+    folder, dest = room.asset.folder, tmp_path / "dest"
+    document = """<?xml version="1.0"?><materialx version="1.38">{}</materialx>"""
+    image = """<input name="file" type="filename" value="a.png"/>"""
+    (folder / "looks.mtlx").write_text(document.format(image))
+    edit(room, """over "room" { def "m" (references = @./looks.mtlx@</MaterialX>) { } }""")
+    with pytest.raises(InputRefused, match=r"looks\.mtlx.*edits\.usda.*\[publish\.materialx\]$"):
+        publish(folder, dest)
+    layer = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    layer.ImportFromString(
+        '#usda 1.0\nover "room"\n{\n    def "c" (\n        clips = {\n            '
+        'dictionary default = {\n                string templateAssetPath = "./c.###.usda"\n'
+        "            }\n        }\n    )\n    {\n    }\n}\n"
+    )
+    layer.Save()
+    with pytest.raises(InputRefused, match=r"'default' of </room/c>.*\[publish\.clips\]$"):
+        publish(folder, dest)
+    assert not dest.exists()
+
+
 def test_names_for_a_resolver(room, tmp_path):
     uri = "ayon+entity://show/assets?product={name}&version={version}"
     options = PublishOptions(uri=uri, encoding="binary")
