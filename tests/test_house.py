@@ -137,6 +137,7 @@ OPENERS: dict[str, str] = {
     "identity.py": "hashes the sources",
     "kernel.py": "compiled code",
     "page/": "the page's own parts",
+    "relighting/scene_file.py": "whether the scene that stands there is ours",
     "validation/validate.py": "the layer of cures is an artist's file",
 }
 _OPEN = {

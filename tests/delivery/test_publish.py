@@ -320,7 +320,10 @@ def test_what_a_copy_cannot_follow_is_refused(room, tmp_path):
     document = """<?xml version="1.0"?><materialx version="1.38">{}</materialx>"""
     image = """<input name="file" type="filename" value="a.png"/>"""
     (folder / "looks.mtlx").write_text(document.format(image))
-    edit(room, """over "room" { def "m" (references = @./looks.mtlx@</MaterialX>) { } }""")
+    # References to such documents do not compose where USD comes without MaterialX.
+    edit(
+        room, """over "room" { def Shader "m" { asset info:mtlx:sourceAsset = @./looks.mtlx@ } }"""
+    )
     with pytest.raises(InputRefused, match=r"looks\.mtlx.*edits\.usda.*\[publish\.materialx\]$"):
         publish(folder, dest)
     layer = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
