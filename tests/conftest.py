@@ -43,6 +43,7 @@ SLOW = (
     "nondestruction",
     "page/test_browser.py",
     "page/test_report.py",
+    "paper",
     "physics/test_lobe_samples.py",
     "physics/test_recovery.py",
     "plugins",

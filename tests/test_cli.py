@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_schemas import checked
 from tests.scenes import make_capture
 from usdbrdf import pipeline
 from usdbrdf.capture import adapters
@@ -432,7 +433,7 @@ def test_rules_are_listed(capsys):
     assert any(line.startswith("usdbrdf.LookSelection (error): ") for line in lines)
     assert all(re.match(r"[\w.:]+( \((error|warning|info)\))?: .+\.$", line) for line in lines)
     assert main(["rules", "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)
+    listed = checked(capsys.readouterr().out, "rules")
     assert [rule["name"] for rule in listed] == [re.split(r":? ", line)[0] for line in lines]
     assert all(rule["advice"] for rule in listed if rule["name"].startswith("usdbrdf."))
 

@@ -31,7 +31,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "usdbrdf"
 GROUND = {"ahead", "calibration", "errors", "identity", "kernel", "option", "options"}
 RUNNING = {"files", "job", "untrusted"}
 SUBJECTS = {"capture", "geometry", "texturing", "shading", "material", "asset"}
-READERS = {"advice", "delivery", "evaluation", "page", "relighting", "validation"}
+READERS = {"advice", "delivery", "evaluation", "page", "paper", "relighting", "validation"}
 
 ARROWS: dict[str, set[str]] = {
     "ahead": set(),
@@ -66,6 +66,8 @@ ARROWS: dict[str, set[str]] = {
     # Shows what others measure and pack; the evidence is the method's own residual.
     "page": {"delivery", "evaluation", "material"},
     "relighting": {"asset"},
+    # Tables and figures of what the others compute.
+    "paper": {"evaluation", "relighting"},
     "validation": {"asset"},
     "cli": {"commands", "command_parser"},
     "run_table": set(),
@@ -74,7 +76,7 @@ ARROWS: dict[str, set[str]] = {
     "farm": {"pipeline", "page", "validation", "run_table"},
     "farm_commands": {"command_kinds", "farm"},
     "command_kinds": {"command_parser", "run_table"},
-    "commands": {"command_kinds", "doctor", "farm_commands"},
+    "commands": {"command_kinds", "doctor", "farm_commands", "paper"},
     "command_parser": {"pipeline", *READERS},
     "__main__": {"cli"},
     # The public face, which nothing inside may import.
@@ -135,6 +137,7 @@ OPENERS: dict[str, str] = {
     "identity.py": "hashes the sources",
     "kernel.py": "compiled code",
     "page/": "the page's own parts",
+    "relighting/scene_file.py": "whether the scene that stands there is ours",
     "validation/validate.py": "the layer of cures is an artist's file",
 }
 _OPEN = {

@@ -7,22 +7,45 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_schemas import SCHEMAS, check, schema_of
 from tests.scenes import make_capture
 from usdbrdf.cli import main
+from usdbrdf.commands import COMMANDS
+from usdbrdf.model.mesh import DIRECTIVES
+from usdbrdf.option import option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
-SCHEMAS = sorted((ROOT / "schemas/json").glob("*.schema.json"))
+NAMES = sorted(file.name.removesuffix(".schema.json") for file in SCHEMAS.glob("*.json"))
+# Documents that no command prints, and the commands that print the same.
+INPUTS, OF_STEPS = {"transforms", "objects"}, {"convert", "ingest", "texture", "shade", "fit"}
+SILENT = {"view"}  # it serves until it is stopped
 jsonschema = pytest.importorskip("jsonschema", reason="needs the extra test")
 
 
-def check(document: object, name: str) -> None:
-    schema = json.loads((ROOT / f"schemas/json/{name}.schema.json").read_text("utf-8"))
-    jsonschema.Draft202012Validator(schema).validate(document)
+@pytest.mark.parametrize("name", NAMES)
+def test_they_are_schemas(name):
+    jsonschema.Draft202012Validator.check_schema(schema_of(name))
+    assert schema_of(name)["$id"] == f"usdbrdf/{name}.schema.json"
 
 
-@pytest.mark.parametrize("file", SCHEMAS, ids=lambda file: file.name)
-def test_they_are_schemas(file):
-    jsonschema.Draft202012Validator.check_schema(json.loads(file.read_text("utf-8")))
+def test_every_command_that_prints_json_has_one():
+    printing = {
+        name
+        for name, command in COMMANDS.items()
+        if any(item.name == "json" for item in option_fields(command))
+    }
+    assert printing >= OF_STEPS
+    assert (printing - OF_STEPS - SILENT) | {"run"} | INPUTS == set(NAMES)
+
+
+def test_objects():
+    sample = json.loads((ROOT / "samples/study/objects.json").read_text("utf-8"))
+    check(sample, "objects")
+    sample["objects"][0]["directive"] = "gold"
+    with pytest.raises(jsonschema.ValidationError, match="gold"):
+        check(sample, "objects")
+    enum = schema_of("objects")["properties"]["objects"]["items"]["properties"]["directive"]["enum"]
+    assert sorted(enum) == sorted(["", *DIRECTIVES])
 
 
 def test_doctor(capsys):

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from usdbrdf.options import ShadeOptions as ShadeOptions
     from usdbrdf.options import TextureOptions as TextureOptions
     from usdbrdf.page.report import report as report
+    from usdbrdf.paper.options import PaperOptions as PaperOptions
+    from usdbrdf.paper.write_paper import write_paper as write_paper
     from usdbrdf.pipeline import convert as convert
     from usdbrdf.pipeline import fit as fit
     from usdbrdf.pipeline import ingest as ingest
@@ -61,6 +63,8 @@ _HOMES = {
     "usdbrdf.evaluation.compare_assets": ("compare",),
     "usdbrdf.evaluation.evaluate_views": ("evaluate",),
     "usdbrdf.page.report": ("report",),
+    "usdbrdf.paper.options": ("PaperOptions",),
+    "usdbrdf.paper.write_paper": ("write_paper",),
     "usdbrdf.relighting.relight": ("relight",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -22,6 +22,7 @@ from usdbrdf.job.interrupts import loading
 from usdbrdf.job.progress import printable, say, set_quiet, show
 from usdbrdf.option import REQUIRED, option
 from usdbrdf.options import EditOptions
+from usdbrdf.paper.options import PaperOptions
 
 
 class Inspect(OnCapture):
@@ -206,11 +207,38 @@ class Compare(Waiting, Talking):
         return self.told(summary, made.comparison_line(found), written)
 
 
+class Paper(Waiting, Talking):
+    """Make the paper's tables and figures of two assets of one scene, lit differently."""
+
+    first: Path = option("ASSET", REQUIRED)
+    "asset folder; it is not changed"
+    second: Path = option("OTHER", REQUIRED)
+    "another of the same scene; it is not changed"
+    output: Path = option("-o --output FOLDER", Path("paper"))
+    "folder for paper.md, tables and figures, made if it is not there"
+    options: PaperOptions
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.evaluation.report import FILES
+            from usdbrdf.paper import write_paper as made
+            from usdbrdf.paper.text import paper_line
+        with self.reading(self.first, self.second):
+            found = made.write_paper(self.first, self.second, self.output, self.options)
+        summary = {k: v for k, v in found.items() if k not in ("objects", "materials", FILES)}
+        summary["views"] = [
+            {key: side[key] for key in ("summary", "changes")} for side in found["views"]
+        ]
+        written = f"{self.output / 'paper.md'}: written, {len(found[FILES])} files"
+        return self.told({"output": str(self.output), **summary}, paper_line(found), written)
+
+
 class Relight(_WithAsset):
     """Path trace the published asset in its own or in other light."""
 
     output: Path = option("-o --output IMAGE", REQUIRED)
-    ".exr: linear float radiance; .png, .jpg: exposed, sRGB; with --views a folder"
+    """.exr: linear float radiance; .png, .jpg: exposed, sRGB; with --views a folder; .xml: the
+    scene itself for Mitsuba, with meshes and pictures beside it"""
     options: options.RelightOptions
 
     def run(self) -> int:
@@ -409,7 +437,7 @@ class PluginPath(Command):
 
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
-    MergeBrackets, DevelopRaw, Evaluate, Compare, Relight, Package, Publish, Report, View,
+    MergeBrackets, DevelopRaw, Evaluate, Compare, Paper, Relight, Package, Publish, Report, View,
     Advise, Validate, Farm, FarmWork, FarmTable, Rules, Adapters, Doctor, Completion, PluginPath,
 )  # fmt: skip
 COMMANDS = {

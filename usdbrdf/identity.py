@@ -19,7 +19,7 @@ PACKAGE = Path(__file__).resolve().parent
 _DATA = (".json", ".toml")
 # What these say or do never enters a layer or texture of an asset.
 _OUTSIDE_TASKS = {
-    *("advice", "delivery", "evaluation", "farm", "page", "relighting", "validation"),
+    *("advice", "delivery", "evaluation", "farm", "page", "paper", "relighting", "validation"),
     *("cli.py", "farm_commands.py", "__main__.py"),
 }
 # Not the package's own code, but what a wheel carries along.

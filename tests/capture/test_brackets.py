@@ -9,6 +9,7 @@ import OpenImageIO as oiio
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from tests.json_schemas import checked
 from tests.scenes import MadeCapture, edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.brackets import aligned, merge, response_from_brackets
@@ -210,7 +211,13 @@ def test_a_capture_of_brackets_becomes_one_of_radiance(tmp_path, same_poses, cap
     if not same_poses:
         with pytest.raises(InputRefused, match=r"merge-brackets.*\[capture\.brackets\]$"):
             read_scan(capture.folder, IngestOptions())
-    assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged"), "-q"]) == 0
+    assert (
+        main(
+            ["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged"), "-q", "--json"]
+        )
+        == 0
+    )
+    assert checked(capsys.readouterr().out, "merge-brackets")["brackets"] > 0
     scan = read_scan(tmp_path / "merged", IngestOptions())
     assert (len(scan.frames), scan.frames.radiometric) == (12, True)
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera)

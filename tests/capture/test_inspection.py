@@ -3,11 +3,10 @@ refusals."""
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
+from tests.json_schemas import checked
 from tests.scenes import MadeCapture, edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.inspection import inspect
@@ -70,7 +69,7 @@ def test_the_table_is_for_people_and_the_document_for_programs(capture, capsys):
     assert "(2.0 stops)" in out
     assert "4 x 3 x 2.5 units, a unit is 1 m, Z up" in out
     assert main(["inspect", str(capture.folder), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["frames"]["count"] == 12
+    assert checked(capsys.readouterr().out, "inspect")["frames"]["count"] == 12
 
 
 def test_a_refusal_comes_with_what_was_read_by_then(capture, capsys):
@@ -80,7 +79,7 @@ def test_a_refusal_comes_with_what_was_read_by_then(capture, capsys):
     assert main(["inspect", str(capture.folder), "--json"]) == 3
     out, err = capsys.readouterr()
     assert err == f"usdbrdf: {refused.value}\n"
-    told = json.loads(out)
+    told = checked(out, "inspect")
     assert told["refused"] == [{"sentence": str(refused.value), "exit_code": 3}]
     assert (told["frames"]["count"], told["mesh"], told["missing"]) == (12, None, ["mesh"])
     assert told["radiance"]["brightest"] > 0.4

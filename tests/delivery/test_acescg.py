@@ -7,6 +7,7 @@ import pytest
 from pxr import Usd
 
 from tests.delivery.packing import edit, extracted, packed
+from tests.synthetic_asset import sky_of
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.delivery.publish import publish
@@ -111,6 +112,29 @@ def test_all_colours_are_in_acescg_and_nothing_else_is(room, version):
     albedo = [prim.GetAttribute("usdBrdf:shading:meanAlbedo") for prim in chair]
     assert albedo[0].Get() == albedo[1].Get()
     assert albedo[1].GetColorSpace() == "lin_rec709_scene"
+
+
+def test_the_sky_and_the_sun_are_in_acescg(room, tmp_path):
+    room.outside = sky_of(room.asset)
+    room.write_layer("shading")
+    options = PublishOptions(texture_space="acescg", photographs=False)
+    publish(room.asset.folder, tmp_path / "dest", options)
+    version, sky = tmp_path / "dest/v001", room.asset.sky
+    here, there = read_exr(room.asset.folder / sky), read_exr(version / sky)
+    assert colour_tag(version / sky)[0] == "lin_ap1_scene"
+    assert there == pytest.approx(converted(here), rel=2e-3, abs=1e-4)
+    # How far it is known is no colour.
+    told = room.asset.sky_confidence
+    assert np.array_equal(read_exr(version / told), read_exr(room.asset.folder / told))
+    stages = [Usd.Stage.Open(str(p)) for p in (room.asset.root_layer, version / "room.usd")]
+    for stage in stages:
+        stage.SetEditTarget(stage.GetSessionLayer())
+        stage.GetDefaultPrim().GetVariantSet("lights").SetVariantSelection("usdlux")
+    lights = [{p.GetTypeName(): p for p in stage.TraverseAll()} for stage in stages]
+    dome = lights[1]["DomeLight"].GetAttribute("inputs:texture:file").Get()
+    assert dome.resolvedPath == str(version / sky)
+    suns = [found["DistantLight"].GetAttribute("inputs:color").Get() for found in lights]
+    assert np.array(suns[1]) == pytest.approx(converted(suns[0]), abs=1e-5)
 
 
 def test_our_own_commands_do_not_take_it_for_rec709(version):

@@ -13,6 +13,7 @@ from pxr import Usd, UsdGeom, UsdMedia
 
 from tests.blender import in_blender, needs_blender
 from tests.delivery.packing import TIME, edit, extracted, members, packed, surfaces_of
+from tests.json_schemas import checked
 from usdbrdf.cli import main
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.packaged_files import encoded_data, size_within, texture_uses
@@ -195,7 +196,7 @@ def test_arkit_stands_upright(room, tmp_path):
 def test_the_command(room, tmp_path, capsys):
     output = tmp_path / "room.usdz"
     assert main(["package", str(room.asset.folder), "-o", str(output), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = checked(capsys.readouterr().out, "package")
     assert told["bytes"] == output.stat().st_size
     assert told["textures"] == 3
     inside = room.asset.folder / "room.usdz"

@@ -13,6 +13,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
+from tests.json_schemas import check
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.review import write_review
@@ -45,6 +46,7 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     edit(room, RED)
     here = surfaces_of(stage_in_look(room.asset, "shaded"))
     told = publish(room.asset.folder, tmp_path / "dest")
+    check(told, "publish")
     assert (told["version"], told["new"]) == ("v001", True)
     shutil.move(tmp_path / "dest/v001", moved := tmp_path / "elsewhere")
     shutil.rmtree(room.asset.folder)
@@ -269,6 +271,71 @@ def test_what_lies_elsewhere_is_not_published(room, tmp_path):
     named = ("usdBrdf:capture:image", "backPlate:")
     assert not [n for n in camera.GetAuthoredPropertyNames() if n.startswith(named)]
     assert camera.HasAPI("UsdBrdfCaptureAPI")
+
+
+def test_components_have_the_number_of_their_version(room, tmp_path):
+    dest = tmp_path / "dest"
+    publish(room.asset.folder, dest)
+    edit(room, RED)
+    publish(room.asset.folder, dest)
+    for version in versions_in(dest):
+        stage = Usd.Stage.Open(str(dest / version / "room.usd"), Usd.Stage.LoadNone)
+        chair = stage.GetPrimAtPath("/room/geo/Stuhl_No_1").GetAssetInfo()
+        assert chair["version"] == version
+        assert chair["name"] == "Stuhl_No_1"
+        assert {*stage.GetDefaultPrim().GetAssetInfo()} >= {"version", "payloadAssetDependencies"}
+        found = {p.GetAssetInfo().get("version") for p in stage.TraverseAll() if p.GetAssetInfo()}
+        assert found == {version}
+    # Nothing but the root says which version it is: the same again is none.
+    assert publish(room.asset.folder, dest)["new"] is False
+
+
+GRAPE = """#usda 1.0
+(
+    defaultPrim = "grape"
+)
+def Xform "grape"
+{
+}
+"""
+
+
+def test_file_formats_keep_what_they_are_told(room, tmp_path):
+    (room.asset.folder / "grape.usda").write_text(GRAPE)
+    edit(
+        room,
+        """over "room" { def "grape" (references = @./grape.usda:SDF_FORMAT_ARGS:a=b@) { } }""",
+    )
+    publish(room.asset.folder, tmp_path / "dest")
+    version = tmp_path / "dest/v001"
+    assert (version / "grape.usda").read_text() == GRAPE
+    edits = Sdf.Layer.OpenAsAnonymous(str(version / "layers/edits.usda")).ExportToString()
+    assert "grape.usda:SDF_FORMAT_ARGS:a=b@" in edits
+    stage = Usd.Stage.Open(str(version / "room.usd"))
+    assert stage.GetPrimAtPath("/room/grape").GetTypeName() == "Xform"
+
+
+def test_what_a_copy_cannot_follow_is_refused(room, tmp_path):
+    folder, dest = room.asset.folder, tmp_path / "dest"
+    document = """<?xml version="1.0"?><materialx version="1.38">{}</materialx>"""
+    image = """<input name="file" type="filename" value="a.png"/>"""
+    (folder / "looks.mtlx").write_text(document.format(image))
+    # References to such documents do not compose where USD comes without MaterialX.
+    edit(
+        room, """over "room" { def Shader "m" { asset info:mtlx:sourceAsset = @./looks.mtlx@ } }"""
+    )
+    with pytest.raises(InputRefused, match=r"looks\.mtlx.*edits\.usda.*\[publish\.materialx\]$"):
+        publish(folder, dest)
+    layer = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    layer.ImportFromString(
+        '#usda 1.0\nover "room"\n{\n    def "c" (\n        clips = {\n            '
+        'dictionary default = {\n                string templateAssetPath = "./c.###.usda"\n'
+        "            }\n        }\n    )\n    {\n    }\n}\n"
+    )
+    layer.Save()
+    with pytest.raises(InputRefused, match=r"'default' of </room/c>.*\[publish\.clips\]$"):
+        publish(folder, dest)
+    assert not dest.exists()
 
 
 def test_names_for_a_resolver(room, tmp_path):

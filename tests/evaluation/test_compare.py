@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 import usdbrdf
+from tests.json_schemas import checked
 from tests.scenes import edited, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
@@ -138,5 +137,5 @@ def test_the_command_prints_its_figures(room, tmp_path, capsys):
     output = tmp_path / "out"
     assert main(["compare", str(room.asset), str(room.asset), "-o", str(output), "--json"]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["lit"]["albedo"]["nrmse"] == 0
+    assert checked(out, "compare")["lit"]["albedo"]["nrmse"] == 0
     assert "NRMSE of lit: albedo 0.00 %" in err

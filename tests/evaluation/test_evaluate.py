@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import usdbrdf
+from tests.json_schemas import checked
 from tests.scenes import MadeCapture, look_at, make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
@@ -115,7 +116,7 @@ def test_the_command_prints_its_summary(room, views, tmp_path, capsys):
         == 0
     )
     out, err = capsys.readouterr()
-    told = json.loads(out)
+    told = checked(out, "evaluate")
     assert told["views"] == 3
     assert told["flip"] == json.loads((output / "evaluation.json").read_text())["summary"]["flip"]
     assert told["truth"]["material"]["objects"] == 4

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_schemas import checked
 from usdbrdf.cli import main
 from usdbrdf.commands import COMMANDS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
@@ -116,8 +117,10 @@ def test_what_is_told_can_be_pasted_into_a_shell(tmp_path, capsys):
     scan, mesh = folders(tmp_path, "a")[0], tmp_path / "the mesh; x.ply"
     mesh.touch()
     bundle = tmp_path / "our bundle"
-    assert main(["farm", str(scan), "-o", str(bundle), "--mesh", str(mesh)]) == 0
-    written, here, cloud = capsys.readouterr().err.splitlines()
+    assert main(["farm", str(scan), "-o", str(bundle), "--mesh", str(mesh), "--json"]) == 0
+    printed = capsys.readouterr()
+    assert checked(printed.out, "farm")["tasks"] == 1
+    written, here, cloud = printed.err.splitlines()
     assert written.endswith("written, 1 scan in 1 task")
     assert shlex.split(here.partition(":")[2]) == [
         "openjd", "run", str(bundle / "template.json"), "--step", "Table", "--run-dependencies",

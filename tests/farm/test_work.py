@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.json_schemas import checked
 from tests.scenes import make_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused
@@ -92,7 +93,7 @@ def test_the_table_says_what_came_of_each(farm, capsys):
     assert text.splitlines()[-1] == "3 scans: 2 good, 1 refused"
     assert text.splitlines()[-1] in said
     assert main(["farm-table", *words, "--json"]) == 3
-    told = json.loads(capsys.readouterr().out)
+    told = checked(capsys.readouterr().out, "farm-table")
     assert told["counts"] == {"good": 2, "refused": 1}
     good = told["scans"][0]
     stamp = json.loads(
@@ -115,7 +116,7 @@ def test_a_second_run_does_nothing(farm, capsys):
     assert main([*words, "--json", "-q"]) == 0
     assert {part: written(results / part) for part in ("assets", "pages")} == before
     assert {path: path.read_bytes() for path in (results / "records").iterdir()} == records
-    found = json.loads(capsys.readouterr().out)["scans"]
+    found = checked(capsys.readouterr().out, "farm-work")["scans"]
     assert [one["status"] for one in found.values()] == ["good", "good", "refused"]
 
 

@@ -13,6 +13,7 @@ from usdbrdf.material.fit_target import (
     FrameSamples,
     GridFit,
     fit_grid,
+    fit_metal,
     multiple_of,
     nothing,
     relative_costs,
@@ -183,3 +184,20 @@ def test_relative_costs_are_least_at_the_lobe_that_made_the_pixels():
     assert costs[1, 2] == pytest.approx(0, abs=1e-9)
     assert costs.shape == (3, 4)
     assert costs[0, 0] > 0.05
+
+
+@pytest.mark.parametrize("phi", [0.1, 0.4])
+def test_a_metal_comes_back_in_each_channel(phi):
+    _, basis = _scene()
+    f0 = np.array([0.9, 0.6, 0.3])
+    base, slope = basis(phi)
+    observed = (base + f0 / 0.08 * slope).astype(np.float32)
+    weight = np.ones((PIXELS, 1), np.float32)
+    found = fit_metal(observed, weight, basis)
+    assert found.phi == pytest.approx(phi, abs=1e-6)
+    assert found.f0 == pytest.approx(tuple(f0), abs=1e-4)
+    assert found.evidence > 0.9999
+    assert found.phi_low <= phi <= found.phi_high
+    # Brighter than any mirror: no reflectance is above 1.
+    assert max(fit_metal(4 * observed, weight, basis).f0) == 1
+    assert fit_metal(0 * observed, weight, basis).f0 == (0, 0, 0)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from tests.evaluation.conftest import Made, make, silence  # noqa: F401
+from tests.json_schemas import check
 from tests.scenes import poses_down_and_up
 from usdbrdf.page.report import report
 
@@ -31,5 +32,5 @@ def room(make) -> Made:  # noqa: F811
 @pytest.fixture(scope="session")
 def page_file(room, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("page") / "report.html"
-    report(room.asset, output)
+    check(report(room.asset, output), "report")
     return output

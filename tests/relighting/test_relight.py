@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.json_schemas import checked
 from tests.relighting.conftest import BASE
 from usdbrdf.cli import main
 from usdbrdf.errors import UsdBrdfError
@@ -139,7 +140,7 @@ def test_png_is_exposed_and_says_how_far(
     assert main([*arguments, "--width", "8", "--samples", "62", "--json"]) == 0
     shown = read_radiance(target)
     printed = capsys.readouterr()
-    assert json.loads(printed.out)["pictures"] == [str(target)]
+    assert checked(printed.out, "relight")["pictures"] == [str(target)]
     said = printed.err.split("exposure: ")[1].split(" stops (automatic)")[0]
     level = float((_FLOOR * _LAMP).mean()) * _FORM
     assert float(said) == pytest.approx(math.log2(0.8 / level), abs=0.1)

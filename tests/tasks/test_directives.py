@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from pxr import UsdShade
 
@@ -79,6 +81,20 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
     stage = open_measured(asset)
     found = {name: read_shading(stage, f"/room/geo/{name}/{name}") for name in ("lamp", "box")}
     assert all(one.emitter and one.directive == "lamp" for one in found.values())
+    # One frame cannot tell whether an object is a metal, and gives those who say so one.
+    _say(asset, floor="metal")
+    for method in ("scaled", "paper"):
+        fit = usdbrdf.FitOptions(environment="none", method=method, max_pixels=50)
+        usdbrdf.convert(capture.folder, folder, replace(OPTIONS, fit=fit))
+        stage = open_measured(asset)
+        floor, walls = (read_fit(stage, f"/room/geo/{name}/{name}") for name in ("floor", "walls"))
+        assert (floor.directive, floor.kind, floor.status) == ("metal", "conductor", "prior")
+        assert all(0 <= value <= 1 for value in floor.f0)
+        assert any(floor.f0)
+        assert (walls.directive, walls.kind) == ("", "dielectric")
+        surface = UsdShade.Shader.Get(stage, "/room/geo/floor/mtl/floor/PreviewSurface")
+        assert surface.GetInput("metallic").Get() == 1
+        assert not has_errors(validate(asset.root_layer))
 
 
 def test_a_word_that_is_none_stops_the_step_that_reads_it(built):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import escape
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from pxr import Ar, Sdf, Tf, UsdUtils
 
@@ -29,6 +30,8 @@ OF_PHOTOGRAPHS = (
 )  # fmt: skip
 SCHEMAS_OF_PHOTOGRAPHS = ("BackPlateAPI:",)
 _UDIM = "<UDIM>"
+# In MaterialX documents: what pictures and other documents are named by.
+_NAMES_FILES = (b"filename", b"xi:include", b"fileprefix")
 
 
 @dataclass(kw_only=True)
@@ -73,6 +76,7 @@ def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
     for file, layer in layers.items():
         if not photographs and forget_photographs(layer):
             found.changed.add(file)
+        _refuse_what_is_not_followed(file, layer)
         found.layers[file] = layer
         _place(found, file, file in measured, CAPTURED)
     for file, layer in found.layers.items():
@@ -82,7 +86,7 @@ def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
                 if target in found.layers:
                     continue
                 if not target.is_file():
-                    raise _missing(asset, target, is_photograph)
+                    raise _missing(asset, target, file, is_photograph)
                 if is_photograph:
                     found.photographs.add(target)
                 found.named_by[target].add(attribute)
@@ -201,7 +205,7 @@ def _paths(layer: Sdf.Layer) -> Iterator[tuple[str, str]]:
 
 def _targets(file: Path, path: str) -> list[Path]:
     """Files that a path in the layer at ``file`` names: none of a URI, several of tiles."""
-    outer, _ = Ar.SplitPackageRelativePathOuter(path)
+    outer = _parts(path).file
     if ADDRESS.match(outer):
         return []
     target = canonical(file.parent / outer)
@@ -209,6 +213,21 @@ def _targets(file: Path, path: str) -> list[Path]:
         pattern = escape(target.name).replace(_UDIM, "[0-9][0-9][0-9][0-9]")
         return sorted(target.parent.glob(pattern)) or [target]
     return [target]
+
+
+class _Parts(NamedTuple):
+    """Of an asset path: the file, what is named inside of it if it is a package, and what its file
+    format is told (SDF_FORMAT_ARGS)."""
+
+    file: str
+    inner: str
+    arguments: dict[str, str]
+
+
+def _parts(path: str) -> _Parts:
+    plain, arguments = Sdf.Layer.SplitIdentifier(path)
+    outer, inner = Ar.SplitPackageRelativePathOuter(plain)
+    return _Parts(outer, inner, arguments)
 
 
 def canonical(file: Path) -> Path:
@@ -234,11 +253,45 @@ def _place(found: Collection, file: Path, allowed: bool, elsewhere: str) -> None
     found.places[file] = f"{folder}/{file.name}"
 
 
-def _missing(asset: Asset, file: Path, is_photograph: bool) -> InputRefused:
+def _refuse_what_is_not_followed(file: Path, layer: Sdf.Layer) -> None:
+    """Raise where a layer names files in ways that a copy cannot be made to lead to copies."""
+    for path in sorted(named_files(layer)):
+        for target in _targets(file, path):
+            # A document that names no file needs nothing else.
+            if target.suffix.lower() == ".mtlx" and target.is_file():
+                content = target.read_bytes()
+                if any(word in content for word in _NAMES_FILES):
+                    raise InputRefused(
+                        f"{target}: this MaterialX document of {file} names other files, which "
+                        "are not copied. Write its materials into USD, or take it out. "
+                        "[publish.materialx]"
+                    )
+
+    def visit(path: Sdf.Path) -> None:
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.PrimSpec) and spec.HasInfo("clips"):
+            for name, clips in dict(spec.GetInfo("clips")).items():
+                if dict(clips).get("templateAssetPath"):
+                    raise InputRefused(
+                        f"{file}: the value clips {name!r} of <{path}> are named by a template, "
+                        "whose files are not copied. Name them one by one (assetPaths), or bake "
+                        "them into the layer. [publish.clips]"
+                    )
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+
+
+def _missing(asset: Asset, file: Path, layer: Path, is_photograph: bool) -> InputRefused:
     if is_photograph:
         return InputRefused(
             f"{file}: this photograph of {asset.folder} is not there. Put the capture back where "
             "it was, or publish with --no-photographs. [publish.photograph]"
+        )
+    if not layer.is_relative_to(os.path.realpath(asset.folder)):
+        return InputRefused(
+            f"{file}: {layer}, which came with the capture, names this file and it is not there. "
+            "Put it back where it was, or take it out of that layer and convert again. "
+            "[publish.missing]"
         )
     return InputRefused(
         f"{file}: the asset {asset.folder} names this file and it is not there. Run the steps "
@@ -251,7 +304,7 @@ def _lead_to_copies(found: Collection, file: Path, layer: Sdf.Layer) -> bool:
     own, new_names = PurePosixPath(found.places[file]).parent, set[str]()
 
     def replaced(path: str) -> str:
-        outer, inner = Ar.SplitPackageRelativePathOuter(path)
+        outer, inner, arguments = _parts(path)
         targets = _targets(file, path)
         if not targets:
             return path
@@ -261,6 +314,7 @@ def _lead_to_copies(found: Collection, file: Path, layer: Sdf.Layer) -> bool:
         led = os.path.relpath(new, own).replace(os.sep, "/")
         led = led if led.startswith("../") else f"./{led}"
         led = Ar.JoinPackageRelativePath([led, inner]) if inner else led
+        led = Sdf.Layer.CreateIdentifier(led, arguments) if arguments else led
         if led != path:
             new_names.add(led)
         return led

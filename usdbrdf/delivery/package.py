@@ -20,6 +20,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
+from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
@@ -135,6 +136,8 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
         info = dict(prim.GetAssetInfo())
         for name in ("identifier", "payloadAssetDependencies"):  # of the asset in its folder
             info.pop(name, None)
+        if info.get("version") == UNPUBLISHED:
+            info.pop("version")
         prim.SetMetadata("assetInfo", info) if info else prim.ClearMetadata("assetInfo")
     _keep_bound_materials(flat)
     for prim in flat.TraverseAll():

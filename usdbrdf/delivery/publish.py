@@ -14,9 +14,10 @@ from typing import Any
 
 from pxr import Sdf
 
+from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
-from usdbrdf.asset.readers.compose import outdated_steps
+from usdbrdf.asset.readers.compose import open_edited, outdated_steps
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
@@ -156,11 +157,14 @@ def _content_of(version: Path) -> str:
 def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) -> Manifest:
     root, space = f"{asset.name}.usd", SPACES[options.texture_space]
     identifier = _identifier(options.uri, asset.name, version) or f"./{root}"
+    components = _unpublished(asset)
     said = hashlib.sha256(f"{options.encoding}\0{options.uri}\0{space}\0".encode())
 
     def describe(layer: Sdf.Layer) -> None:
         said.update(layer.ExportToString().encode())
         _describe(layer, asset.name, version, identifier)
+        for path in components:
+            _tell(Sdf.CreatePrimInLayer(layer, path), version=version)
 
     found = write_copy(
         asset,
@@ -215,6 +219,19 @@ def _identifier(template: str | None, name: str, version: str) -> str:
     )
 
 
+def _unpublished(asset: Asset) -> list[Sdf.Path]:
+    """Components, which get the version's number where the root layer says its own: other layers
+    are the same in every version that says the same."""
+    stage = open_edited(asset)
+    known = ((prim.GetPath(), prim.GetAssetInfo().get("version")) for prim in stage.TraverseAll())
+    return [path for path, version in known if version == UNPUBLISHED]
+
+
+def _tell(prim: Sdf.PrimSpec, **info: object) -> None:
+    known = dict(prim.GetInfo("assetInfo")) if prim.HasInfo("assetInfo") else {}
+    prim.SetInfo("assetInfo", {**known, **info})
+
+
 def _describe(layer: Sdf.Layer, name: str, version: str, identifier: str) -> None:
     """What the root layer of a version says of it."""
     layer.documentation = (
@@ -222,9 +239,7 @@ def _describe(layer: Sdf.Layer, name: str, version: str, identifier: str) -> Non
         "your own above it."
     )
     root = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}")
-    known = dict(root.GetInfo("assetInfo")) if root.HasInfo("assetInfo") else {}
-    told = {"identifier": Sdf.AssetPath(identifier), "name": name, "version": version}
-    root.SetInfo("assetInfo", {**known, **told})
+    _tell(root, identifier=Sdf.AssetPath(identifier), name=name, version=version)
 
 
 def _summary(version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:

@@ -67,35 +67,47 @@ def compare(
     place_a, a = measured_atlas(Path(first), chosen.lighting)
     place_b, b = measured_atlas(Path(second), chosen.other_lighting)
     with output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
-        forth, back = matched(a, b), matched(b, a)
-        if not (forth[1].any() and back[1].any()):
-            raise InputRefused(
-                f"{first}, {second}: no texel was seen three times in both. Compare captures that "
-                "show the same surfaces. [compare.surface]"
-            )
-        for name, same in ((place_a.name, forth[0]), (place_b.name, back[0])):
-            if same.missing:
-                warn(f"only {name} has {', '.join(same.missing)}. [compare.objects]")
-        found: dict[str, Any] = {
-            "assets": [place_a.name, place_b.name],
-            **({"lightings": [a.lighting, b.lighting]} if a.lighting or b.lighting else {}),
-            "texels": int(forth[1].sum()),
-            "missing": [list(forth[0].missing), list(back[0].missing)],
-        }
-        rows: list[Row] = []
-        for key, maps in _SETS.items():
-            if not all(atlas.has(name) for atlas in (a, b) for name in maps):
-                continue
-            pair = relit(a, b, forth, maps), relit(b, a, back, maps)
-            errors = _errors(*pair, forth[1], back[1])
-            found[key] = {name: error._asdict() for name, error in errors.items()}
-            rows += _object_rows(key, *pair)
-        write_text_atomic(work / "comparison.csv", table_text(rows))
-        _write_pictures(work / "pictures", *pair, a.frames)
-        found["objects"] = rows
+        found, (forth, back) = agreement(a, b, (place_a.name, place_b.name))
+        write_text_atomic(work / "comparison.csv", table_text(found["objects"]))
+        _write_pictures(work / "pictures", forth, back, a.frames)
         found[FILES] = [*files_of(work), DOCUMENT]
         write_json(work / DOCUMENT, found)
     return found
+
+
+def agreement(
+    a: AssetMaps, b: AssetMaps, names: tuple[str, str]
+) -> tuple[dict[str, Any], tuple[Relit, Relit]]:
+    """What ``compare`` returns of two assets of these names, but for the list of files; and A with
+    the albedo of B, B with that of A, of the last set of maps that both have.
+
+    Raises InputRefused where the assets share no texel.
+    """
+    forth, back = matched(a, b), matched(b, a)
+    if not (forth[1].any() and back[1].any()):
+        raise InputRefused(
+            f"{', '.join(names)}: no texel was seen three times in both. Compare captures that "
+            "show the same surfaces. [compare.surface]"
+        )
+    for name, same in ((names[0], forth[0]), (names[1], back[0])):
+        if same.missing:
+            warn(f"only {name} has {', '.join(same.missing)}. [compare.objects]")
+    found: dict[str, Any] = {
+        "assets": [*names],
+        **({"lightings": [a.lighting, b.lighting]} if a.lighting or b.lighting else {}),
+        "texels": int(forth[1].sum()),
+        "missing": [list(forth[0].missing), list(back[0].missing)],
+    }
+    rows: list[Row] = []
+    for key, maps in _SETS.items():
+        if not all(atlas.has(name) for atlas in (a, b) for name in maps):
+            continue
+        pair = relit(a, b, forth, maps), relit(b, a, back, maps)
+        errors = _errors(*pair, forth[1], back[1])
+        found[key] = {name: error._asdict() for name, error in errors.items()}
+        rows += _object_rows(key, *pair)
+    found["objects"] = rows
+    return found, pair
 
 
 def comparison_line(found: dict[str, Any]) -> str:
@@ -145,11 +157,12 @@ def _object_rows(key: str, forth: Relit, back: Relit) -> list[Row]:
 @dataclass(frozen=True, kw_only=True)
 class Relit:
     """On the texels of one asset, (T, 3) each: its radiance, the radiance predicted with the other
-    asset's albedo, both albedos; the texels that are compared, (T,) bool."""
+    asset's albedo, its irradiance, both albedos; the texels that are compared, (T,) bool."""
 
     atlas: AssetMaps
     measured: Float
     predicted: Float
+    irradiance: Float
     albedo: Float
     other_albedo: Float
     scored: Bool
@@ -175,13 +188,15 @@ def relit(
     (same, scored), (radiance, irradiance, albedo) = match, maps
     theirs = same.interpolated(other.map_where_present(albedo, 3))
     measured = atlas.map_where_present(radiance, 3)
-    reflected = atlas.map(irradiance) * theirs / np.pi
+    arriving = atlas.map(irradiance)
+    reflected = arriving * theirs / np.pi
     # Lamps are given: what is predicted is what they light.
     emits = atlas.map_where_present("emission", 3).any(axis=1, keepdims=True)
     return Relit(
         atlas=atlas,
         measured=measured,
         predicted=np.where(emits, measured, reflected).astype(np.float32),
+        irradiance=arriving,
         albedo=atlas.map_where_present(albedo, 3),
         other_albedo=theirs,
         scored=scored,
@@ -212,16 +227,27 @@ def _row(
     relit: Relit, hits: Hits, size: tuple[int, int], maps: tuple[Float, Float], exposure: float
 ) -> list[Byte]:
     """Reference, what is compared with it, and the error relative to the reference."""
+    reference, values = (on_surface(relit, hits, size, values) for values in maps)
+    pictures = [to_display_srgb8(m, exposure_scale=exposure) for m in (reference, values)]
+    return [*pictures, error_picture(relit, hits, size, maps)]
+
+
+def error_picture(
+    relit: Relit, hits: Hits, size: tuple[int, int], maps: tuple[Float, Float]
+) -> Byte:
+    """|values - reference| over the reference of ``maps``, reference first, as ``magma`` shows it;
+    grey where texels are not compared."""
     scored = np.repeat(relit.scored[:, None], 3, axis=1).astype(np.float32)
-    texels, owner = relit.atlas.texels, relit.atlas.scene.face_object
-    textures = (surface_texture(texels, owner, values) for values in (*maps, scored))
-    seen = (texture.at(hits.face, hits.u, hits.v) for texture in textures)
-    reference, values, share = (each.reshape(*size[::-1], 3) for each in seen)
-    counted = share[..., 0] > 0.5
+    reference, values, share = (on_surface(relit, hits, size, each) for each in (*maps, scored))
     error = np.abs(values - reference).mean(axis=2)
     relative = error / np.maximum(reference.mean(axis=2), 1e-6)
-    pictures = [to_display_srgb8(m, exposure_scale=exposure) for m in (reference, values)]
-    return [*pictures, magma((relative / _FULL_ERROR).astype(np.float32), counted)]
+    return magma((relative / _FULL_ERROR).astype(np.float32), share[..., 0] > 0.5)
+
+
+def on_surface(relit: Relit, hits: Hits, size: tuple[int, int], values: Float) -> Float:
+    """(H, W, 3): values (T, 3) where a camera with pictures of ``size`` (W, H) sees them."""
+    texture = surface_texture(relit.atlas.texels, relit.atlas.scene.face_object, values)
+    return texture.at(hits.face, hits.u, hits.v).reshape(*size[::-1], 3)
 
 
 @dataclass(frozen=True, kw_only=True)

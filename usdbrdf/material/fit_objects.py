@@ -25,6 +25,7 @@ from usdbrdf.material.fit_target import (
     choose_target_frames,
     count_frame,
     fit_target_frame,
+    metal_of_target_frame,
 )
 from usdbrdf.material.fit_views import (
     MIXTURE,
@@ -344,7 +345,7 @@ def fit_object(
     survey = max((one.survey for one in lightings), key=lambda survey: survey.shown[index])
     target = int(survey.target[index])
     if options.method != "views":
-        return _fit_of_frame(lightings[0].lit, reader, target, index, options)
+        return _fit_of_frame(lightings[0].lit, reader, target, index, options, asked)
     prepared = cache(lambda: _sampled(lightings, reader, index, mixture))
     used = look.num_samples if look else prepared()[1]
     if not (look.lobes if look else prepared()[0]):
@@ -370,15 +371,27 @@ def fit_object(
 
 
 def _fit_of_frame(
-    lit: LitScene, reader: FrameReader, target: int, index: int, options: FitOptions
+    lit: LitScene, reader: FrameReader, target: int, index: int, options: FitOptions, asked: str
 ) -> ObjectFit:
-    """The paper's: from the target frame alone."""
+    """The paper's: from the target frame alone. It cannot tell a metal from what is none, and
+    believes who ``asked`` for one."""
     faces = np.arange(*lit.scene.objects[index].faces.indices(len(lit.scene.triangles)))
     third = np.full(len(faces), 1 / 3, np.float32)
     shines = lit.emission.at(faces.astype(np.int32), third, third)[:, 0] > 0.5
     if target < 0 or shines.all():
         return ObjectFit(target=target)
     view = _view(reader.frames, target, reader.read(target))
+    if asked == METAL:
+        metal, used = metal_of_target_frame(lit, view, index, options.max_pixels, options.seed)
+        if metal is None:
+            return ObjectFit(num_samples=used, target=target)
+        error = (metal.phi_high - metal.phi_low) / math.sqrt(12)
+        red, green, blue = metal.f0
+        return ObjectFit(
+            metal.phi, 1.0, error, math.nan, 0.0, metal.cost, metal.evidence,
+            metal_phi=metal.phi, red=red, green=green, blue=blue, metal_phi_error=error,
+            clearer=0.0, num_samples=used, target=target,
+        )  # fmt: skip
     residual: Residual = "paper" if options.method == "paper" else "scaled"
     of_frame, used = fit_target_frame(lit, view, index, residual, options.max_pixels, options.seed)
     if of_frame is None:
@@ -398,15 +411,15 @@ def judged(
     what a person wanted of it."""
     if asked == GLASS:
         return replace(verdict_on_views(None, observed), kind="transparent")
+    if math.isfinite(found.clearer):
+        f0 = found.red, found.green, found.blue
+        errors = found.metal_phi_error, found.f0_error
+        return verdict_on_metal(found.metal_phi, f0, *errors, likelier=found.clearer > 0)
     if options.method == "views":
         lobe = LobeEstimate(
             found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
             found.evidence, (0.0, 0.0), found.phi_median, found.psi_median, found.psi_upper,
         )  # fmt: skip
-        if math.isfinite(found.clearer):
-            f0 = found.red, found.green, found.blue
-            errors = found.metal_phi_error, found.f0_error
-            return verdict_on_metal(found.metal_phi, f0, *errors, likelier=found.clearer > 0)
         verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
     else:
         keep, phi = options.method == "paper", (found.phi, found.phi_error)

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import ndimage
@@ -13,7 +13,7 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.transport.brdf import PAPER
+from usdbrdf.transport.brdf import F0_OF_PSI, PAPER
 from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
@@ -131,30 +131,83 @@ def fit_grid(observed: Float, weight: Float, basis: Basis, without_diffuse: Proj
     """
     root = np.sqrt(weight).astype(np.float64)
     target = without_diffuse(observed * root)
-    tried: dict[float, tuple[float, float]] = {}
+
+    def solve(phi: float) -> tuple[float, float]:
+        base, slope = basis(phi)
+        rest = target - without_diffuse(base * root)
+        slope_left = without_diffuse(slope * root)
+        square = float((slope_left * slope_left).sum())
+        psi = float((slope_left * rest).sum()) / square if square > 0 else 0.0
+        # The cost is that of the clamped psi; ``base`` stays at 0.
+        psi = min(1.0, max(0.0, psi))
+        left = rest - psi * slope_left
+        return float((left * left).sum()), psi
+
+    tried = _two_levels(solve)
+    low, phi, high = _flat_interval({phi: cost for phi, (cost, _) in tried.items()})
+    cost, psi = tried[phi]
+    evidence = _explained(cost, target)
+    return GridFit(phi, psi, low, high, cost / max(target.size, 1), evidence)
+
+
+class MetalFit(NamedTuple):
+    """phi in [0, 1]; f0 (3,) in [0, 1], reflectance at normal incidence; the roughnesses
+    phi_low..phi_high that fit as well within 1 %; cost per residual; evidence = 1 - cost / cost
+    of a black surface."""
+
+    phi: float
+    f0: tuple[float, float, float]
+    phi_low: float
+    phi_high: float
+    cost: float
+    evidence: float
+
+
+def fit_metal(observed: Float, weight: Float, basis: Basis) -> MetalFit:
+    """Fit a lobe without a diffuse part, with a reflectance of its own in each channel; arguments
+    and levels as of ``fit_grid``."""
+    root = np.sqrt(weight).astype(np.float64)
+    target = observed * root
+
+    def solve(phi: float) -> tuple[float, Double]:
+        base, slope = (part * root for part in basis(phi))
+        slope = slope / F0_OF_PSI
+        square = np.maximum((slope * slope).sum(axis=0), 1e-30)
+        f0 = np.clip((slope * (target - base)).sum(axis=0) / square, 0, 1)
+        left = target - base - f0 * slope
+        return float((left * left).sum()), f0
+
+    tried = _two_levels(solve)
+    low, phi, high = _flat_interval({phi: cost for phi, (cost, _) in tried.items()})
+    cost, (red, green, blue) = tried[phi][0], tried[phi][1].tolist()
+    evidence = _explained(cost, target)
+    return MetalFit(phi, (red, green, blue), low, high, cost / max(target.size, 1), evidence)
+
+
+Solved = TypeVar("Solved")
+
+
+def _two_levels(
+    solve: Callable[[float], tuple[float, Solved]],
+) -> dict[float, tuple[float, Solved]]:
+    """What ``solve`` finds at each roughness tried, its cost first."""
+    tried: dict[float, tuple[float, Solved]] = {}
 
     def level(low: float, high: float) -> tuple[float, float]:
         grid = [float(phi) for phi in low + np.arange(GRID) * (high - low) / (GRID - 1)]
         for phi in grid:
             if phi not in tried:
-                base, slope = basis(phi)
-                rest = target - without_diffuse(base * root)
-                slope_left = without_diffuse(slope * root)
-                square = float((slope_left * slope_left).sum())
-                psi = float((slope_left * rest).sum()) / square if square > 0 else 0.0
-                # The cost is that of the clamped psi; ``base`` stays at 0.
-                psi = min(1.0, max(0.0, psi))
-                left = rest - psi * slope_left
-                tried[phi] = float((left * left).sum()), psi
+                tried[phi] = solve(phi)
         best = min(range(GRID), key=lambda k: tried[grid[k]][0])
         return grid[max(best - 1, 0)], grid[min(best + 1, GRID - 1)]
 
     level(*level(0.0, 1.0))
-    low, phi, high = _flat_interval(tried)
-    cost, psi = tried[phi]
+    return tried
+
+
+def _explained(cost: float, target: Double) -> float:
     unexplained = float((target * target).sum())
-    evidence = max(0.0, 1.0 - cost / unexplained if unexplained > 0 else 0.0)
-    return GridFit(phi, psi, low, high, cost / max(target.size, 1), evidence)
+    return max(0.0, 1.0 - cost / unexplained if unexplained > 0 else 0.0)
 
 
 def nothing(values: Double) -> Double:
@@ -173,10 +226,11 @@ def multiple_of(diffuse: Float | Double) -> Projection:
     return project
 
 
-def _flat_interval(tried: dict[float, tuple[float, float]]) -> tuple[float, float, float]:
-    """Lowest, middle and highest roughness tried of the flat stretch around the minimum."""
+def _flat_interval(tried: Mapping[float, float]) -> tuple[float, float, float]:
+    """Lowest, middle and highest roughness of the flat stretch around the minimum; tried: roughness
+    -> cost."""
     phis = sorted(tried)
-    costs = [tried[phi][0] for phi in phis]
+    costs = [tried[phi] for phi in phis]
     best = min(range(len(phis)), key=costs.__getitem__)
     first = last = best
     while first > 0 and costs[first - 1] <= (1 + _FLAT) * costs[best]:
@@ -247,11 +301,7 @@ def fit_target_frame(
     samples, number = frame_samples(lit, view, index, max_pixels, seed)
     if samples is None:
         return None, number
-
-    def basis(phi: float) -> tuple[Float, Float]:
-        base, slope = samples.of_phis(PAPER, [phi])
-        return base[..., 0], slope[..., 0]
-
+    basis = _of_one_phi(samples)
     observed, diffuse = samples.observed, samples.diffuse
     if residual == "paper":
         # The paper sums over all pixels alike; what was left out is stood for by what was taken.
@@ -261,6 +311,25 @@ def fit_target_frame(
     # Highlights count for more than their share of pixels.
     weight = samples.weight()
     return fit_grid(observed, weight, basis, multiple_of(diffuse * np.sqrt(weight))), number
+
+
+def metal_of_target_frame(
+    lit: LitScene, view: View, index: int, max_pixels: int, seed: int
+) -> tuple[MetalFit | None, int]:
+    """The same of an object that somebody knows to be a metal, residuals as of "scaled": what it
+    shows is all lobe, also what the texture holds of it."""
+    samples, number = frame_samples(lit, view, index, max_pixels, seed)
+    if samples is None:
+        return None, number
+    return fit_metal(samples.observed, samples.weight(), _of_one_phi(samples)), number
+
+
+def _of_one_phi(samples: FrameSamples) -> Basis:
+    def basis(phi: float) -> tuple[Float, Float]:
+        base, slope = samples.of_phis(PAPER, [phi])
+        return base[..., 0], slope[..., 0]
+
+    return basis
 
 
 def relative_costs(

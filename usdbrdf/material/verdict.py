@@ -242,12 +242,12 @@ def verdict_on_metal(
     likelier: bool = True,
 ) -> Verdict:
     """On a metal; ``likelier``: it explains many views better than any dielectric, without which
-    nothing of it is measured, whoever says that it is one."""
+    nothing of it is measured, whoever says that it is one. f0_error: NaN of one frame."""
     phi_sure = "high" if phi_error <= MAX_PHI_ERROR else "low"
     f0_sure = "high" if f0_error <= _MAX_F0_ERROR else "low"
     measured = (phi_sure, f0_sure) == ("high", "high") and likelier
     # psi is at the bound of all dielectrics.
-    psi_error = float(min(f0_error / F0_OF_PSI, NOTHING_KNOWN))
+    psi_error = float(np.minimum(f0_error / F0_OF_PSI, NOTHING_KNOWN))  # NaN if F0's is
     return Verdict(
         phi, 1.0, phi_error, psi_error, "measured" if measured else "prior", phi_sure, f0_sure,
         psi_upper=1.0, kind="conductor", f0=f0, f0_error=f0_error,

@@ -29,6 +29,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.options import RelightOptions
 from usdbrdf.relighting.relit_scene import SKY_SUFFIXES, USD_SUFFIXES, relit_scene
 from usdbrdf.relighting.render import mitsuba_scene, mitsuba_variant, render_view
+from usdbrdf.relighting.scene_file import SUFFIX, write_scene_file
 from usdbrdf.transport.denoise import OIDN, chosen_filter, denoise_picture
 
 LINEAR, DISPLAYED = (".exr",), (".png", ".jpg", ".jpeg")
@@ -37,7 +38,8 @@ _LEVELS = 1 << 16  # pixels of a picture that the exposure is taken from
 
 @reads_asset("folder")
 def relight(folder: Path, output: Path, options: RelightOptions | None = None) -> dict[str, Any]:
-    """Render the asset in ``folder`` into ``output``: a picture, or with views a folder of them.
+    """Render the asset in ``folder`` into ``output``: a picture, or with views a folder of them; or
+    write there the scene that Mitsuba would be given, an .xml.
 
     What is rendered is the root layer as everybody opens it, the artist's edits included; nothing
     of the asset is changed. Returns a summary of plain values.
@@ -55,13 +57,24 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         views = cameras_of_views(options.views, asset, captured.metres_per_unit)
     if options.width is not None:
         views = tuple(view.at_width(options.width) for view in views)
-    targets = [output]
-    if options.views is not None:
+    targets, is_scene = [output], output.suffix.lower() == SUFFIX
+    if options.views is not None and not is_scene:
         targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
         for target in targets:
             _refuse_taken(target, folder=False)
     falls = any(insert.falls_from_eye_height for insert in options.inserts)
     scene = relit_scene(captured, options, eye_height(stage) if falls else 0.0)
+    told = {
+        "samples": options.samples,
+        "bounces": options.bounces,
+        "surfaces": len(scene.surfaces),
+        "lights": len(scene.lights) + sum(s.material.emits for s in scene.surfaces),
+    }
+    if is_scene:
+        files = write_scene_file(
+            mitsuba, output, scene, views, bounces=options.bounces, samples=options.samples
+        )
+        return {"scene": str(output), "files": files, "cameras": len(views), **told}
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):
         targets[0].parent.mkdir(parents=True, exist_ok=True)
@@ -70,12 +83,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     return {
         "pictures": [str(target) for target in targets],
         "variant": mitsuba.variant(),
-        "samples": options.samples,
         "denoise": noise,
-        "bounces": options.bounces,
-        "surfaces": len(scene.surfaces),
-        "lights": len(scene.lights) + sum(s.material.emits for s in scene.surfaces),
         "exposure": exposure,
+        **told,
     }
 
 
@@ -136,12 +146,13 @@ def _write_picture(path: Path, radiance: Float, stops: float) -> None:
 
 def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
     """Everything that can be refused before the renderer is started."""
-    if options.views is None and output.suffix.lower() not in (*LINEAR, *DISPLAYED):
+    suffix, many = output.suffix.lower(), options.views is not None
+    if not many and suffix not in (*LINEAR, *DISPLAYED, SUFFIX):
         raise UsageError(
-            f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}. Choose one of "
-            "these extensions. [relight.format]"
+            f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}, scenes for "
+            f"Mitsuba as {SUFFIX}. Choose one of these extensions. [relight.format]"
         )
-    _refuse_taken(output, folder=options.views is not None)
+    _refuse_taken(output, folder=many and suffix != SUFFIX)
     asset.refuse_output(output, "relight.output")
     lights = options.lights
     if lights is not None and lights.suffix.lower() not in USD_SUFFIXES | SKY_SUFFIXES:

@@ -6,9 +6,7 @@ description = "Measured materials for captured rooms and objects, written as USD
 requires = ["python-3.10+<3.14"]
 tools = ["usdbrdf"]
 private_build_requires = ["pip"]
-build_command = (
-    "python -m pip install --prefix {install_path} -c {root}/../../constraints.txt {root}/../.."
-)
+build_command = "python -m pip install --prefix {install_path} -c {root}/../../../constraints.txt {root}/../../.."
 
 
 def commands():

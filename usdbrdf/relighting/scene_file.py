@@ -1,0 +1,173 @@
+"""A scene as Mitsuba's own format: NAME.xml, and beside it the folder NAME.files with meshes (PLY)
+and pictures (EXR). It needs no plug-in of ours: materials are what Mitsuba's BSDFs can say of
+them, see ``description.two_of_mitsuba``."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from usdbrdf.errors import OwnershipConflict
+from usdbrdf.files.atomic import (
+    TEMPORARY_PREFIX,
+    environment_failures,
+    publish_folder,
+    write_text_atomic,
+)
+from usdbrdf.files.images import write_exr
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.camera import Camera
+from usdbrdf.model.light import RelitScene
+from usdbrdf.relighting import description
+from usdbrdf.relighting.render import mesh_of_surface
+
+SUFFIX = ".xml"
+VERSION = "3.0.0"  # of Mitsuba's format
+_TAGS = {
+    "area": "emitter", "bitmap": "texture", "blendbsdf": "bsdf", "box": "rfilter",
+    "constant": "emitter", "diffuse": "bsdf", "directional": "emitter", "disk": "shape",
+    "envmap": "emitter", "hdrfilm": "film", "mesh_attribute": "texture", "multijitter": "sampler",
+    "path": "integrator", "perspective": "sensor", "ply": "shape", "rectangle": "shape",
+    "roughconductor": "bsdf", "sphere": "shape", "twosided": "bsdf", "uniform": "texture",
+}  # fmt: skip
+_OURS = "A scene of usdbrdf for Mitsuba 3: metres, linear Rec.709, radiance in the asset's unit. "
+
+
+def write_scene_file(
+    mi: Any, path: Path, scene: RelitScene, cameras: Sequence[Camera], *, bounces: int, samples: int
+) -> int:
+    """Write the scene with all cameras, of which Mitsuba renders the first; returns how many files
+    lie beside it. What stood there of an earlier scene is replaced.
+
+    Pictures have square pixels: a camera whose pixels are not has more or fewer rows. Raises
+    OwnershipConflict where the folder for its files holds something else.
+    """
+    folder = path.with_name(f"{path.stem}.files")
+    if folder.exists() and not _is_ours(path, folder):
+        raise OwnershipConflict(
+            f"{folder}: this is in the place of the scene's meshes and pictures. Name another file "
+            "with -o. [relight.output]"
+        )
+    with environment_failures(str(path)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=path.parent))
+    try:
+        with environment_failures(str(path)):
+            made = work / folder.name
+            made.mkdir()
+            root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples)
+            ElementTree.indent(root)
+            text = ElementTree.tostring(root, encoding="unicode")
+            if folder.exists():
+                path.unlink(missing_ok=True)  # it names what goes now
+                os.replace(folder, work / "earlier")
+            publish_folder(made, folder)
+            write_text_atomic(path, f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n')
+            return sum(1 for _ in folder.iterdir())
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _is_ours(path: Path, folder: Path) -> bool:
+    if not folder.is_dir():
+        return False
+    if not any(folder.iterdir()):
+        return True
+    with suppress(OSError, UnicodeDecodeError):
+        return path.is_file() and _OURS in path.read_text("utf-8")
+    return False
+
+
+class _Files:
+    """The pictures and meshes of a scene, equal pictures once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._known: dict[tuple[Any, ...], str] = {}
+
+    def named(self, name: str) -> str:
+        return f"{self.folder.name}/{name}"
+
+    def picture(self, pixels: Float) -> str:
+        key = pixels.shape, pixels.tobytes()
+        if key not in self._known:
+            name = f"picture_{len(self._known):04d}.exr"
+            write_exr(self.folder / name, pixels, half=False)
+            self._known[key] = name
+        return self.named(self._known[key])
+
+
+def _scene_element(
+    mi: Any, files: _Files, scene: RelitScene, cameras: Sequence[Camera], bounces: int, samples: int
+) -> ElementTree.Element:
+    root = ElementTree.Element("scene", version=VERSION)
+    root.append(ElementTree.Comment(f" {_OURS}"))
+    _add(root, "", description.integrator(bounces), files)
+    for camera in cameras:
+        sensor = description.pinhole(camera, *description.square_pixels(camera))
+        sensor["sampler"] = {**sensor["sampler"], "sample_count": samples}
+        _add(root, "", sensor, files).set("id", camera.name)
+    clear = [surface for surface in scene.surfaces if surface.material.clear]
+    for i, surface in enumerate(s for s in scene.surfaces if s not in clear):
+        name = f"mesh_{i:04d}.ply"
+        mesh_of_surface(mi, surface, mi.Properties()).write_ply(str(files.folder / name))
+        bsdf = description.two_of_mitsuba(surface)
+        shape: dict[str, Any] = {"type": "ply", "filename": files.named(name)}
+        shape["bsdf"] = {"type": "twosided", "bsdf": bsdf} if surface.two_sided else bsdf
+        if surface.material.emits:
+            shape["emitter"] = description.emitter(surface)
+        root.append(ElementTree.Comment(f" {surface.name.replace('--', '- -')} "))
+        _add(root, "", shape, files)
+    extent = description.extent(scene)
+    for light in scene.lights:
+        _add(root, "", description.light(light, *extent), files)
+    return root
+
+
+def _add(
+    above: ElementTree.Element, name: str, plain: Mapping[str, Any], files: _Files
+) -> ElementTree.Element:
+    """An element for a description, named as a property of what is above it."""
+    kind = plain["type"]
+    named = {"name": name} if name else {}
+    if kind == "rgb":
+        value = np.atleast_1d(np.asarray(plain["value"], np.float64)).tolist()
+        return _element(above, "rgb", **named, value=", ".join(map(repr, value)))
+    if kind == "uniform" and above.tag == "bsdf":
+        return _element(above, "float", **named, value=repr(plain["value"]))
+    made = _element(above, _TAGS[kind], type=kind, **named)
+    for key, value in plain.items():
+        if key != "type":
+            _add_value(made, key, value, files)
+    return made
+
+
+def _add_value(above: ElementTree.Element, name: str, value: Any, files: _Files) -> None:
+    if isinstance(value, Mapping):
+        _add(above, name, value, files)
+    elif isinstance(value, np.ndarray) and name == "bitmap":
+        _element(above, "string", name="filename", value=files.picture(value))
+    elif isinstance(value, np.ndarray):
+        _element(_element(above, "transform", name=name), "matrix", value=_matrix(value))
+    elif isinstance(value, list):
+        _element(above, "vector", name=name, value=", ".join(map(repr, value)))
+    else:
+        kinds = {bool: "boolean", int: "integer", float: "float", str: "string"}
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        _element(above, kinds[type(value)], name=name, value=text)
+
+
+def _matrix(values: Double) -> str:
+    return " ".join(map(repr, np.asarray(values, np.float64).ravel().tolist()))
+
+
+def _element(above: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
+    return ElementTree.SubElement(above, tag, attributes)
