@@ -84,6 +84,7 @@ ARROWS: dict[str, set[str]] = {
 # --- The one place of each dependency. ------------------------------------------------------------
 
 IMPORTERS: dict[str, set[str]] = {
+    "cv2": {"capture/alignment.py"},
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "dask": {"cluster/"},
     "distributed": {"cluster/"},
@@ -254,6 +255,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
     "_OTHER_SEED": "a seed",
+    "_OVERLAP": "limit of what is refused",
     "_PARTS": "blocks of a jackknife",
     "_PER_CODE": "time",
     "_PER_PIXEL": "bytes",
