@@ -84,6 +84,7 @@ ARROWS: dict[str, set[str]] = {
 # --- The one place of each dependency. ------------------------------------------------------------
 
 IMPORTERS: dict[str, set[str]] = {
+    "av": {"untrusted/"},
     "cv2": {"capture/alignment.py"},
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "dask": {"cluster/"},
@@ -271,6 +272,7 @@ ENGINEERING: dict[str, str] = {
     "_PSI_GRID": "discretisation of the posterior",
     "_PUBLISHED": "convention of a format",
     "_QUANTILE": "mathematics: the median",
+    "_RANKS": "discretisation of the ranks",
     "_RAYS": "rays: noise against time",
     "_RAYS_OF_LOBE": "rays: noise against time",
     "_RAYS_OF_MANY": "rays: noise against time",
@@ -281,6 +283,7 @@ ENGINEERING: dict[str, str] = {
     "_ROUNDING": "numerics: of float32 and printed digits",
     "_ROUNDS": "steps of a search",
     "_ROWS": "memory",
+    "_RUN": "time",
     "_SAMPLING": "rays: noise against time",
     "_SEED": "a seed",
     "_SEGMENTS": "time: how many are asked",
