@@ -58,7 +58,7 @@ def room(session: nox.Session) -> None:
 @nox.session
 def everything(session: nox.Session) -> None:
     """All tests, as they run before a change is accepted."""
-    install(session, "test,colmap,e57,dcc,denoise,render,farm")
+    install(session, "test,brackets,colmap,e57,dcc,denoise,render,farm")
     session.run("python", "-m", "pytest", *session.posargs)
 
 

@@ -32,7 +32,7 @@ COARSE = ["--texel-size", "0.3", "--rays", "64", "--max-pixels", "50"]
 NAMES = (
     *("convert", "ingest", "texture", "shade", "fit", "evaluate", "compare", "relight"),
     *("package", "validate", "rules", "adapters", "plugin-path", "inspect", "merge-brackets"),
-    *("report", "view", "develop-raw", "publish"),
+    *("report", "view", "develop-raw", "develop-video", "publish"),
 )
 
 

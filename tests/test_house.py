@@ -86,6 +86,8 @@ ARROWS: dict[str, set[str]] = {
 # --- The one place of each dependency. ------------------------------------------------------------
 
 IMPORTERS: dict[str, set[str]] = {
+    "av": {"untrusted/"},
+    "cv2": {"capture/alignment.py"},
     "cyclopts": {"cli.py", "commands.py", "command_parser.py"},
     "dask": {"cluster/"},
     "distributed": {"cluster/"},
@@ -259,6 +261,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
     "_OTHER_SEED": "a seed",
+    "_OVERLAP": "limit of what is refused",
     "_PARTS": "blocks of a jackknife",
     "_PER_CODE": "time",
     "_PER_PIXEL": "bytes",
@@ -274,6 +277,7 @@ ENGINEERING: dict[str, str] = {
     "_PSI_GRID": "discretisation of the posterior",
     "_PUBLISHED": "convention of a format",
     "_QUANTILE": "mathematics: the median",
+    "_RANKS": "discretisation of the ranks",
     "_RAYS": "rays: noise against time",
     "_RAYS_OF_LOBE": "rays: noise against time",
     "_RAYS_OF_MANY": "rays: noise against time",
@@ -285,6 +289,7 @@ ENGINEERING: dict[str, str] = {
     "_ROUNDING": "numerics: of float32 and printed digits",
     "_ROUNDS": "steps of a search",
     "_ROWS": "memory",
+    "_RUN": "time",
     "_SAMPLING": "rays: noise against time",
     "_SEED": "a seed",
     "_SEGMENTS": "time: how many are asked",

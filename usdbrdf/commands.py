@@ -125,6 +125,28 @@ class DevelopRaw(Talking):
         return self.told({"capture": str(self.output), **found}, told)
 
 
+class DevelopVideo(Talking):
+    """Make a capture of radiance of a video whose exposure changes from frame to frame."""
+
+    capture: Path = option("SCAN", REQUIRED)
+    "folder with transforms.json, which names a video, its exposures and each frame's number in it"
+    output: Path = option("-o --output DIR", REQUIRED)
+    "new folder for the capture of one EXR for each frame that is named"
+
+    def run(self) -> int:
+        with loading():
+            from usdbrdf.capture.native import refuse_taken
+            from usdbrdf.capture.video_frames import develop_video
+        refuse_taken(self.output, self.capture)
+        found = develop_video(self.capture, self.output)
+        told = (
+            f"{self.output}: written, {found['frames']} frames over {found['stops']:.1f} stops; "
+            f"radiometric up to one scale; clipped {found['clipped_share']:.2%} of the pixels; "
+            f"{len(found['contradicting'])} frames contradict their stated exposure"
+        )
+        return self.told({"capture": str(self.output), **found}, told)
+
+
 class _RunOnAsset(Run):
     asset: Path = option("ASSET", REQUIRED)
     "asset folder made by ingest"
@@ -437,8 +459,9 @@ class PluginPath(Command):
 
 _TASKS: tuple[type[Command], ...] = (Inspect, Convert, Ingest, Texture, Shade, Fit)
 _OTHERS = (
-    MergeBrackets, DevelopRaw, Evaluate, Compare, Paper, Relight, Package, Publish, Report, View,
-    Advise, Validate, Farm, FarmWork, FarmTable, Rules, Adapters, Doctor, Completion, PluginPath,
+    MergeBrackets, DevelopRaw, DevelopVideo, Evaluate, Compare, Paper, Relight, Package, Publish,
+    Report, View, Advise, Validate, Farm, FarmWork, FarmTable, Rules, Adapters, Doctor, Completion,
+    PluginPath,
 )  # fmt: skip
 COMMANDS = {
     re.sub("(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command

@@ -88,6 +88,18 @@ def test_gains_masks_and_lenses_of_some_are_none_of_the_others(pair):
     assert frames.photographs == ()
 
 
+@pytest.mark.parametrize("through_a_lens", ["by_day", "by_night"])
+def test_the_photographs_encoding_is_that_of_those_that_were_resampled(pair, through_a_lens):
+    scans = _scans(*(made.folder for made in pair))
+    frames = scans[through_a_lens].frames
+    taken = tuple(path.with_suffix(".jpg") for path in frames.image_paths)
+    frames = replace(frames, photographs=taken, photograph_encoding="acescct_ap1")
+    scans[through_a_lens] = replace(scans[through_a_lens], frames=frames)
+    joined = scan_of_lightings(scans, CREASE).frames
+    assert joined.photograph_encoding == "acescct_ap1"
+    assert sum(path is not None for path in joined.photographs) == len(taken)
+
+
 def test_the_lens_is_what_those_tell_that_tell_of_it(pair):
     scans = _scans(*(made.folder for made in pair))
     assert scan_of_lightings(scans, CREASE).frames.vignetting == (0, 0)

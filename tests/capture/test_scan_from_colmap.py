@@ -12,6 +12,7 @@ from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.formats import colmap
+from usdbrdf.capture.formats.named_pictures import mask_beside
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.options import IngestOptions
@@ -173,11 +174,30 @@ def test_a_model_without_points_and_with_colmaps_own_mesh_and_masks(tmp_path):
     (made.folder / "dense").mkdir()
     (made.folder / "mesh.ply").rename(made.folder / "dense" / "meshed-poisson.ply")
     (made.folder / "masks").mkdir()
-    shutil.copy(make_mask(tmp_path / "mask.png"), made.folder / "masks" / "0003.exr.png")
+    # COLMAP's name, and those that other programs give.
+    for name in ("0003.exr.png", "0005.png", "0007_mask.png"):
+        shutil.copy(make_mask(tmp_path / "mask.png"), made.folder / "masks" / name)
     scan = read_scan(made.folder, IngestOptions())
-    assert [view is not None for view in scan.views] == [i == 3 for i in range(10)]
+    assert [view is not None for view in scan.views] == [i in (3, 5, 7) for i in range(10)]
     assert any("[colmap.scale]" in warning for warning in scan.warnings)
-    assert any("1 masks" in warning for warning in scan.warnings)
+    assert any("3 masks" in warning for warning in scan.warnings)
+
+
+def test_masks_of_subfolders_are_not_mixed_up(tmp_path):
+    (tmp_path / "masks/left").mkdir(parents=True)
+    for name in ("left/0001.jpg.png", "0001.png", "0002.jpg"):
+        make_mask(tmp_path / "masks" / name)
+    found = {
+        name: mask_beside(tmp_path, name, OPTIONS)
+        for name in ("left/0001.jpg", "right/0001.jpg", "0001.jpg", "0002.jpg")
+    }
+    masks = tmp_path / "masks"
+    assert found == {
+        "left/0001.jpg": masks / "left/0001.jpg.png",
+        "right/0001.jpg": None,
+        "0001.jpg": masks / "0001.png",
+        "0002.jpg": masks / "0002.jpg",
+    }
 
 
 def make_mask(path):

@@ -171,7 +171,9 @@ def test_lenses_image_points_where_agisofts_do(tmp_path, room, kind):
     camera = _child(cameras, "camera", id="0", sensor_id="0", label="DSC0000")
     _child(camera, "transform", _text(np.eye(4)))
     folder = _write(tmp_path / "lens", document, room)
-    (record,) = frame_records(folder / "cameras.xml", pictures_of(folder, OPTIONS), Findings())
+    (record,) = frame_records(
+        folder / "cameras.xml", pictures_of(folder, OPTIONS), OPTIONS, Findings()
+    )
     points = np.random.default_rng(0).uniform((-0.6, -0.5, 1), (0.6, 0.5, 1.2), (50, 3))
     seen = record.lens.project(points * (1, -1, -1), record.intrinsics)
     np.testing.assert_allclose(seen, _agisoft(points, kind, numbers), atol=1e-6)
@@ -183,7 +185,9 @@ def test_a_spherical_sensor_needs_no_calibration(tmp_path, room):
     camera = _child(cameras, "camera", id="0", sensor_id="0", label="DSC0000")
     _child(camera, "transform", _text(np.eye(4)))
     folder = _write(tmp_path / "sphere", document, room)
-    (record,) = frame_records(folder / "cameras.xml", pictures_of(folder, OPTIONS), Findings())
+    (record,) = frame_records(
+        folder / "cameras.xml", pictures_of(folder, OPTIONS), OPTIONS, Findings()
+    )
     assert record.lens.curve == "equirectangular"
     ahead = record.lens.project(np.array([[0.0, 0, -1], [1, 0, 0]]), record.intrinsics)
     np.testing.assert_allclose(ahead, [[WIDTH / 2, HEIGHT / 2], [0.75 * WIDTH, HEIGHT / 2]])

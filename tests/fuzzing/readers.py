@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -43,6 +44,7 @@ from usdbrdf.untrusted import (
     replica_files,
     usd_cameras,
     usd_files,
+    video_files,
 )
 
 # Refusals of bytes that are not the format at all; what is refused by another rule was read.
@@ -50,7 +52,7 @@ OF_THE_FORM = frozenset((
     "adapter.none", "arrays.damaged", "colmap.model", "document.depth", "document.duplicate",
     "document.json", "document.missing", "document.nonfinite", "document.size", "document.table",
     "document.xml", "e57.read", "image.format", "image.limits", "image.unreadable", "mesh.read",
-    "publish.manifest", "raw.read", "review.layer", "stage.input",
+    "publish.manifest", "raw.read", "review.layer", "stage.input", "video.read",
 ))  # fmt: skip
 
 
@@ -99,6 +101,11 @@ def _scan(adapter: str, *, photographs: bool = False) -> Callable[[Path], object
     # Nothing of any capture lies in the folder that is allowed too.
     options = IngestOptions(assume_srgb=photographs, allow_outside=(Path("/nowhere/at/all"),))
     return lambda path: read_scan(path, options, adapter, plugins=False)
+
+
+def _frames_of_video(path: Path) -> object:
+    with TemporaryDirectory() as folder:
+        return video_files.read_here(path, (0, 2), folder)
 
 
 def _mesh_and_model(path: Path) -> object:
@@ -206,6 +213,13 @@ READERS = {
             lines=("usdbrdf.untrusted.raw_files:read_here,_rec709_from_camera",),
             in_child=True,
             unknown=frozenset(("exposure",)),
+        ),
+        Reader(
+            name="video",
+            seeds=seeds.video,
+            read=_frames_of_video,
+            lines=("usdbrdf.untrusted.video_files:read_here,_upright",),
+            in_child=True,
         ),
         *(
             Reader(

@@ -134,6 +134,23 @@ def dng(folder: Path) -> list[Seed]:
     return _alone(folder / "a.dng")
 
 
+def video(folder: Path) -> list[Seed]:
+    """Three frames, in two containers."""
+    import av
+
+    folder.mkdir(parents=True)
+    made = [folder / "a.mp4", folder / "a.mkv"]
+    codes = np.random.default_rng(0).integers(0, 255, (3, 48, 64, 3), np.uint8)
+    for path, codec in zip(made, ("mpeg4", "ffv1"), strict=True):
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream(codec, rate=30)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+            for picture in codes:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+    return _alone(*made)
+
+
 def pictures(folder: Path) -> list[Seed]:
     """Of every format, with metadata."""
     made = [*exr(folder)[2:4], *hdr(folder), *png(folder), *jpeg(folder), *tiff(folder)]
@@ -692,7 +709,7 @@ def matrices(folder: Path) -> list[Seed]:
 
 NEEDS = {
     **dict.fromkeys(("colmap", "colmap_text", "colmap_binary", "scannetpp"), "pycolmap"),
-    **{"e57": "pye57", "dng": "rawpy"},
+    **{"e57": "pye57", "dng": "rawpy", "video": "av"},
 }
 
 

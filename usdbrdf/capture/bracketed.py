@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from usdbrdf.capture.brackets import Response, aligned, merge, response_from_brackets
+from usdbrdf.capture.alignment import Aligned, aligned
+from usdbrdf.capture.brackets import Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
@@ -22,7 +23,7 @@ from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.images import exif_exposure, is_eight_bit, needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Byte, Double
+from usdbrdf.model.arrays import Double
 
 # Brackets that the response is told by.
 _TELLING = 12
@@ -49,7 +50,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     brackets = _brackets(source, document)
     telling = [brackets[i] for i in spread_evenly(len(brackets), _TELLING)]
     response = response_from_brackets(
-        [_codes(bracket) for bracket in telling], [bracket.exposures for bracket in telling]
+        [_aligned(bracket).stack for bracket in telling], [bracket.exposures for bracket in telling]
     )
     frames, clipped, ghosts = [], [], []
     with environment_failures(str(folder)), whole_folder(folder) as staged:
@@ -92,7 +93,8 @@ def _merged(
     bracket: Bracket, response: Response, place: Path
 ) -> tuple[dict[str, Any], tuple[float, float]]:
     """Writes the picture; the frame's entry, and the shares of clipped and contradicting pixels."""
-    found = merge(_codes(bracket), bracket.exposures, response)
+    laid = _aligned(bracket)
+    found = merge(laid.stack, bracket.exposures, response, laid.silent)
     # What is clearly negative is unknown to every reader of frames.
     pixels = np.where(np.isnan(found.radiance), -np.float32(found.saturation), found.radiance)
     write_exr(place, pixels, half=not needs_float(pixels))
@@ -101,8 +103,7 @@ def _merged(
     return entry, (found.clipped, found.ghost)
 
 
-def _codes(bracket: Bracket) -> Byte:
-    """(K, H, W, 3), shifted onto each other."""
+def _aligned(bracket: Bracket) -> Aligned:
     pictures = []
     for path in bracket.images:
         if not is_eight_bit(path):
@@ -117,7 +118,7 @@ def _codes(bracket: Bracket) -> Byte:
             f"{bracket.images[0]}: the images of this bracket have {len(sizes)} sizes. Export all "
             "of them alike. [brackets.size]"
         )
-    return aligned(np.array(pictures), [path.name for path in bracket.images])[0]
+    return aligned(np.array(pictures), [path.name for path in bracket.images])
 
 
 def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:

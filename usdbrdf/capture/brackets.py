@@ -10,10 +10,9 @@ Everything is known up to one factor, the same for all pictures of one response.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import median_filter, uniform_filter
 from scipy.optimize import nnls
 
@@ -21,7 +20,6 @@ from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Byte, Double, Float, Int
 
-T = TypeVar("T", bound=np.generic)
 # Codes beyond which a channel is dark or bright, and not how much; JPEG moves codes near its ends.
 DARK_CODE, BRIGHT_CODE = 4, 250
 _MIDDLE = 128
@@ -34,12 +32,6 @@ _PER_CODE, _ROUNDS = 12, 3
 _ALONE = 2.5 / 9
 # Codes over which errors are taken together.
 _AROUND = 9
-# How far brackets are shifted, at most, as a power of two, in pixels.
-_LEVELS = 6
-# Codes between which the threshold of a bitmap is chosen, and those around it that say nothing.
-_CLEAR, _UNDECIDED = (16, 239), 4
-# Pixels by which the parts of a shifted picture may disagree, if so many more of their bits fit.
-_NEAR, _BETTER = 1.5, 0.01
 
 
 class Response(NamedTuple):
@@ -189,15 +181,18 @@ def _add(normal: Double, said: Double, codes: Byte, log: Double, weight: Double)
             np.add.at(normal, (codes[one], codes[other]), -weight[one] * weight[other] / total)
 
 
-def merge(stack: Byte, exposures: Double, response: Response) -> Merged:
+def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | None = None) -> Merged:
     """One picture of radiance from a bracket, (K, H, W, 3) uint8, aligned, exposed (K,).
+
+    silent  (K, H, W, 3) where an exposure shows nothing; None: nowhere
 
     What is further off the mean than ``brackets.ghost`` of its errors contradicts the others.
     """
+    silent = np.zeros(stack.shape, np.bool_) if silent is None else silent
     channel = np.arange(3)
     logs = response.logarithm[channel, stack] - np.log(exposures)[:, None, None, None]
     error = response.error[channel, stack]
-    tells = _tells(stack)
+    tells, over, under = _tells(stack) & ~silent, stack > BRIGHT_CODE, stack < DARK_CODE
     weight = tells / error**2
     total = weight.sum(axis=0)
     known = total > 0
@@ -207,12 +202,14 @@ def merge(stack: Byte, exposures: Double, response: Response) -> Merged:
     # What clips in an exposure, or is dark in it, is a bound on what the others say.
     reach = _GHOST * response.error[:, [DARK_CODE, BRIGHT_CODE]]
     exposed = mean + np.log(exposures)[:, None, None, None]
-    against |= known & ((stack > BRIGHT_CODE) & (exposed < (ends - reach)[:, 1])).any(axis=0)
-    against |= known & ((stack < DARK_CODE) & (exposed > (ends + reach)[:, 0])).any(axis=0)
+    against |= known & (over & ~silent & (exposed < (ends - reach)[:, 1])).any(axis=0)
+    against |= known & (under & ~silent & (exposed > (ends + reach)[:, 0])).any(axis=0)
     floor = float(np.exp(ends[:, 0].max() - np.log(exposures.max())))
     ceiling = float(np.exp(ends[:, 1].min() - np.log(exposures.min())))
     radiance = np.where(known, np.exp(mean), np.nan)
-    clipped, dark = (stack > BRIGHT_CODE).all(axis=0), (stack < DARK_CODE).all(axis=0)
+    # Of these limits only the shortest exposure knows the one, the longest the other.
+    clipped = (over | silent).all(axis=0) & ~silent[exposures.argmin()]
+    dark = (under | silent).all(axis=0) & ~silent[exposures.argmax()]
     radiance = np.where(clipped, 2 * ceiling, np.where(dark, 0, radiance))
     # What moves covers more than a pixel; what noise does is alone.
     ghost = uniform_filter(against.any(axis=2).astype(np.float32), 3) > _ALONE
@@ -224,110 +221,3 @@ def merge(stack: Byte, exposures: Double, response: Response) -> Merged:
         clipped=float((radiance >= ceiling).any(axis=2).mean()),
         ghost=float(ghost.mean()),
     )
-
-
-def aligned(stack: Byte, names: list[str]) -> tuple[Byte, Int]:
-    """A hand-held bracket, (K, H, W, 3) by exposure, shifted by whole pixels onto its middle
-    exposure; where nothing is known after that the code is 0 in all. And the shifts (K, 2).
-
-    Bitmaps above and below a rank are compared, coarse to fine (Ward, "Fast, robust image
-    registration", 2003). Raises InputRefused, with ``names``, where parts of a picture have moved
-    differently: it was turned, or something near was seen from elsewhere.
-    """
-    grey = stack.astype(np.float32).mean(axis=3).astype(np.uint8)
-    middle = len(stack) // 2
-    shifts = np.zeros((len(stack), 2), np.int32)
-    for k in [*range(middle + 1, len(stack)), *range(middle - 1, -1, -1)]:
-        near = k - 1 if k > middle else k + 1
-        step = _shift(grey[near], grey[k], _LEVELS)
-        rows, columns = (n // 2 for n in grey.shape[1:])
-        corners = [
-            (slice(a, a + rows), slice(b, b + columns)) for a in (0, rows) for b in (0, columns)
-        ]
-        moved = _moved(grey[k], step)
-        if any(_moves_on(grey[near][c], moved[c]) for c in corners):
-            raise InputRefused(
-                f"{names[k]}: its parts have moved by different amounts against {names[near]}, "
-                "which no shift undoes. Use a tripod, or leave it out. [brackets.moved]"
-            )
-        shifts[k] = shifts[near] + step
-    whole = np.ones(grey.shape[1:], np.bool_)
-    result = np.empty_like(stack)
-    for k, shift in enumerate(shifts):
-        result[k] = _moved(stack[k], shift)
-        whole &= _moved(np.ones_like(whole), shift)
-    result[:, ~whole] = 0
-    return result, shifts
-
-
-def _moved(picture: npt.NDArray[T], shift: Int) -> npt.NDArray[T]:
-    """The picture down and right by ``shift``; 0 comes in."""
-    down, right = (int(n) for n in shift)
-    height, width = picture.shape[:2]
-    moved = np.zeros_like(picture)
-    to = slice(max(0, down), height + min(0, down)), slice(max(0, right), width + min(0, right))
-    start = (
-        slice(max(0, -down), height + min(0, -down)),
-        slice(max(0, -right), width + min(0, -right)),
-    )
-    moved[to] = picture[start]
-    return moved
-
-
-def _shift(fixed: Byte, other: Byte, levels: int) -> Int:
-    """By how many pixels, down and right, ``other`` (H, W) is to be moved onto ``fixed``."""
-    best = np.zeros(2, np.int32)
-    levels = min(levels, max(0, int(np.log2(max(min(fixed.shape), 1) / 16))))
-    rank = _common_rank(fixed, other)
-    if rank is None:
-        return best
-    for level in range(levels, -1, -1):
-        one, two = fixed[:: 1 << level, :: 1 << level], other[:: 1 << level, :: 1 << level]
-        if level:
-            one, two = _reduced(fixed, level), _reduced(other, level)
-        bits = _bitmap(one, rank), _bitmap(two, rank)
-        best = 2 * best
-        tries = [best + np.array(d, np.int32) for d in np.ndindex(3, 3)]
-        tries = [t - 1 for t in tries]
-        best = min(tries, key=lambda t: (_differing(*bits, t), int(np.abs(t).sum())))
-    return best
-
-
-def _moves_on(fixed: Byte, other: Byte) -> bool:
-    """Whether these parts of two pictures fit clearly better shifted by more than a pixel."""
-    shift, rank = _shift(fixed, other, 3), _common_rank(fixed, other)
-    if rank is None or np.abs(shift).max() <= _NEAR:
-        return False
-    bits = _bitmap(fixed, rank), _bitmap(other, rank)
-    return _differing(*bits, np.zeros(2, np.int32)) > _BETTER + _differing(*bits, shift)
-
-
-def _reduced(picture: Byte, level: int) -> Byte:
-    """Means of squares of 2^level pixels to a side."""
-    side = 1 << level
-    height, width = (n // side * side for n in picture.shape)
-    parts = picture[:height, :width].reshape(height // side, side, width // side, side)
-    return np.asarray(parts.mean(axis=(1, 3)), np.uint8)
-
-
-def _common_rank(one: Byte, other: Byte) -> float | None:
-    """A share of the pixels below a code that is clear of the ends in either picture, nearest to
-    one half; None where there is none."""
-    ranks = np.arange(1, 50) / 50
-    low, high = _CLEAR
-    codes = np.array([np.quantile(picture, ranks) for picture in (one, other)])
-    clear = ranks[((codes >= low) & (codes <= high)).all(axis=0)]
-    return float(clear[np.abs(clear - 0.5).argmin()]) if len(clear) else None
-
-
-def _bitmap(picture: Byte, rank: float) -> tuple[Bool, Bool]:
-    """(H, W): above the code of that rank, and clearly above or below it."""
-    threshold = np.quantile(picture, rank)
-    return picture > threshold, np.abs(picture - threshold) > _UNDECIDED
-
-
-def _differing(one: tuple[Bool, Bool], other: tuple[Bool, Bool], shift: Int) -> float:
-    """Share of the decided pixels whose bits differ, ``other`` moved."""
-    above, decided = _moved(other[0], shift), _moved(other[1], shift)
-    both = one[1] & decided
-    return float((both & (one[0] != above)).sum() / max(int(both.sum()), 1))

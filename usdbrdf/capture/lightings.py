@@ -151,6 +151,9 @@ def _joined(scans: Mapping[str, Scan]) -> Frames:
             f.world_from_camera if f.captured_pose is None else f.captured_pose for f in several
         ]
         columns["captured_pose"] = np.concatenate(poses)
+    # Their images' encodings are one, and where none was resampled nothing is said of photographs.
+    said = [frames.photograph_encoding for frames in several if frames.photograph_encoding]
+    columns["photograph_encoding"] = said[0] if said else ""
     # One lens took them all, and not all tell clearly what it does.
     told = [frames.vignetting for frames in several if any(frames.vignetting)]
     columns["vignetting"] = tuple(np.mean(told or [(0.0, 0.0)], axis=0).tolist())

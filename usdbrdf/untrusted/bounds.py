@@ -37,6 +37,7 @@ LIMITS = {
     "stage": Limits(4 * _GIB, 600.0, 64 * _GIB),  # all of its layers together
     "model": Limits(8 * _GIB, 600.0, 64 * _GIB),
     "picture": Limits(2 * _GIB, 120.0, 24 * _GIB),
+    "video": Limits(256 * _GIB, 3600.0, 24 * _GIB),  # of which some frames are written down
 }
 PLUGIN_SECONDS = 60.0  # for the import of another package's module, which may be a large one
 _CURES = {
@@ -44,6 +45,7 @@ _CURES = {
     "stage": "Check its name and permission.",
     "model": "Copy the whole model, cameras and images.",
     "picture": "Check its name and permission.",
+    "video": "Check its name and permission.",
 }
 T = TypeVar("T")
 

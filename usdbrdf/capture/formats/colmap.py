@@ -23,14 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.formats.named_pictures import mask_beside, scan_of
 from usdbrdf.capture.formats.transforms import path_in_capture
-from usdbrdf.capture.parts import (
-    as_photographs,
-    geometry_from_file,
-    radiance_encoding,
-    scan_from_parts,
-)
+from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import image_size
@@ -67,29 +63,13 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     findings = Findings()
     chosen = _chosen(path, options, findings)
     records = _records(path, chosen, options, findings)
-    photographs = refuse_photographs(
-        [record.image_path for record in records], assume_srgb=options.assume_srgb
-    )
-    encoding = radiance_encoding(options, photographs=photographs)
-    if photographs:
-        records = as_photographs(records, findings, path)
-    else:
-        findings.warn(
-            f"{path.name}: a COLMAP model says nothing of exposures, so clipped pixels pass for "
-            "radiance. [capture.saturation]"
-        )
-    if masks := sum(record.mask_path is not None for record in records):
-        findings.warn(
-            f"{path.name}: {masks} masks in masks/ are used; what is black there is not looked at. "
-            "[capture.mask]"
-        )
     if options.meters_per_unit is None or options.up_axis is None:
         findings.warn(
             f"{path.name}: a COLMAP model has no scale and no direction up; taken are metres and "
             "Z. State them with --meters-per-unit and --up-axis. [colmap.scale]"
         )
     objects = path_in_capture(path, "objects.json", options)
-    return scan_from_parts(
+    return scan_of(
         records,
         lambda: geometry_from_file(
             options.mesh or _mesh(path, options),
@@ -100,11 +80,9 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         ),
         options,
         findings,
-        name=path.name,
         adapter=NAME,
         source=path,
-        encoding=encoding,
-        radiometric=not photographs,
+        folder=path,
     )
 
 
@@ -267,16 +245,10 @@ def _records(
                 intrinsics=intrinsics,
                 resolution=camera.resolution,
                 lens=lens,
-                mask_path=_mask(path, name, options),
+                mask_path=mask_beside(path, name.replace("\\", "/"), options),
             )
         )
     return records
-
-
-def _mask(path: Path, name: str, options: CaptureOptions) -> Path | None:
-    """COLMAP's own masks: masks/NAME.png, black where no feature is to be taken."""
-    mask = path_in_capture(path, f"masks/{name}.png", options)
-    return mask if mask.is_file() else None
 
 
 def world_from_camera(camera_from_world: Double) -> Double:

@@ -69,7 +69,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 world_from_camera=rigid_pose(np.stack([right, -down, back], axis=1), centre),
                 intrinsics=(focal, focal, width / 2, height / 2),
                 resolution=(int(width), int(height)),
-                mask_path=mask_beside(folder, image),
+                mask_path=mask_beside(folder, image.name, options),
             )
         )
     mesh = mesh_beside(

@@ -66,7 +66,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = source.parent, Findings()
     pictures = pictures_of(folder, options)
     refuse_without_pictures(pictures, source)
-    records = frame_records(source, pictures, findings)
+    records = frame_records(source, pictures, options, findings)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     mesh = mesh_beside(
         folder,
@@ -112,7 +112,9 @@ class _Place:
         return rigid_pose(self.rotation @ chunk_from_camera[:3, :3], centre)
 
 
-def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[FrameRecord]:
+def frame_records(
+    source: Path, pictures: Pictures, options: CaptureOptions, findings: Findings
+) -> list[FrameRecord]:
     """The cameras of a document that have a pose and a picture, by their labels."""
     chunk = read_xml(source).find("chunk")
     if chunk is None or chunk.find("sensors") is None or chunk.find("cameras") is None:
@@ -151,7 +153,7 @@ def frame_records(source: Path, pictures: Pictures, findings: Findings) -> list[
                 intrinsics=sensor.intrinsics,
                 resolution=sensor.resolution,
                 lens=sensor.lens,
-                mask_path=mask_beside(source.parent, image),
+                mask_path=mask_beside(source.parent, image.name, options),
             )
         )
     return sorted(records, key=lambda record: record.image_path)

@@ -126,15 +126,16 @@ def _below(folder: Path, *, deep: bool) -> Pictures:
     return Pictures(folder=folder, paths=tuple(sorted(paths)))
 
 
-def mask_beside(folder: Path, image: Path) -> Path | None:
-    """The mask of a picture in masks/: of its name, with or without its suffix, as programs have
-    it; black is what is not to be looked at."""
-    for name in (image.name, image.stem, f"{image.stem}_mask", f"{image.name}.mask"):
+def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
+    """The mask of a picture in masks/: of its name there (in subfolders too), with or without its
+    suffix, as programs have it; black is what is not to be looked at."""
+    stem = str(PurePosixPath(name).with_suffix(""))
+    for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
         for suffix in (".png", ".jpg"):
-            if (folder / "masks" / f"{name}{suffix}").is_file():
-                return contained(folder, f"masks/{name}{suffix}")
-    same = folder / "masks" / image.name
-    return contained(folder, f"masks/{image.name}") if same.is_file() else None
+            if (folder / "masks" / f"{usual}{suffix}").is_file():
+                return path_in_capture(folder, f"masks/{usual}{suffix}", options)
+    same = folder / "masks" / name
+    return path_in_capture(folder, f"masks/{name}", options) if same.is_file() else None
 
 
 def drop_without_picture(label: str, findings: Findings) -> None:

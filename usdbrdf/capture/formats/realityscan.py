@@ -89,7 +89,9 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         records = list(records_of_table(source, pictures, findings))
     else:
         records = list(records_of_sidecars(_sidecars(path), pictures, findings))
-    records = [replace(r, mask_path=mask_beside(folder, r.image_path)) for r in records]
+    records = [
+        replace(r, mask_path=mask_beside(folder, r.image_path.name, options)) for r in records
+    ]
     records.sort(key=lambda record: record.image_path)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     mesh = mesh_beside(

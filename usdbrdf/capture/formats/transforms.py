@@ -226,6 +226,12 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
             "capture.brackets",
         )
     name = frame.get("file_path")
+    if name is None and "video_frame" in frame:
+        raise capture.refuse(
+            "its frames are those of a video. Make them frames of radiance with `usdbrdf "
+            "develop-video`, and convert what that writes.",
+            "capture.video",
+        )
     if not isinstance(name, str):
         findings.drop("(unnamed)", "it has no file_path", "capture.file")
         return None

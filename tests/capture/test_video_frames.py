@@ -1,0 +1,185 @@
+"""Frames of videos that a made up camera took, which went through its exposures over and over."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.capture.test_brackets import _photograph, _shoot
+from tests.scenes import edited, make_capture
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.video_frames import develop_video
+from usdbrdf.cli import main
+from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.frames import read_frame
+from usdbrdf.options import IngestOptions
+from usdbrdf.untrusted import video_files
+
+av = pytest.importorskip("av", reason="needs usdbrdf[video]")
+pytest.importorskip("cv2", reason="needs usdbrdf[video]")
+
+SIZE = (160, 120)
+CYCLE = [0.64, 0.08, 0.01]
+NUMBERS = [1, 5, 6, 10, 14, 15, 19, 23, 24, 28, 32, 33]
+# What stands for one second of exposure, so that the longest clips and the shortest drowns.
+LIGHT = 16.0
+
+
+def _radiance(number: int) -> np.ndarray:
+    """(H, W, 3) that frame sees: a slow pan over a large picture."""
+    large = _photograph((SIZE[1] + 40, SIZE[0] + 80), decades=2.5, seed=2)
+    right, down = number * 3 // 2, number // 2
+    return large[down : down + SIZE[1], right : right + SIZE[0]]
+
+
+def _write_video(path: Path, exposures: list[float], *, codec: str = "libx264") -> None:
+    """With an encoder call that the product knows nothing of."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(30))
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv444p"
+        stream.options = {"crf": "4"} if codec == "libx264" else {}
+        for number, exposure in enumerate(exposures):
+            codes = _shoot(_radiance(number), np.array([LIGHT * exposure]), seed=number)[0]
+            frame = av.VideoFrame.from_ndarray(codes, format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "walk.mp4"
+    _write_video(path, [CYCLE[n % 3] for n in range(36)])
+    return path
+
+
+@pytest.fixture
+def capture(tmp_path, video) -> Path:
+    made = make_capture(tmp_path / "scan", size=SIZE)
+    (made.folder / "walk.mp4").write_bytes(video.read_bytes())
+    with edited(made.manifest) as document:
+        for number, frame in zip(NUMBERS, document["frames"], strict=True):
+            for key in ("file_path", "exposure_time", "saturation_radiance"):
+                frame.pop(key, None)
+            frame["video_frame"] = number
+        document |= {"video": "walk.mp4", "exposure_cycle": CYCLE}
+    return made.folder
+
+
+def test_frames_become_radiance_in_one_unit(capture, tmp_path, capsys):
+    with pytest.raises(InputRefused, match=r"develop-video.*\[capture\.video\]$"):
+        read_scan(capture, IngestOptions())
+    target = tmp_path / "radiance"
+    assert main(["develop-video", str(capture), "-o", str(target), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["frames"], told["stops"], told["contradicting"]) == (12, 6, {})
+    scan = read_scan(target, IngestOptions())
+    assert scan.frames.radiometric
+    assert [path.name for path in scan.frames.image_paths] == [f"{n:06d}.exr" for n in NUMBERS]
+    np.testing.assert_allclose(scan.frames.exposure_time, [CYCLE[n % 3] for n in NUMBERS])
+    ratios = []
+    for i, number in enumerate(NUMBERS):
+        pixels = read_frame(scan.frames, i)
+        found, true = pixels.radiance[pixels.valid], _radiance(number)[pixels.valid]
+        assert len(found) > 1000
+        ratio = found / true
+        ratio /= np.median(ratio, axis=0)
+        # Of single pixels, of which the shortest exposure has few electrons.
+        assert np.median(np.abs(ratio - 1)) < 0.08, number
+        ratios.append(np.median(found / true, axis=0))
+    # Over six stops of exposure.
+    np.testing.assert_allclose(
+        ratios, np.broadcast_to(np.median(ratios, axis=0), (12, 3)), rtol=0.04
+    )
+
+
+def test_a_table_says_the_exposures_and_a_wrong_one_is_told(capture, tmp_path, capsys):
+    stated = {n: CYCLE[n % 3] for n in range(36)}
+    stated[14] *= 1.6
+    table = "\n".join(["frame,exposure_time", *(f"{n},{t}" for n, t in stated.items())])
+    (capture / "exposures.csv").write_text(table)
+    with edited(capture / "transforms.json") as document:
+        del document["exposure_cycle"]
+        document["exposure_table"] = "exposures.csv"
+    found = develop_video(capture, tmp_path / "radiance")
+    assert list(found["contradicting"]) == ["14"]
+    assert found["contradicting"]["14"] == pytest.approx(-np.log2(1.6), abs=0.2)
+    assert "14 (-0." in capsys.readouterr().err
+
+
+def test_a_cycle_that_begins_elsewhere_is_refused(capture, tmp_path):
+    with edited(capture / "transforms.json") as document:
+        document["exposure_cycle"] = CYCLE[1:] + CYCLE[:1]
+    with pytest.raises(InputRefused, match=r"frame 0\. \[video.contradiction\]$"):
+        develop_video(capture, tmp_path / "radiance")
+    assert not (tmp_path / "radiance").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"video": None}, "video.none"),
+        ({"video": "../walk.mp4"}, "paths.outside"),
+        ({"video": "gone.mp4"}, "video.missing"),
+        ({"exposure_cycle": [0.1]}, "video.exposure"),
+        ({"exposure_cycle": [0.1, 0.1]}, "video.exposure"),
+        ({"exposure_cycle": [0.1, -1]}, "video.exposure"),
+        ({"exposure_cycle": None, "exposure_table": "table.csv"}, "document.missing"),
+        ({"exposure_table": "table.csv"}, "video.exposure"),
+    ],
+)
+def test_documents_that_do_not_say_enough_are_refused(capture, tmp_path, changes, rule):
+    with edited(capture / "transforms.json") as document:
+        document |= changes
+    with pytest.raises(InputRefused, match=rf"\[{rule}\]$"):
+        develop_video(capture, tmp_path / "radiance")
+
+
+@pytest.mark.parametrize("number", [-1, 2.5, "3", None, True, 5, 10**9])
+def test_frames_that_no_video_has_are_refused(capture, tmp_path, number):
+    with edited(capture / "transforms.json") as document:
+        document["frames"][0]["video_frame"] = number
+    with pytest.raises(InputRefused, match=r"\[video.frames\]$"):
+        develop_video(capture, tmp_path / "radiance")
+
+
+def test_a_video_that_ends_before_is_refused(capture, tmp_path):
+    with edited(capture / "transforms.json") as document:
+        document["frames"][0]["video_frame"] = 400
+    with pytest.raises(InputRefused, match=r"no sound frame 400, which.*\[video.frames\]$"):
+        develop_video(capture, tmp_path / "radiance")
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "playlist", "half", "zeros within"])
+def test_broken_and_hostile_files_are_refused(capture, tmp_path, kind, monkeypatch):
+    path = capture / "walk.mp4"
+    whole = path.read_bytes()
+    (tmp_path / "secret.mp4").write_bytes(whole)
+    half = len(whole) // 2
+    path.write_bytes({
+        "empty": b"",
+        "text": b"frames of a video\n" * 100,
+        "playlist": f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{tmp_path}/secret.mp4\n"
+        "#EXT-X-ENDLIST\n".encode(),
+        "half": whole[:half],
+        "zeros within": whole[: half // 2] + bytes(half) + whole[half // 2 + half :],
+    }[kind])  # fmt: skip
+    with pytest.raises(InputRefused, match=r"\[video\.(read|frames|response)\]$"):
+        develop_video(capture, tmp_path / "radiance")
+    assert not (tmp_path / "radiance").exists()
+
+
+def test_frames_are_upright_and_the_asked_ones(tmp_path, video):
+    found = video_files.frames_of_video(video, [7, 3, 7, 90], tmp_path)
+    assert found.numbers == (3, 7)
+    assert found.resolution == SIZE
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["000003.png", "000007.png"]
+
+
+def test_without_pyav_a_sentence_says_how_to_get_it(tmp_path, video, monkeypatch):
+    monkeypatch.setattr(video_files, "find_spec", lambda name: None)
+    with pytest.raises(EnvironmentFailure, match=r"usdbrdf\[video\].*\[environment.av\]"):
+        video_files.frames_of_video(video, [1], tmp_path)
