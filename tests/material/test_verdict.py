@@ -14,6 +14,7 @@ from usdbrdf.material.verdict import (
     NEUTRAL,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
+    UNASKED,
     LobeEstimate,
     lobe_from_costs,
     verdict_on_frame,
@@ -127,7 +128,7 @@ def test_a_lobe_that_explains_less_is_less_certain_of_phi():
 def test_what_no_frame_sees_is_unseen():
     found = verdict_on_views(None, False)
     assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.0, 1.0, "unseen")
-    assert found.phi_error == found.psi_error == pytest.approx(NOTHING_KNOWN)
+    assert (found.phi_error, found.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.
     assert verdict_on_views(None, True).status == "prior"
@@ -149,7 +150,7 @@ def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, 
     assert (kept.phi, kept.psi, kept.status) == (0.1, 0.8, "failed")
     prior = verdict_on_frame((0.1, flat), 0.8, evidence, True, False)
     assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "prior")
-    assert prior.phi_error == prior.psi_error == pytest.approx(NOTHING_KNOWN)
+    assert (prior.phi_error, prior.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
 
 
 @pytest.mark.parametrize("keep", [True, False])

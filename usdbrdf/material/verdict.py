@@ -149,8 +149,9 @@ def _deviation(density: Double, values: Double, about: float) -> float:
     return float(np.sqrt((density * (values - about) ** 2).sum()))
 
 
-# The medians of what could not be asked: no lobe was as likely as one.
-NEUTRAL = (0.5, 0.0)
+# The medians of what could not be asked, no lobe being as likely as one; and the deviation of psi
+# about its median then.
+NEUTRAL, UNASKED = (0.5, 0.0), 1 / math.sqrt(6)
 _OF_WORD = calibration.pairs("prior.classes")
 
 
@@ -208,7 +209,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     Names and classes of objects tell nothing here.
     """
     if lobe is None:
-        errors = float(NOTHING_KNOWN), float(NOTHING_KNOWN)
+        errors = float(NOTHING_KNOWN), UNASKED
         return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
@@ -263,5 +264,5 @@ def verdict_on_frame(
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
         return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
-    unknown = float(NOTHING_KNOWN)
-    return Verdict(*NEUTRAL, unknown, unknown, "prior" if seen else "unseen", psi_upper=1.0)
+    errors = float(NOTHING_KNOWN), UNASKED
+    return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
