@@ -169,6 +169,7 @@ ENGINEERING: dict[str, str] = {
     "RINGS": "mathematics: nodes of a quadrature",
     "SAMPLE": "codes of what a texel shows in a frame",
     "SIDE": "texels of a square",
+    "UNASKED": "mathematics: deviation of what is nothing as likely as anything",
     "WIDTH": "pixels of a picture",
     "_ALONE": "mathematics: two of nine",
     "_AROUND": "codes, or texels, that are taken together",

@@ -14,6 +14,7 @@ from usdbrdf.material.verdict import (
     NEUTRAL,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
+    UNASKED,
     LobeEstimate,
     lobe_from_costs,
     verdict_on_frame,
@@ -72,12 +73,27 @@ def test_no_highlight_where_one_would_show_bounds_psi():
     assert found.evidence == 0
     assert found.psi_median < 0.15
     assert found.psi_median < found.psi_upper < 0.85
-    # Where nothing was asked nothing is known.
+    # Where nothing was asked nothing is known, and no lobe is as likely as one.
     terms[:, 2] = 0
     found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
-    assert found.psi_median == pytest.approx(0.5, abs=0.01)
+    assert found.psi_median < 0.03
     assert found.psi_upper == pytest.approx(0.95, abs=0.01)
     assert found.phi_median == pytest.approx(0.5, abs=0.03)
+
+
+def test_the_median_of_psi_leaves_room_for_there_being_no_lobe():
+    # A lobe of psi = 0.8 is some times as likely as none; that of the rest falls off by distance.
+    phis = np.linspace(0, 1, 21)
+    gain = 2 * np.log(20.0)
+    terms = np.tile([gain, gain / 0.8, gain / 0.8**2], (21, 1))
+    found = lobe_from_costs(phis, terms, without=gain, noisy=0.0, freedom=1, blur=0.0)
+    psi = np.linspace(0, 1, 201)
+    density = np.exp(-0.5 * gain * (psi / 0.8 - 1) ** 2)
+    none = np.exp(-0.5 * gain) / (np.exp(-0.5 * gain) + density.mean())
+    below = none + (1 - none) * np.cumsum(density) / density.sum()
+    assert 0.05 < none < 0.3
+    assert found.psi_median == pytest.approx(psi[np.searchsorted(below, 0.5)], abs=0.01)
+    assert found.psi_median < psi[np.searchsorted(np.cumsum(density) / density.sum(), 0.5)] - 0.01
 
 
 def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
@@ -112,7 +128,7 @@ def test_a_lobe_that_explains_less_is_less_certain_of_phi():
 def test_what_no_frame_sees_is_unseen():
     found = verdict_on_views(None, False)
     assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.0, 1.0, "unseen")
-    assert found.phi_error == found.psi_error == pytest.approx(NOTHING_KNOWN)
+    assert (found.phi_error, found.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.
     assert verdict_on_views(None, True).status == "prior"
@@ -134,7 +150,7 @@ def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, 
     assert (kept.phi, kept.psi, kept.status) == (0.1, 0.8, "failed")
     prior = verdict_on_frame((0.1, flat), 0.8, evidence, True, False)
     assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "prior")
-    assert prior.phi_error == prior.psi_error == pytest.approx(NOTHING_KNOWN)
+    assert (prior.phi_error, prior.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
 
 
 @pytest.mark.parametrize("keep", [True, False])

@@ -24,7 +24,6 @@ from usdbrdf.material.verdict import (
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
     MODEL_DISCREPANCY,
-    NO_LOBE,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
     UNEXPLAINED,
@@ -86,8 +85,9 @@ def likely_lobes(
     if np.isfinite(psi_upper):
         log = log + np.where(known.psi > psi_upper, np.log(_BEYOND_BOUND), 0.0)
     density = np.exp(log - log.max())
-    # All that is known then is that the chance of a lobe lies between none and this.
-    chance = (1 - NO_LOBE) / 2 if psi == 0 and psi_upper < 1 else 1.0
+    # All that is known then is that the chance of a lobe is less than one half; what could not be
+    # asked has that chance itself.
+    chance = 1.0 if psi != 0 else 0.25 if psi_upper < 1 else 0.5
     return np.asarray(chance * density / density.sum(), np.float64)
 
 

@@ -332,7 +332,7 @@ class FittedObject(MeasuredObject):
 
     phi: Annotated[float, Fact(FIT, "phi", "float", 0.5, """Roughness parameter: alpha of the GGX
         distribution is max(0.001, phi); 0 to 1, without unit.""", low=0, high=1)]
-    psi: Annotated[float, Fact(FIT, "psi", "float", 0.5, """Specular parameter: the reflectance at
+    psi: Annotated[float, Fact(FIT, "psi", "float", 0.0, """Specular parameter: the reflectance at
         normal incidence is F0 = 0.08 psi; 0 to 1, without unit. Of a conductor 1, which says that
         F0 is above all dielectrics': it is usdBrdf:fit:f0.""", low=0, high=1)]
     phi_error: Annotated[float, Fact(FIT, "phiError", "float", 0.0, """Standard deviation of phi,

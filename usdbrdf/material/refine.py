@@ -262,7 +262,8 @@ def refined_light(
     for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
-    and L_d is what it reflects of S; what shines keeps the radiance with which it shines.
+    and L_d is what it reflects of S, but for what lies beside seen texels, where that is filled in
+    as well; what shines keeps the radiance with which it shines.
     """
     need = _need([one.lit for one in lightings])
     texels, found = lightings[0].lit.texels, []

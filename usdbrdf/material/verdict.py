@@ -19,7 +19,6 @@ _PSI_GRID = np.linspace(0, 1, 201)
 POSTERIOR = ("phi_median", "psi_median", "psi_upper")
 MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
-NO_LOBE = calibration.number("fit.no_lobe")
 # Standard deviation of a number in [0, 1] of which nothing is known.
 NOTHING_KNOWN = 1 / np.sqrt(12)
 
@@ -31,9 +30,8 @@ class LobeEstimate(NamedTuple):
     light; of_rays, what the rays' noise alone does to phi and psi, beside the stated errors until
     ``mean_of_repeats`` adds it to them. phi_median, psi_median, psi_upper: medians of either, and
     what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
-    highlight shows, the frames still say that psi is small or phi large. Where no lobe at all is
-    clearly likelier than one, both being alike before, psi_median is 0: the simpler model explains
-    as much."""
+    highlight shows, the frames still say that psi is small or phi large. For psi_median no lobe at
+    all was as likely before as one: it is 0 where the simpler model explains as much."""
 
     phi: float
     psi: float
@@ -79,8 +77,9 @@ def lobe_from_costs(
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
-    psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (0.5, 0.95))
-    psi_median = 0.0 if none > NO_LOBE else psi_median
+    middle = (0.5 - none) / (1 - none) if none < 0.5 else 0.0
+    psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (middle, 0.95))
+    psi_median = psi_median if middle > 0 else 0.0
     (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
@@ -150,8 +149,9 @@ def _deviation(density: Double, values: Double, about: float) -> float:
     return float(np.sqrt((density * (values - about) ** 2).sum()))
 
 
-# What is shown of what could not be asked: no lobe, which was as likely as one.
-NEUTRAL = (0.5, 0.0)
+# The medians of what could not be asked, no lobe being as likely as one; and the deviation of psi
+# about its median then.
+NEUTRAL, UNASKED = (0.5, 0.0), 1 / math.sqrt(6)
 _OF_WORD = calibration.pairs("prior.classes")
 
 
@@ -209,7 +209,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     Names and classes of objects tell nothing here.
     """
     if lobe is None:
-        errors = float(NOTHING_KNOWN), float(NOTHING_KNOWN)
+        errors = float(NOTHING_KNOWN), UNASKED
         return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
@@ -264,5 +264,5 @@ def verdict_on_frame(
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
         return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
-    unknown = float(NOTHING_KNOWN)
-    return Verdict(*NEUTRAL, unknown, unknown, "prior" if seen else "unseen", psi_upper=1.0)
+    errors = float(NOTHING_KNOWN), UNASKED
+    return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)

@@ -178,9 +178,11 @@ def light_from_outside(
         if (clear := _clearly_lit(surface, many, sun, seed)) is not None:
             share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
             clear = _under_what_was_seen(surface, lit, clear, seen, z_up, seed)
-            with_sun = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
-            found = solved(*with_sun)
-            error = jackknife(*with_sun, found)
+            clearly = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
+            told = solved(*clearly)
+            own_error = jackknife(*clearly, told)
+            if own_error[-1].max() < _MOST_CLEAR_ERROR:
+                with_sun, found, error = clearly, told, own_error
         found = levelled(*with_sun, found)
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
@@ -317,6 +319,7 @@ _ALIKE_OVER_HORIZON = calibration.number("outside.alike_over_horizon")
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
 _LEAST_SUN = calibration.number("outside.least_sun")
 _MOST_SUN_ERROR = calibration.number("outside.most_sun_error")
+_MOST_CLEAR_ERROR = calibration.number("outside.most_clear_error")
 
 
 def _sky(
