@@ -274,9 +274,10 @@ def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
     reflects = atlas.map("base_color") * atlas.map("refined_irradiance") / np.pi
     rim = refine._beside_seen(atlas.texels, atlas)
     assert rim.sum() > 5
-    assert (atlas.map("diffuse")[rim] <= 1.01 * reflects[rim] + 1e-4).all()
-    # Some would be brighter than what was seen beside them, and are not.
-    assert (atlas.map("diffuse")[rim] < 0.9 * reflects[rim]).any()
+    lit, kept = atlas.map("diffuse")[rim].mean(axis=1), reflects[rim].mean(axis=1)
+    filled = np.abs(lit / kept - 1) > 0.05
+    assert filled.any()
+    assert (lit[filled] < 0.55 * kept[filled]).all()
     unseen &= ~rim
     assert unseen.sum() > 50
     np.testing.assert_allclose(atlas.map("diffuse")[unseen], reflects[unseen], rtol=4e-3, atol=1e-4)

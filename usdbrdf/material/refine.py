@@ -188,8 +188,8 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
-# Texels around what was seen that are no brighter.
-_RIM = 3
+# Texels around what was seen that are no more than so many times as bright as their fill.
+_RIM, _LEAK = 3, 2.0
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
@@ -262,8 +262,8 @@ def refined_light(
     for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
-    and L_d is what it reflects of S, but no brighter than its fill where it lies beside seen
-    texels; what shines keeps the radiance with which it shines.
+    and L_d is what it reflects of S, but filled in as well where it lies beside seen texels and
+    would be much brighter; what shines keeps the radiance with which it shines.
     """
     need = _need([one.lit for one in lightings])
     texels, found = lightings[0].lit.texels, []
@@ -294,7 +294,8 @@ def refined_light(
             hidden = base_color * one.irradiance / np.pi
             # Beyond the foot of a wall it may lie in the sun, and is read together with what was
             # seen before it.
-            hidden = np.where(beside[:, None], np.minimum(hidden, one.radiance), hidden)
+            beside &= hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1)
+            hidden = np.where(beside[:, None], one.radiance, hidden)
             light.append(np.where((one.known | one.emissive)[:, None], one.radiance, hidden))
         return base_color, light
 
