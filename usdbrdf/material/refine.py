@@ -294,8 +294,8 @@ def refined_light(
             hidden = base_color * one.irradiance / np.pi
             # Beyond the foot of a wall it may lie in the sun, and is read together with what was
             # seen before it.
-            beside &= hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1)
-            hidden = np.where(beside[:, None], one.radiance, hidden)
+            leaks = beside & (hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1))
+            hidden = np.where(leaks[:, None], one.radiance, hidden)
             light.append(np.where((one.known | one.emissive)[:, None], one.radiance, hidden))
         return base_color, light
 
