@@ -218,6 +218,7 @@ ENGINEERING: dict[str, str] = {
     "_LAGS": "pixels at which correlations are taken",
     "_LAMP": "numerics: deviations",
     "_LARGEST": "limit of what is refused",
+    "_LEAK": "geometry: texels that pixels may mix",
     "_LEAST": "numerics",
     "_LEAST_OF_SEGMENT": "time: how many are asked",
     "_LEVELS": "steps of a search",

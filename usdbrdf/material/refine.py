@@ -188,8 +188,8 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
-# Texels around what was seen that are like it.
-_RIM = 3
+# Texels around what was seen that are no more than so many times as bright as their fill.
+_RIM, _LEAK = 3, 2.0
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
@@ -262,8 +262,8 @@ def refined_light(
     for.
 
     Where no frame measured a texel the base colour is filled in from its object's measured ones,
-    and L_d is what it reflects of S, but for what lies beside seen texels, where that is filled in
-    as well; what shines keeps the radiance with which it shines.
+    and L_d is what it reflects of S, but filled in as well where it lies beside seen texels and
+    would be much brighter; what shines keeps the radiance with which it shines.
     """
     need = _need([one.lit for one in lightings])
     texels, found = lightings[0].lit.texels, []
@@ -274,7 +274,7 @@ def refined_light(
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
     owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
-    out_of_sight = [_out_of_sight(texels, one.before) for one in lightings]
+    beside_seen = [_beside_seen(texels, one.before) for one in lightings]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
         """Base colour, and of each lighting L_d with what it reflects where nobody looked."""
@@ -289,10 +289,15 @@ def refined_light(
             for one, (diffuse, error), incoming in zip(lightings, found, irradiance, strict=True)
         ]
         base_color = base_color_of(texels, shown)
-        return base_color, [
-            np.where(unseen[:, None], base_color * one.irradiance / np.pi, one.radiance)
-            for one, unseen in zip(shown, out_of_sight, strict=True)
-        ]
+        light = []
+        for one, beside in zip(shown, beside_seen, strict=True):
+            hidden = base_color * one.irradiance / np.pi
+            # Beyond the foot of a wall it may lie in the sun, and is read together with what was
+            # seen before it.
+            leaks = beside & (hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1))
+            hidden = np.where(leaks[:, None], one.radiance, hidden)
+            light.append(np.where((one.known | one.emissive)[:, None], one.radiance, hidden))
+        return base_color, light
 
     _, first = reflected([one.before.irradiance for one in lightings])
     irradiance, seen = [], np.ones((len(texels), 1), np.float32)
@@ -316,14 +321,14 @@ def refined_light(
     ]
 
 
-def _out_of_sight(texels: Texels, before: LightBefore) -> Bool:
-    """Texels (T,) that no frame shows and that nothing seen is read together with: beyond the foot
-    of a wall they may lie in the sun, and the last texels before it few frames show."""
+def _beside_seen(texels: Texels, before: LightBefore) -> Bool:
+    """Texels (T,) that no frame shows and that are read together with seen ones, or lie before
+    those: the last ones before a wall few frames show."""
     shown, found = before.coverage.observed | before.emissive, np.zeros(len(texels), np.bool_)
     for i in range(len(texels.resolution)):
         near = binary_dilation(texels.image(i, shown), np.ones((3, 3)), iterations=_RIM)
-        found[texels.of_object(i)] = ~texels.from_image(i, near)
-    return found
+        found[texels.of_object(i)] = texels.from_image(i, near)
+    return found & ~shown
 
 
 def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tuple[Float, Float]:
