@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.capture.test_brackets import _photograph, _shoot
+from tests.json_schemas import checked
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.video_frames import develop_video
@@ -74,7 +74,7 @@ def test_frames_become_radiance_in_one_unit(capture, tmp_path, capsys):
         read_scan(capture, IngestOptions())
     target = tmp_path / "radiance"
     assert main(["develop-video", str(capture), "-o", str(target), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = checked(capsys.readouterr().out, "develop-video")
     assert (told["frames"], told["stops"], told["contradicting"]) == (12, 6, {})
     scan = read_scan(target, IngestOptions())
     assert scan.frames.radiometric

@@ -18,6 +18,7 @@ from usdbrdf.material.verdict import (
     LobeEstimate,
     lobe_from_costs,
     verdict_on_frame,
+    verdict_on_metal,
     verdict_on_views,
 )
 
@@ -158,3 +159,10 @@ def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, 
 def test_without_a_fit_there_is_nothing_to_keep(keep: bool, seen: bool, status: str):
     found = verdict_on_frame((math.nan, math.nan), math.nan, math.nan, seen, keep)
     assert (found.phi, found.psi, found.status) == (*NEUTRAL, status)
+
+
+def test_one_frame_is_sure_of_nothing_of_a_metal():
+    f0 = (0.9, 0.6, 0.3)
+    many, one = (verdict_on_metal(0.2, f0, 1e-3, error) for error in (1e-3, math.nan))
+    assert (many.status, many.phi_confidence, many.psi_confidence) == ("measured", "high", "high")
+    assert (one.status, one.phi_confidence, one.psi_confidence) == ("prior", "low", "low")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,7 @@ from usdbrdf.asset.review import (
     write_review,
 )
 from usdbrdf.errors import InputRefused
+from usdbrdf.page.objects import why
 
 CHAIR, WALL = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/wall/wall"
 
@@ -29,6 +31,22 @@ def fit(**numbers):
         prim_path=CHAIR, identifier="chair", cost=0.0, evidence=0.5, target_frame=0,
         num_pixels=9, method="views", **usual | numbers,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({}, r"by directive\.$"),
+        ({"status": "prior"}, r"by directive\. Dielectrics explain the photographs no worse\.$"),
+        ({"status": "prior", "psi_confidence": "low"}, r"\. Its numbers are not known well\.$"),
+        ({"status": "prior", "f0_error": math.nan}, r"One frame cannot tell whether it is one\.$"),
+        ({"status": "prior", "kind": "dielectric"}, r"photographs do not show enough\.$"),
+    ],
+)
+def test_of_a_metal_by_directive_the_page_says_no_more_than_is_known(numbers, told):
+    sure = {"phi_confidence": "high", "psi_confidence": "high", "f0_error": 0.01}
+    found = fit(**{"directive": "metal", "kind": "conductor", **sure, **numbers})
+    assert re.search(told, why(found, found.status, None))
 
 
 def test_what_is_said_comes_back_and_is_metadata_alone(built):

@@ -11,11 +11,12 @@ import pytest
 
 import usdbrdf
 from tests.json_schemas import checked
+from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.errors import UsageError
-from usdbrdf.evaluation.evaluate_views import ScoredView
+from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
 from usdbrdf.files.images import image_size, read_radiance
-from usdbrdf.paper.figures import TellingViews
+from usdbrdf.paper.figures import MOST_ACROSS, TellingViews, _scene_of, views_sheet
 from usdbrdf.paper.tables import changes
 
 SMALL = ["--frames", "3", "--samples-per-pixel", "1", "--rays", "8", "--samples", "8"]
@@ -102,6 +103,18 @@ def test_the_same_again_is_the_same(made, room, brighter, tmp_path, capsys):
             assert (place / name).read_bytes() == (output / name).read_bytes(), name
 
 
+def test_an_artists_edits_are_in_no_figure(room):
+    asset = Asset.made(room.asset)
+    before = asset.edits_layer.read_text("utf-8")
+    root = f'over "{asset.name}" (active = false) {{}}'
+    shown = len(_scene_of(asset).surfaces)
+    try:
+        asset.edits_layer.write_text(f"#usda 1.0\n{root}\n", "utf-8")
+        assert len(_scene_of(asset).surfaces) == shown > 0
+    finally:
+        asset.edits_layer.write_text(before, "utf-8")
+
+
 def test_an_output_inside_of_an_asset_is_refused(room, brighter):
     with pytest.raises(UsageError):
         usdbrdf.write_paper(room.asset, brighter.asset, brighter.asset / "paper")
@@ -133,3 +146,40 @@ def test_views_that_tell_most_are_kept():
             ScoredView(row=row, reference=empty, shown={}, counted=empty[..., 0] > 0, errors={})
         )
     assert [view.row["number"] for view in kept.chosen()] == [1, 3, 0, 4]
+
+
+def view_of_size(width, height, number=0):
+    """A view that counts in its left half and is off by 0.25 there."""
+    counted = np.broadcast_to(np.arange(width) < width // 2, (height, width))
+    reference = np.full((height, width, 3), 0.5, np.float32)
+    shown = dict.fromkeys(MODELS, np.where(counted[..., None], np.float32(0.75), reference))
+    return ScoredView(
+        row={"number": number, "flip_baseline": 0.5, "flip_full": 0.5},
+        reference=reference,
+        shown=shown,
+        counted=counted,
+        errors=dict.fromkeys(MODELS, np.full((height, width), 0.5, np.float32)),
+    )
+
+
+def test_views_are_kept_no_larger_than_they_are_shown():
+    kept = TellingViews()
+    kept.see(view_of_size(1920, 1280))
+    (view,) = kept.chosen()
+    assert view.counted.shape == (320, MOST_ACROSS)
+    assert view.counted.mean() == 0.5
+    for shown, flip in zip(view.shown.values(), view.errors.values(), strict=True):
+        assert shown.shape == view.reference.shape == (320, MOST_ACROSS, 3)
+        np.testing.assert_allclose(shown[view.counted], 0.75, atol=1e-6)
+        np.testing.assert_allclose(flip, 0.5, atol=1e-6)
+    small = view_of_size(300, 200)
+    kept.see(small)
+    assert kept._kept["last"][1] is small
+
+
+def test_pictures_of_another_shape_are_not_stretched():
+    sheet = views_sheet([view_of_size(300, 200), view_of_size(200, 300, 1)])
+    # The second row's photograph, grey, is 133 pixels wide in a cell of 300, white beside it.
+    row = sheet[204 + 100, :300]
+    assert (row == 255).all(axis=1).sum() == 300 - 133
+    assert (row[84:216] == 128).all()

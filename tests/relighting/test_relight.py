@@ -247,6 +247,39 @@ def test_refusals_are_one_sentence(
     assert not target.exists()
 
 
+@pytest.mark.parametrize(
+    "option", [["--exposure", "2"], ["--format", "png"], ["--denoise", "none"]]
+)
+def test_a_scene_takes_no_options_of_pictures(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: list[str]
+) -> None:
+    target = tmp_path / "scene.xml"
+    start = [str(room), "-o", str(target), "--camera", "/room/eye", "--width", "8"]
+    status, said = _refused([*start, *option], capsys)
+    assert status == 2
+    assert f"{option[0]}: is of pictures" in said
+    assert not target.exists()
+
+
+def test_two_views_of_one_name_are_refused(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # As images have it, and as the faces of a lens do.
+    views = _views(tmp_path, "a", "a.front")
+    document = json.loads(views.read_text())
+    round_about = {"w": 64, "h": 32, "camera_model": "EQUIRECTANGULAR"}
+    for changed in ({"file_path": "b/a.front.png"}, round_about):
+        document["frames"][0] |= changed
+        views.write_text(json.dumps(document))
+        for output in ("scene.xml", "pictures"):
+            place = tmp_path / output
+            command = [str(room), "-o", str(place), "--views", str(views), "--samples", "1"]
+            status, said = _refused(command, capsys)
+            assert (status, "two views have images of one name" in said) == (3, True)
+            assert not place.exists()
+        document["frames"][0]["file_path"] = "a.png"
+
+
 def test_a_matrix_excludes_what_it_holds_itself(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import errno
+import resource
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from tests.json_schemas import checked
-from tests.relighting.scenes import material
+from tests.relighting.scenes import material, plate, surface
 from usdbrdf.cli import main
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, OwnershipConflict
 from usdbrdf.files.images import read_exr
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import DistantLight, RelitScene, ShapeLight, SkyLight
 from usdbrdf.model.material import Surface, constant_map
 from usdbrdf.options import RelightOptions
+from usdbrdf.relighting import scene_file
 from usdbrdf.relighting.relight import relight
 from usdbrdf.relighting.render import mitsuba_scene, mitsuba_variant, render_view
 from usdbrdf.relighting.scene_file import write_scene_file
 
+ROOT = Path(__file__).resolve().parents[2]
 SPP = 256
 
 
@@ -97,7 +106,7 @@ def test_loaded_by_mitsuba_alone_it_is_the_same_scene(tmp_path):
         mi, file, scene, (eye, camera("wide", (24.0, 12.0))), bounces=6, samples=4
     )
     beside = file.with_name("room.files")
-    assert count == len(list(beside.iterdir())) >= 3 + 4
+    assert count == len(list(beside.glob("*_*.*"))) >= 3 + 4
     assert [p.name for p in file.parent.iterdir() if p.name.startswith(".")] == []
     ours = render_view(
         mi, mitsuba_scene(mi, scene, bounces=6), eye, samples=SPP, seed=(1,), label="ours"
@@ -141,6 +150,7 @@ def test_an_earlier_scene_is_replaced_and_nothing_else(room, tmp_path):
         "mesh_0000.ply",
         "mesh_0001.ply",
         "picture_0000.exr",
+        "usdbrdf.txt",
     ]
     (tmp_path / "mine.files").mkdir()
     (tmp_path / "mine.files/notes.txt").write_text("mine")
@@ -148,3 +158,88 @@ def test_an_earlier_scene_is_replaced_and_nothing_else(room, tmp_path):
         relight(room, tmp_path / "mine.xml", options)
     assert (tmp_path / "mine.files/notes.txt").read_text() == "mine"
     assert not (tmp_path / "mine.xml").exists()
+
+
+def test_a_text_of_another_is_not_replaced(room, tmp_path):
+    (tmp_path / "mine.xml").write_text("<mine/>")
+    with pytest.raises(OwnershipConflict, match=r"mine\.xml: not a scene.*\[relight\.output\]$"):
+        relight(room, tmp_path / "mine.xml", RelightOptions(camera="/room/eye", width=8))
+    assert (tmp_path / "mine.xml").read_text() == "<mine/>"
+    assert not (tmp_path / "mine.files").exists()
+
+
+SMALL = RelitScene(surfaces=(plate(material(0.5)),), lights=())
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_clear_parts_of_a_mesh_are_left_out(tmp_path):
+    clear = replace(material(0.5), clear=True)
+    parts = replace(SMALL, surfaces=(plate(material(0.5)), plate(clear), plate(material(0.2))))
+    file = tmp_path / "room.xml"
+    mi = mitsuba_variant("scalar_rgb")
+    assert write_scene_file(mi, file, parts, (camera(),), bounces=4, samples=1) == 2
+    assert len(mi.load_file(str(file)).shapes()) == 2
+
+
+@pytest.mark.parametrize("name", ["publish_folder", "move"])
+def test_where_it_cannot_be_put_in_place_the_earlier_scene_stays(tmp_path, monkeypatch, name):
+    mi, file = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml"
+    write_scene_file(mi, file, SMALL, (camera(),), bounces=4, samples=1)
+    earlier = contents(tmp_path)
+    other = replace(SMALL, surfaces=(plate(material(0.1)),) * 2)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_file, name, full)
+        with pytest.raises(EnvironmentFailure, match=r"room\.xml: No space.*\[environment\.io\]$"):
+            write_scene_file(mi, file, other, (camera(),), bounces=4, samples=1)
+    assert contents(tmp_path) == earlier
+    assert write_scene_file(mi, file, other, (camera(),), bounces=4, samples=1) == 2
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from tests.relighting import test_scene_file as tests
+def killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+tests.scene_file.move = killed
+mi = tests.mitsuba_variant("scalar_rgb")
+tests.write_scene_file(
+    mi, Path(sys.argv[1]), tests.SMALL, (tests.camera(),), bounces=4, samples=1
+)
+"""
+
+
+def test_after_a_kill_the_same_command_writes_it(tmp_path):
+    mi, file = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml"
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(file)], cwd=ROOT, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert (tmp_path / "room.files/mesh_0000.ply").is_file()
+    assert not file.exists()
+    write_scene_file(mi, file, SMALL, (camera(),), bounces=4, samples=1)
+    # What the killed one had beside it goes too.
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["room.files", "room.xml"]
+
+
+# A mesh that Mitsuba's own writer has in its buffer until it closes the file, and a larger one.
+@pytest.mark.parametrize("triangles", [60, 6000])
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, triangles):
+    mi, file = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml"
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    large = replace(SMALL, surfaces=(surface(corners, [(0, 1, 2)] * triangles, material(0.5)),))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, hard))
+        with pytest.raises(EnvironmentFailure, match=r"\[environment\.io\]$"):
+            write_scene_file(mi, file, large, (camera(),), bounces=4, samples=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert list(tmp_path.iterdir()) == []

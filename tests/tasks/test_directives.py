@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -89,6 +90,8 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
         stage = open_measured(asset)
         floor, walls = (read_fit(stage, f"/room/geo/{name}/{name}") for name in ("floor", "walls"))
         assert (floor.directive, floor.kind, floor.status) == ("metal", "conductor", "prior")
+        assert (floor.phi_confidence, floor.psi_confidence) == ("low", "low")
+        assert math.isnan(floor.f0_error)
         assert all(0 <= value <= 1 for value in floor.f0)
         assert any(floor.f0)
         assert (walls.directive, walls.kind) == ("", "dielectric")

@@ -243,7 +243,8 @@ def verdict_on_metal(
 ) -> Verdict:
     """On a metal; ``likelier``: it explains many views better than any dielectric, without which
     nothing of it is measured, whoever says that it is one. f0_error: NaN of one frame."""
-    phi_sure = "high" if phi_error <= MAX_PHI_ERROR else "low"
+    # One frame fits a roughness to whatever it was told to believe.
+    phi_sure = "high" if phi_error <= MAX_PHI_ERROR and math.isfinite(f0_error) else "low"
     f0_sure = "high" if f0_error <= _MAX_F0_ERROR else "low"
     measured = (phi_sure, f0_sure) == ("high", "high") and likelier
     # psi is at the bound of all dielectrics.

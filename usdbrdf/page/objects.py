@@ -142,11 +142,22 @@ def _by_directive(fit: FittedObject, shading: ShadedObject | None) -> str:
     told = {
         "ignore": "It was left out by directive: nothing was fitted.",
         "glass": "It is clear glass by directive: nothing was fitted.",
-        "metal": "It is fitted as a metal by directive"
-        + ("." if fit.is_metal else ", of which the photographs do not show enough.")
-        + (" Dielectrics explain the photographs no worse." if fit.status == "prior" else ""),
+        "metal": f"It is fitted as a metal by directive{_of_metal(fit)}",
     }
     return told.get(fit.directive, "")
+
+
+def _of_metal(fit: FittedObject) -> str:
+    """How sure that is, as the end of a sentence, or of two."""
+    if not fit.is_metal:
+        return ", of which the photographs do not show enough."
+    if fit.status != "prior":
+        return "."
+    if math.isnan(fit.f0_error):
+        return ". One frame cannot tell whether it is one."
+    if "low" in (fit.phi_confidence, fit.psi_confidence):
+        return ". Its numbers are not known well."
+    return ". Dielectrics explain the photographs no worse."
 
 
 def _pictures(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import camera_hits
-from usdbrdf.asset.readers.compose import open_edited
+from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_stage, time_code
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.evaluation.compare_assets import Relit, error_picture, on_surface
@@ -98,17 +99,24 @@ def _shown(one: Relit, hits: Hits, size: tuple[int, int], names: Sequence[str]) 
 
 
 def _sheet(rows: Any) -> Byte:
-    """Rows of pictures below each other, each as wide as the first."""
+    """Rows of pictures below each other, all in cells of the first one's size."""
     listed = [list(row) for row in rows]
     height, width = listed[0][0].shape[:2]
-    return sheet([[_of_size(picture, width, height) for picture in row] for row in listed])
+    return sheet([[_in_cell(picture, width, height) for picture in row] for row in listed])
 
 
-def _of_size(picture: Byte, width: int, height: int) -> Byte:
-    if picture.shape[:2] == (height, width):
+def _in_cell(picture: Byte, width: int, height: int) -> Byte:
+    """As large as fits into a cell, with white about it."""
+    tall, wide = picture.shape[:2]
+    if (tall, wide) == (height, width):
         return picture
-    scaled = resized(picture.astype(np.float32), width, height)
-    return np.asarray(np.clip(scaled + 0.5, 0, 255), np.uint8)
+    scale = min(width / wide, height / tall)
+    wide, tall = max(1, round(wide * scale)), max(1, round(tall * scale))
+    scaled = resized(picture.astype(np.float32), wide, tall)
+    cell = np.full((height, width, 3), 255, np.uint8)
+    top, left = (height - tall) // 2, (width - wide) // 2
+    cell[top : top + tall, left : left + wide] = np.clip(scaled + 0.5, 0, 255)
+    return cell
 
 
 class TellingViews:
@@ -121,18 +129,37 @@ class TellingViews:
     def see(self, view: ScoredView) -> None:
         pair = [view.row[f"flip_{model}"] for model in MODELS]
         gain = pair[0] - pair[1] if None not in pair else 0.0
-        held = self._kept
-        held.setdefault("first", (gain, view))
+        held, kept = self._kept, (gain, _reduced(view))
+        held.setdefault("first", kept)
         if "best" not in held or gain > held["best"][0]:
-            held["best"] = gain, view
+            held["best"] = kept
         if "worst" not in held or gain < held["worst"][0]:
-            held["worst"] = gain, view
-        held["last"] = gain, view
+            held["worst"] = kept
+        held["last"] = kept
 
     def chosen(self) -> list[ScoredView]:
         views = [self._kept[name][1] for name in ("best", "worst", "first", "last")]
         numbers = [view.row["number"] for view in views]
         return [view for i, view in enumerate(views) if numbers.index(numbers[i]) == i]
+
+
+def _reduced(view: ScoredView) -> ScoredView:
+    """The same as large as sheets show it; a pixel counts if half of what it covers does."""
+    height, width = view.counted.shape
+    if width <= MOST_ACROSS:
+        return view
+    size = MOST_ACROSS, max(1, round(height * MOST_ACROSS / width))
+
+    def smaller(values: Float) -> Float:
+        return resized(values, *size)
+
+    return replace(
+        view,
+        reference=smaller(view.reference),
+        shown={model: smaller(picture) for model, picture in view.shown.items()},
+        counted=smaller(view.counted[..., None].astype(np.float32))[..., 0] > 0.5,
+        errors={model: smaller(flip[..., None])[..., 0] for model, flip in view.errors.items()},
+    )
 
 
 def views_sheet(views: Sequence[ScoredView]) -> Byte:
@@ -192,5 +219,6 @@ def write_relit(
 
 
 def _scene_of(asset: Asset) -> RenderScene:
-    stage = open_edited(asset)
+    """As it was measured, as all other figures show it: without the artist's edits."""
+    stage = open_measured(asset)
     return render_scene_from_stage(stage, time_code(stage, None), warn)

@@ -75,9 +75,9 @@ def write_paper(
         ]
         found["relighting"] = None
         if chosen.relight:
-            camera = _overview_camera(pair[0])
+            camera, places = _overview_camera(pair[0]), (sides[0].place, sides[1].place)
             found["relighting"] = figures.write_relit(
-                work / "figures/fig10_relighting.png", (place_a, place_b), camera, chosen
+                work / "figures/fig10_relighting.png", places, camera, chosen
             )
         write_text_atomic(work / "paper.md", paper_text(found, report.files_of(work)))
         found[report.FILES] = [*report.files_of(work), DOCUMENT]

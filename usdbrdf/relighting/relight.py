@@ -152,6 +152,8 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
             f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}, scenes for "
             f"Mitsuba as {SUFFIX}. Choose one of these extensions. [relight.format]"
         )
+    if suffix == SUFFIX:
+        _refuse_options_of_pictures(options)
     _refuse_taken(output, folder=many and suffix != SUFFIX)
     asset.refuse_output(output, "relight.output")
     lights = options.lights
@@ -163,6 +165,17 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
     for file in (lights, *(insert.model for insert in options.inserts)):
         if file is not None and not file.is_file():
             raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
+
+
+def _refuse_options_of_pictures(options: RelightOptions) -> None:
+    """UsageError for what a scene for Mitsuba cannot follow."""
+    usual = RelightOptions()
+    for name in ("exposure", "format", "denoise"):
+        if getattr(options, name) != getattr(usual, name):
+            raise UsageError(
+                f"--{name}: is of pictures, and {SUFFIX} is a scene. Leave it out, or name a "
+                "picture with -o. [relight.scene]"
+            )
 
 
 def _refuse_taken(path: Path, *, folder: bool) -> None:

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,9 +16,11 @@ import numpy as np
 
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import (
-    TEMPORARY_PREFIX,
     environment_failures,
+    flush_folder,
+    move,
     publish_folder,
+    temporary_folder,
     write_text_atomic,
 )
 from usdbrdf.files.images import write_exr
@@ -39,50 +40,68 @@ _TAGS = {
     "roughconductor": "bsdf", "sphere": "shape", "twosided": "bsdf", "uniform": "texture",
 }  # fmt: skip
 _OURS = "A scene of usdbrdf for Mitsuba 3: metres, linear Rec.709, radiance in the asset's unit. "
+# In the folder it says whose that is; of the scene it is at its beginning.
+_MARK, _BEGINNING = "usdbrdf.txt", 4096
 
 
 def write_scene_file(
     mi: Any, path: Path, scene: RelitScene, cameras: Sequence[Camera], *, bounces: int, samples: int
 ) -> int:
-    """Write the scene with all cameras, of which Mitsuba renders the first; returns how many files
-    lie beside it. What stood there of an earlier scene is replaced.
+    """Write the scene with all cameras, of which Mitsuba renders the first; returns how many meshes
+    and pictures lie beside it. What stood there of an earlier scene is replaced, or stays if that
+    fails.
 
     Pictures have square pixels: a camera whose pixels are not has more or fewer rows. Raises
-    OwnershipConflict where the folder for its files holds something else.
+    OwnershipConflict where something else stands in the place of the scene or of its files.
     """
     folder = path.with_name(f"{path.stem}.files")
-    if folder.exists() and not _is_ours(path, folder):
+    if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
         raise OwnershipConflict(
             f"{folder}: this is in the place of the scene's meshes and pictures. Name another file "
             "with -o. [relight.output]"
         )
-    with environment_failures(str(path)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=path.parent))
-    try:
-        with environment_failures(str(path)):
-            made = work / folder.name
-            made.mkdir()
-            root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples)
-            ElementTree.indent(root)
-            text = ElementTree.tostring(root, encoding="unicode")
-            if folder.exists():
-                path.unlink(missing_ok=True)  # it names what goes now
-                os.replace(folder, work / "earlier")
-            publish_folder(made, folder)
-            write_text_atomic(path, f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n')
-            return sum(1 for _ in folder.iterdir())
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    if path.exists() and not _says_so(path):
+        raise OwnershipConflict(
+            f"{path}: not a scene that usdbrdf wrote. Name another file with -o. [relight.output]"
+        )
+    with environment_failures(str(path)), temporary_folder(path) as work:
+        made, text = work / "made" / folder.name, work / "made" / path.name
+        made.mkdir(parents=True)
+        root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples)
+        count = sum(1 for _ in made.iterdir())
+        write_text_atomic(made / _MARK, f"{_OURS}\n")
+        ElementTree.indent(root)
+        plain = ElementTree.tostring(root, encoding="unicode")
+        write_text_atomic(text, f'<?xml version="1.0" encoding="utf-8"?>\n{plain}\n')
+        _replace(path, folder, text, made, work / "earlier")
+    return count
 
 
-def _is_ours(path: Path, folder: Path) -> bool:
-    if not folder.is_dir():
-        return False
-    if not any(folder.iterdir()):
-        return True
-    with suppress(OSError, UnicodeDecodeError):
-        return path.is_file() and _OURS in path.read_text("utf-8")
+def _replace(path: Path, folder: Path, text: Path, made: Path, earlier: Path) -> None:
+    """Put the scene and its files in the place of those that are there, or leave these."""
+    earlier.mkdir()
+    with ExitStack() as undo:
+        # Its text goes first and comes last: it never names files of another scene.
+        for place in (path, folder):
+            if place.exists():
+                os.replace(place, earlier / place.name)
+                undo.callback(os.replace, earlier / place.name, place)
+        undo.callback(shutil.rmtree, folder, ignore_errors=True)
+        publish_folder(made, folder)
+        move(text, path)
+        undo.pop_all()
+    flush_folder(path.parent)
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder is of a scene of ours, or empty."""
+    return _says_so(folder / _MARK) or not any(folder.iterdir())
+
+
+def _says_so(file: Path) -> bool:
+    """Whether the beginning of a file says that usdbrdf wrote it."""
+    with suppress(OSError), file.open("rb") as opened:
+        return _OURS.encode() in opened.read(_BEGINNING)
     return False
 
 
@@ -115,10 +134,12 @@ def _scene_element(
         sensor = description.pinhole(camera, *description.square_pixels(camera))
         sensor["sampler"] = {**sensor["sampler"], "sample_count": samples}
         _add(root, "", sensor, files).set("id", camera.name)
-    clear = [surface for surface in scene.surfaces if surface.material.clear]
-    for i, surface in enumerate(s for s in scene.surfaces if s not in clear):
+    for i, surface in enumerate(s for s in scene.surfaces if not s.material.clear):
         name = f"mesh_{i:04d}.ply"
-        mesh_of_surface(mi, surface, mi.Properties()).write_ply(str(files.folder / name))
+        # Into memory: where the disk is full, a mesh's own writer may leave half a file unnoticed.
+        written = mi.MemoryStream()
+        mesh_of_surface(mi, surface, mi.Properties()).write_ply(written)
+        (files.folder / name).write_bytes(written.raw_buffer())
         bsdf = description.two_of_mitsuba(surface)
         shape: dict[str, Any] = {"type": "ply", "filename": files.named(name)}
         shape["bsdf"] = {"type": "twosided", "bsdf": bsdf} if surface.two_sided else bsdf

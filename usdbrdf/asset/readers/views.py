@@ -67,11 +67,6 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
             f"{source}: the view {first.name!r} cannot be rendered: {first.reason}. Correct the "
             "document. [relight.views]"
         )
-    if not records or len({Path(record.name).stem for record in records}) < len(records):
-        raise InputRefused(
-            f"{source}: {'no views' if not records else 'two views have images of one name'}. "
-            "Correct the document. [relight.views]"
-        )
     cameras = []
     for record in records:
         place = Path(record.name)
@@ -90,6 +85,11 @@ def cameras_of_views(source: Path, asset: Asset, metres_per_unit: float) -> tupl
                     height=height,
                 )
             )
+    if not cameras or len({Path(camera.name).stem for camera in cameras}) < len(cameras):
+        raise InputRefused(
+            f"{source}: {'two views have images of one name' if cameras else 'no views'}. "
+            "Correct the document. [relight.views]"
+        )
     return tuple(cameras)
 
 
