@@ -49,8 +49,8 @@ from power_loss import LOSSES, WATCHED, Disk
 from system_calls import Call, can_watch, run_watched
 
 from usdbrdf.cli import main as usdbrdf_main
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.identity import tasks_identity
-from usdbrdf.job.child import scratch_folder
 
 # What makes the step short, and what makes its results differ from those.
 OPTIONS = {
