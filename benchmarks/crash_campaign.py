@@ -49,8 +49,8 @@ from power_loss import LOSSES, WATCHED, Disk
 from system_calls import Call, can_watch, run_watched
 
 from usdbrdf.cli import main as usdbrdf_main
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.identity import tasks_identity
-from usdbrdf.job.child import scratch_folder
 
 # What makes the step short, and what makes its results differ from those.
 OPTIONS = {
@@ -202,10 +202,14 @@ class Campaign:
 
     def ended(self, start: Start, fault: str, where: str, case: Path, status: int) -> None:
         """Run the same command again where a disturbed one ended, and note the result; ``where``
-        is "" if nothing disturbed it."""
-        if not where:
+        is "" if nothing disturbed it, which then has to have ended well."""
+        if not where and status == 0:
             self.missed += 1
             shutil.rmtree(case)
+            return
+        if not where:
+            problem = f"before any call was disturbed: ended with {status} {said(case)[-300:]}"
+            self.note(start, fault, problem)
             return
         problem = ""
         if status not in ENDS[fault] and status != 0:

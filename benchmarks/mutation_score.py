@@ -7,8 +7,10 @@ Mutations are drawn at random, all places in all rooms alike: another operator o
 number that is not the same, a condition turned round, a statement left out. Each is put into a copy
 of the repository, where the tests of its own room run until one fails: first those of a file named
 as the module, then those that name it, then the rest. One that no test notices survives; what
-hangs or does not import any more does not. With `--json` a run that was stopped goes on where it
-was.
+hangs or does not import any more does not; where the tests could not be run, or the machine ended
+them, nothing was found out. Before the first mutation of a room its tests have to pass as it is.
+With `--json` a run that was stopped goes on where it was; what it tried beside what is drawn now
+does not count.
 
 Why not mutmut or cosmic-ray: mutmut puts all versions of a function behind a switch that numba
 cannot compile; cosmic-ray works in place, for one command. Kernels lie in a cache of their own,
@@ -31,7 +33,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +49,9 @@ ROOMS = {
     "files": ("tests/files",),
     "job": ("tests/job",),
 }
-SURVIVED = 0  # exit code of pytest; another says that a test failed, or a module's import
+# Exit codes of pytest: all passed; a test failed; a module's import did. Others say that there were
+# no tests, that pytest could not run them, or that a signal ended it.
+SURVIVED, FOUND = 0, (1, 2, "hangs")
 # Of a mutant's tests: those that take longer of the processor, in one process, hang; those that do
 # of the clock, which runs on where others need the machine, tell nothing and do not count.
 PROCESSOR_SECONDS, CLOCK_SECONDS = 600, 7200
@@ -239,6 +243,13 @@ class Copy:
         failed = [line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
         return process.returncode, (failed or said.splitlines() or [""])[-1][:200]
 
+    def refuse_failing(self, room: str) -> None:
+        """As its tests fail already, every mutation of the room would be found."""
+        files = sorted(f for folder in ROOMS[room] for f in (self.root / folder).glob("test_*.py"))
+        status, said = self.tested([file.relative_to(self.root).as_posix() for file in files])
+        if status != SURVIVED:
+            raise SystemExit(f"{room}: without any mutation its tests end with {status}: {said}")
+
     def tried(self, mutation: Mutation) -> dict[str, object]:
         path = self.root / mutation.file
         source, known = path.read_text("utf-8"), set(self.kernels.rglob("*"))
@@ -253,7 +264,7 @@ class Copy:
                 made.unlink()
         return {
             "mutation": mutation.name, "before": mutation.before, "after": mutation.after,
-            "found": status != SURVIVED, "status": status, "said": said,
+            "found": status in FOUND, "status": status, "said": said,
             "seconds": round(time.monotonic() - began, 1),
         }  # fmt: skip
 
@@ -279,16 +290,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         drawn = [one for one in every if one.name in chosen.only]
     results = []
     if chosen.json and chosen.json.is_file() and not chosen.only:
-        results = [json.loads(line) for line in chosen.json.read_text().splitlines()]
-    done = {result["mutation"] for result in results}
+        results = counted(chosen.json.read_text(), drawn)
+    done, passing = {result["mutation"] for result in results}, set[str]()
     end = time.monotonic() + 60 * chosen.minutes
     with tempfile.TemporaryDirectory(prefix="mutations-", dir=chosen.work) as folder:
         place = Copy(Path(folder))
         for mutation in drawn:
             if mutation.name in done or time.monotonic() > end:
                 continue
+            if mutation.room not in passing:
+                place.refuse_failing(mutation.room)
+                passing.add(mutation.room)
             result = place.tried(mutation)
-            if result["status"] == "undecided":
+            if not is_decided(result):
+                print(f"undecided, {result['status']}: {mutation.name}: {result['said']}")
                 continue
             results.append(result)
             word = "found" if result["found"] else "SURVIVED"
@@ -299,6 +314,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 with chosen.json.open("a") as file:
                     file.write(json.dumps(result) + "\n")
     return told(results, len(every))
+
+
+def counted(lines: str, drawn: Sequence[Mutation]) -> list[dict[str, object]]:
+    """What an earlier run found out, of what is drawn now."""
+    names = {mutation.name for mutation in drawn}
+    results = map(json.loads, lines.splitlines())
+    return [each for each in results if each["mutation"] in names and is_decided(each)]
+
+
+def is_decided(result: Mapping[str, object]) -> bool:
+    return result["status"] == SURVIVED or result["status"] in FOUND
 
 
 def told(results: Sequence[dict[str, object]], places: int) -> int:

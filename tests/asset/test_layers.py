@@ -1,6 +1,9 @@
 """What holds for every layer: header, provenance, equal bytes, no absolute path, whole files."""
 
+import errno
 import hashlib
+import os
+import re
 import resource
 from dataclasses import replace
 
@@ -12,7 +15,7 @@ from usdbrdf.asset.header import Provenance, StageHeader, new_layer, read_header
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.scan_layer import check_root
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsdBrdfError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsdBrdfError
 
 
 def layer_files(asset):
@@ -150,13 +153,39 @@ def test_a_layer_that_does_not_compose_is_not_published(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.fault("R1")
-def test_a_layer_whose_neighbour_cannot_be_read_may_be_written_later(tmp_path):
-    neighbour = tmp_path / "neighbour.usda"
-    neighbour.write_text("what a disk gave instead of it")
+DAMAGED = "what a disk gave instead of it"
+
+
+def export_beside(tmp_path, name):
+    """Export a layer that references another, which cannot be composed."""
     layer = new_layer(StageHeader(name="room"), Provenance(role="scan", version="1"))
     prim = Sdf.CreatePrimInLayer(layer, "/room")
-    prim.referenceList.prependedItems = [Sdf.Reference("./neighbour.usda")]
-    with pytest.raises(EnvironmentFailure, match=r"neighbour\.usda: .+\[environment\.io\]"):
+    prim.referenceList.prependedItems = [Sdf.Reference(f"./{name}")]
+    try:
         export(layer, tmp_path / "scan.usda", folder=tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["neighbour.usda"]
+    finally:
+        assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["neighbour.usda", "half  a@room.usda", "@@r@.usdc", "all.usdz"])
+def test_a_layer_whose_neighbour_is_damaged_is_refused(tmp_path, name):
+    (tmp_path / name).write_text(DAMAGED)
+    with pytest.raises(InputRefused, match=rf"{re.escape(name)}: USD .+\[stage\.input\]$"):
+        export_beside(tmp_path, name)
+
+
+@pytest.mark.fault("R1")
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_layer_whose_neighbour_cannot_be_read_may_be_written_later(tmp_path, monkeypatch, gone):
+    """The disk fails once more, or not."""
+    neighbour = tmp_path / "neighbour.usda"
+    neighbour.write_text(DAMAGED)
+
+    def read(file):
+        if gone:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), file)
+        neighbour.write_text("#usda 1.0\n")
+
+    monkeypatch.setattr("usdbrdf.asset.layers.author.sha256_of", read)
+    with pytest.raises(EnvironmentFailure, match=r"neighbour\.usda: .+\[environment\.io\]"):
+        export_beside(tmp_path, neighbour.name)

@@ -16,7 +16,7 @@ import pytest
 import trimesh
 
 from tests.fuzzing import seeds
-from usdbrdf.job.child import PREFIX
+from usdbrdf.files.scratch import PREFIX
 
 _STRACE = shutil.which("strace")
 _CALLS = "execve,open,openat,creat,mkdir,mkdirat,rename,renameat,unlink,link,symlink,socket,connect"

@@ -17,6 +17,7 @@ import pytest
 
 from tests.fault_injection import VARIABLE, Fault
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files import atomic
 from usdbrdf.files.atomic import (
     environment_failures,
     flush_folder,
@@ -133,7 +134,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write_beside_it(tmp_path,
 
 def test_what_another_process_is_writing_stays(tmp_path):
     """Whether it can be seen, or only its lock: it may run in another container."""
-    seen = tmp_path / "seen" / named(os.getpid())
+    seen = tmp_path / "seen" / named(os.getppid())
     seen.mkdir(parents=True)
     write_text_atomic(tmp_path / "seen" / "a.txt", "new")
     assert seen.is_dir()
@@ -153,6 +154,27 @@ def test_what_another_process_is_writing_stays(tmp_path):
         assert unseen.is_file()
     assert run_python(code, tmp_path / "locked" / "a.txt").returncode == 0
     assert not unseen.exists()
+
+
+@pytest.mark.fault("R2")
+def test_what_another_process_with_our_number_left_goes_and_ours_stays(tmp_path, monkeypatch):
+    """In a container each command is process 1."""
+    left = tmp_path / named(os.getpid())
+    left.mkdir()
+    with temporary_folder(tmp_path / "a") as mine, temporary_beside(tmp_path / "a.usda") as half:
+        half.touch()
+        as_usd_names_it = half.with_suffix(".2YgHvW")
+        as_usd_names_it.touch()
+        assert {path.name for path in tmp_path.iterdir()} == {
+            mine.name, half.name, as_usd_names_it.name,
+        }  # fmt: skip
+        # One that was forked, and swept nowhere yet; the lock is ours, as for another descriptor.
+        monkeypatch.setattr(atomic, "_swept", set())
+        monkeypatch.setattr(fcntl, "flock", lambda _descriptor, _operation: None)
+        write_text_atomic(tmp_path / "b.txt", "new")
+        assert mine.is_dir()
+        assert half.is_file()
+        assert as_usd_names_it.is_file()
 
 
 def test_without_locks_nothing_is_swept_and_all_is_written(tmp_path, monkeypatch):

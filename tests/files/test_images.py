@@ -24,6 +24,7 @@ from usdbrdf.files.images import (
     write_exr,
     write_preview_png,
 )
+from usdbrdf.files.scratch import PREFIX
 
 
 @pytest.fixture
@@ -547,6 +548,21 @@ def test_a_jpeg_for_people_has_no_metadata_and_is_the_picture(tmp_path):
     (tmp_path / "picture.jpg").write_bytes(content)
     assert np.abs(read_radiance(tmp_path / "picture.jpg") * 255 - picture).mean() < 2
     assert encoded_jpeg(np.ascontiguousarray(picture), 90) == content
+
+
+def test_a_jpeg_is_made_where_the_next_command_sweeps_if_it_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    made = []
+
+    def write(target, *rest):
+        made.extend(tmp_path.iterdir())
+        write_image(target, *rest)
+
+    write_image = images.write_image
+    monkeypatch.setattr(images, "write_image", write)
+    encoded_jpeg(np.zeros((8, 8, 3), np.uint8), 90)
+    assert [place.name.startswith(PREFIX) for place in made] == [True]
+    assert not any(tmp_path.iterdir())
 
 
 UNREAD = """

@@ -36,7 +36,7 @@ from tests.fuzzing.readers import OF_THE_FORM, Reader
 from tests.fuzzing.seeds import Seed
 from usdbrdf.errors import UsageError, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures
-from usdbrdf.job.child import PREFIX
+from usdbrdf.files.scratch import PREFIX
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.untrusted import bounds
 

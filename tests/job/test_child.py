@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.files import scratch
 from usdbrdf.job import child as module
 from usdbrdf.job.child import run_child
 
@@ -186,7 +187,7 @@ def test_a_child_dies_with_its_parent_and_its_folder_is_swept(tmp_path, monkeypa
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": search}
     )
     _appears(note)
-    (left,) = tmp_path.glob(f"{module.PREFIX}*")
+    (left,) = tmp_path.glob(f"{scratch.PREFIX}*")
     os.utime(left, (0, 0))
     child, grandchild = (int(pid) for pid in note.read_text().split())
     try:
@@ -194,8 +195,8 @@ def test_a_child_dies_with_its_parent_and_its_folder_is_swept(tmp_path, monkeypa
         parent.send_signal(signal.SIGKILL)
         parent.wait()
         assert _ended(child)
-        fresh = tmp_path / f"{module.PREFIX}fresh"
-        link = tmp_path / f"{module.PREFIX}link"
+        fresh = tmp_path / f"{scratch.PREFIX}fresh"
+        link = tmp_path / f"{scratch.PREFIX}link"
         fresh.mkdir()
         link.symlink_to(tmp_path)
         assert _sweeps(tmp_path) == {fresh, link}, "one is too young to be without owner"
@@ -205,9 +206,9 @@ def test_a_child_dies_with_its_parent_and_its_folder_is_swept(tmp_path, monkeypa
 
 def _sweeps(folder):
     """The scratch folders that the next run leaves."""
-    module._sweep.cache_clear()
-    with module.scratch_folder() as own:
-        return set(folder.glob(f"{module.PREFIX}*")) - {own}
+    scratch._sweep.cache_clear()
+    with scratch.scratch_folder() as own:
+        return set(folder.glob(f"{scratch.PREFIX}*")) - {own}
 
 
 def _appears(path):

@@ -26,8 +26,8 @@ from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.images import needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.files.tables import csv_rows, number_in
-from usdbrdf.job.child import scratch_folder
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Byte, Double
 from usdbrdf.untrusted.video_files import MOST_FRAMES, frames_of_video, place_of

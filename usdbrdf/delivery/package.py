@@ -49,7 +49,7 @@ from usdbrdf.errors import (
 )
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import code_version

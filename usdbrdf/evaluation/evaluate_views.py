@@ -30,7 +30,7 @@ from usdbrdf.files.colour import display_exposure, to_display_srgb
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Float

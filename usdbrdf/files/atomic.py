@@ -25,8 +25,9 @@ _BLOCK = 1 << 20  # bytes hashed at a time
 # Names of ours tell machine and process; what a library names so on the way ends otherwise.
 _MACHINE = hashlib.sha256(socket.gethostname().encode("utf-8", "replace")).hexdigest()[:8]
 _TEMPORARY = re.compile(
-    rf"{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}}(\..*)?"
+    rf"(?P<name>{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}})(\..*)?"
 )
+_own: set[str] = set()  # names in use by this process, its threads, and those it was forked from
 _swept: set[Path] = set()  # once in a process is enough
 
 
@@ -83,8 +84,8 @@ def write_text_atomic(path: Path, text: str) -> None:
 @contextmanager
 def temporary_beside(path: Path) -> Iterator[Path]:
     """A fresh name in the folder of ``path``, with its suffix; gone at the end unless published."""
-    staged = path.with_name(f"{_new_name()}{path.suffix}")
-    with _at_work_in(staged.parent):
+    with _new_name() as name, _at_work_in(path.parent):
+        staged = path.with_name(f"{name}{path.suffix}")
         try:
             yield staged
         finally:
@@ -96,8 +97,8 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 def temporary_folder(final: Path) -> Iterator[Path]:
     """A fresh folder beside ``final``; gone at the end unless published."""
     final.parent.mkdir(parents=True, exist_ok=True)
-    staged = final.with_name(_new_name())
-    with _at_work_in(staged.parent):
+    with _new_name() as name, _at_work_in(final.parent):
+        staged = final.with_name(name)
         staged.mkdir()
         try:
             yield staged
@@ -105,8 +106,14 @@ def temporary_folder(final: Path) -> Iterator[Path]:
             shutil.rmtree(staged, ignore_errors=True)
 
 
-def _new_name() -> str:
-    return f"{TEMPORARY_PREFIX}{_MACHINE}-{os.getpid()}-{secrets.token_hex(4)}"
+@contextmanager
+def _new_name() -> Iterator[str]:
+    name = f"{TEMPORARY_PREFIX}{_MACHINE}-{os.getpid()}-{secrets.token_hex(4)}"
+    _own.add(name)
+    try:
+        yield name
+    finally:
+        _own.discard(name)
 
 
 @contextmanager
@@ -141,7 +148,7 @@ def _sweep(folder: Path) -> None:
     """Remove temporary files and folders of this user and machine whose processes are no more."""
     for place in folder.iterdir():
         named = _TEMPORARY.fullmatch(place.name)
-        if named is None or place.lstat().st_uid != os.geteuid() or _lives(int(named["process"])):
+        if named is None or place.lstat().st_uid != os.geteuid() or _is_in_use(**named.groupdict()):
             continue
         if place.is_dir() and not place.is_symlink():
             shutil.rmtree(place, ignore_errors=True)
@@ -149,9 +156,13 @@ def _sweep(folder: Path) -> None:
             place.unlink(missing_ok=True)
 
 
-def _lives(process: int) -> bool:
+def _is_in_use(name: str, process: str) -> bool:
+    """Whether the process that made a name lives. One with our number that we did not make is an
+    earlier one's: in a container every command has the same number, often 1."""
+    if int(process) == os.getpid():
+        return name in _own
     try:
-        os.kill(process, 0)
+        os.kill(int(process), 0)
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:

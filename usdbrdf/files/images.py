@@ -14,7 +14,6 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,6 +21,7 @@ import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Byte, Float
 
 T = TypeVar("T")
@@ -219,8 +219,8 @@ def encoded_jpeg(rgb8: Byte, quality: int) -> bytes:
 
     quality  1 to 100
     """
-    with TemporaryDirectory(prefix="usdbrdf-picture-") as folder:
-        path = Path(folder) / "picture.jpg"
+    with scratch_folder() as folder:
+        path = folder / "picture.jpg"
         spec = _spec_of_preview(path, rgb8)
         spec.attribute("Compression", f"jpeg:{quality}")
         write_image(path, path, spec, np.ascontiguousarray(rgb8))

@@ -9,21 +9,17 @@ behind go at the next one. The child dies with us.
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import json
 import math
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,47 +28,8 @@ from usdbrdf import errors
 from usdbrdf.errors import CrashedChild, EnvironmentFailure, LateChild, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Array
-
-PREFIX = "usdbrdf-scratch-"
-# Between its making and its locking a folder seems to have no owner.
-_MIN_AGE_SECONDS = 60
-
-
-@contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """A new folder beside other temporary ones, of this user alone, gone at the end of the block.
-
-    It is locked as long as this process lives, so that it can be told from what nobody owns.
-    """
-    _sweep(tempfile.gettempdir())
-    with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as name:
-        descriptor = os.open(name, os.O_RDONLY)
-        try:
-            with suppress(OSError):  # a file system without locks: it then has to be swept by hand
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield Path(name)
-        finally:
-            os.close(descriptor)
-
-
-@cache  # once in a process is enough
-def _sweep(parent: str) -> None:
-    with suppress(OSError), os.scandir(parent) as entries:
-        for entry in (entry for entry in entries if entry.name.startswith(PREFIX)):
-            with suppress(OSError):  # gone meanwhile, or locked: it has an owner
-                status = entry.stat(follow_symlinks=False)
-                old = time.time() - status.st_mtime > _MIN_AGE_SECONDS
-                ours = entry.is_dir(follow_symlinks=False) and status.st_uid == os.geteuid()
-                if not (ours and old):
-                    continue
-                descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                finally:
-                    os.close(descriptor)
-                shutil.rmtree(entry.path, ignore_errors=True)
-
 
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"

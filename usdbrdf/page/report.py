@@ -23,7 +23,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reading
 from usdbrdf.job.stamp import code_version
 from usdbrdf.model.capture import Frames

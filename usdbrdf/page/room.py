@@ -14,7 +14,7 @@ from usdbrdf.delivery.package import package
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import resized
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions

@@ -22,7 +22,7 @@ from usdbrdf.evaluation.evaluate_views import (
 from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.images import write_preview_png
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.model.camera import Camera
 from usdbrdf.paper import figures, tables

@@ -13,7 +13,7 @@ from usdbrdf.capture.inspection import Inspection
 from usdbrdf.capture.inspection import inspect as inspect_capture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented

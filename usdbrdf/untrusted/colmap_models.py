@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.job.child import scratch_folder
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Double, Int
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
-from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
-from usdbrdf.files.atomic import temporary_beside
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import environment_failures, sha256_of, temporary_beside
 
 Types = Sdf.ValueTypeNames
-# As USD names a file that it was to compose; where the file is there, its disk did not give it.
-_NOT_OPENED = re.compile(r"Could not open asset @(?P<file>[^@]+)@")
+# As USD names a file that it was to compose; between @@@ a name that holds an @, in some versions.
+_NOT_OPENED = re.compile(r"Could not open asset @(?:@@)?(?P<file>.+?)@(?:@@)? for ")
 
 
 def over(layer: Sdf.Layer, path: str) -> Sdf.PrimSpec:
@@ -165,17 +165,36 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
         # replaced, or the artist's. So for payloads.
         stored.subLayerPaths = []
         stage = Usd.Stage.Open(stored, Usd.Stage.LoadNone)
-        problems = [in_one_line(error) for error in stage.GetCompositionErrors()]
-        for named in filter(None, map(_NOT_OPENED.search, problems)):
-            if os.path.isfile(named["file"]):
-                raise EnvironmentFailure(
-                    f"{named['file']}: USD could not read the layer, on which {path.name} rests. "
-                    "Check the disk, then run the same command again; finished work is kept. "
-                    "[environment.io]"
-                )
-        if problems:
+        if errors := stage.GetCompositionErrors():
+            for named in filter(None, map(_NOT_OPENED.search, map(str, errors))):
+                _refuse_damaged(named["file"])
             raise UsdBrdfError(
-                f"{path.name}: the layer does not compose: {problems[0]}. This is a defect of "
-                "usdbrdf; please report it. [stage.composition]"
+                f"{path.name}: the layer does not compose: {in_one_line(errors[0])}. This is a "
+                "defect of usdbrdf; please report it. [stage.composition]"
             )
         os.replace(written, path)
+
+
+def _refuse_damaged(asset: str) -> None:
+    """Say of a file that USD could not compose whether its disk or its content is at fault: the
+    latter where its bytes can be read and USD opens it no more than before. One that is not there
+    is left to the caller."""
+    file = Path(Ar.SplitPackageRelativePathOuter(asset)[0])
+    if not file.is_file():
+        return
+    with environment_failures(str(file)):
+        sha256_of(file)
+    try:
+        opened = Sdf.Layer.OpenAsAnonymous(asset)
+        why = "it is not a layer"
+    except Tf.ErrorException as error:
+        opened, why = None, in_one_line(error)
+    if opened:
+        raise EnvironmentFailure(
+            f"{file}: USD could read the layer at the second attempt only. Check the disk, then "
+            "run the same command again; finished work is kept. [environment.io]"
+        )
+    raise InputRefused(
+        f"{file}: USD cannot open it: {why}. Correct that file or export it again, then run the "
+        "same command again. [stage.input]"
+    )
