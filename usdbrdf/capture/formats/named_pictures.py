@@ -4,6 +4,7 @@ beside them, in one frame and unit."""
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -132,10 +133,11 @@ def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None
     stem = str(PurePosixPath(name).with_suffix(""))
     for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
         for suffix in (".png", ".jpg"):
-            if (folder / "masks" / f"{usual}{suffix}").is_file():
+            # Of which nothing can be asked, as of too long a name, is not there.
+            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
                 return path_in_capture(folder, f"masks/{usual}{suffix}", options)
     same = folder / "masks" / name
-    return path_in_capture(folder, f"masks/{name}", options) if same.is_file() else None
+    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
 
 
 def drop_without_picture(label: str, findings: Findings) -> None:
