@@ -78,6 +78,16 @@ class Pictures:
                 return found[0] if len(found) == 1 else None
         return None
 
+    def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
+        """``mask_beside`` of a picture by its path below the pictures' folder, else by its name
+        alone, where no other folder has a picture of this name."""
+        relative = picture.relative_to(self.folder).as_posix()
+        found = mask_beside(folder, relative, options)
+        if found is not None or relative == picture.name:
+            return found
+        alike = {path.parent for path, _ in self._by_stem[picture.stem]}
+        return mask_beside(folder, picture.name, options) if len(alike) == 1 else None
+
     @cached_property
     def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
         by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
