@@ -59,8 +59,9 @@ def aligned(stack: Byte, names: Sequence[str]) -> Aligned:
     """A bracket, (K, H, W, 3) by exposure, the longest first, laid onto its middle exposure.
 
     What hardly moved stays as it is. Raises InputRefused, with ``names``, where an exposure does
-    not fit onto its neighbour, and where parts of it moved by different amounts: something near was
-    seen from elsewhere. EnvironmentFailure without OpenCV.
+    not fit onto its neighbour, where both share no code that is clear in either, so that nothing
+    can be compared, and where parts of it moved by different amounts: something near was seen from
+    elsewhere. EnvironmentFailure without OpenCV.
     """
     grey = stack.astype(np.float32).mean(axis=3).astype(np.uint8)
     middle = len(stack) // 2
@@ -84,7 +85,7 @@ def between(fixed: Byte, other: Byte, names: tuple[str, str]) -> Double:
     down, right = (int(n) for n in _shift(fixed, other, _LEVELS))
     found = np.array([[1.0, 0, -right], [0, 1, -down], [0, 0, 1]])
     if _common_rank(fixed, other) is None:
-        return found  # no code is clear in both
+        raise _nothing_shared(names)
     if fixed.mean() >= other.mean():
         found = _correlated(fixed, other, found)
     else:
@@ -186,6 +187,8 @@ def _codes_by_rank(picture: Byte, other: Byte, moved: Double) -> Float:
 
 def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, str]) -> None:
     onto, both = _warped(other, moved), _inside(fixed.shape, moved)
+    if both.any() and _common_rank(fixed[both], onto[both]) is None:
+        raise _nothing_shared(names)
     if both.mean() < _OVERLAP or _unlike(fixed, onto, both) > _FITS:
         raise InputRefused(
             f"{names[1]}: shows another view than {names[0]}, or one turned too far, so that one "
@@ -200,11 +203,18 @@ def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, st
         )
 
 
+def _nothing_shared(names: tuple[str, str]) -> InputRefused:
+    return InputRefused(
+        f"{names[1]}: where {names[0]} shows something this exposure is black or white, so that "
+        "nothing tells whether the camera moved. Bracket in smaller steps, or leave it out. "
+        "[brackets.moved]"
+    )
+
+
 def _unlike(one: Byte, other: Byte, both: Bool) -> float:
     """Share of differing bits of two pictures where both show something."""
     rank = _common_rank(one[both], other[both])
-    if rank is None:
-        return 0.0
+    assert rank is not None, "refused before"
     bits = [_bitmap(p, float(np.quantile(p[both], rank))) for p in (one, other)]
     return _differing((bits[0][0], bits[0][1] & both), bits[1], np.zeros(2, np.int32))
 
