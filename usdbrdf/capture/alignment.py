@@ -20,6 +20,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from usdbrdf import calibration
 from usdbrdf.capture.brackets import BRIGHT_CODE, DARK_CODE
 from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Byte, Double, Float, Int
 
 T = TypeVar("T", bound=np.generic)
@@ -59,9 +60,9 @@ def aligned(stack: Byte, names: Sequence[str]) -> Aligned:
     """A bracket, (K, H, W, 3) by exposure, the longest first, laid onto its middle exposure.
 
     What hardly moved stays as it is. Raises InputRefused, with ``names``, where an exposure does
-    not fit onto its neighbour, where both share no code that is clear in either, so that nothing
-    can be compared, and where parts of it moved by different amounts: something near was seen from
-    elsewhere. EnvironmentFailure without OpenCV.
+    not fit onto its neighbour, and where parts of it moved by different amounts: something near was
+    seen from elsewhere; EnvironmentFailure without OpenCV. Warns where both share no code that is
+    clear in either: nothing is compared then, and none is moved onto the other.
     """
     grey = stack.astype(np.float32).mean(axis=3).astype(np.uint8)
     middle = len(stack) // 2
@@ -85,7 +86,8 @@ def between(fixed: Byte, other: Byte, names: tuple[str, str]) -> Double:
     down, right = (int(n) for n in _shift(fixed, other, _LEVELS))
     found = np.array([[1.0, 0, -right], [0, 1, -down], [0, 0, 1]])
     if _common_rank(fixed, other) is None:
-        raise _nothing_shared(names)
+        _warn_of_nothing_shared(names)
+        return found
     if fixed.mean() >= other.mean():
         found = _correlated(fixed, other, found)
     else:
@@ -188,7 +190,8 @@ def _codes_by_rank(picture: Byte, other: Byte, moved: Double) -> Float:
 def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, str]) -> None:
     onto, both = _warped(other, moved), _inside(fixed.shape, moved)
     if both.any() and _common_rank(fixed[both], onto[both]) is None:
-        raise _nothing_shared(names)
+        _warn_of_nothing_shared(names)
+        return
     if both.mean() < _OVERLAP or _unlike(fixed, onto, both) > _FITS:
         raise InputRefused(
             f"{names[1]}: shows another view than {names[0]}, or one turned too far, so that one "
@@ -203,11 +206,11 @@ def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, st
         )
 
 
-def _nothing_shared(names: tuple[str, str]) -> InputRefused:
-    return InputRefused(
-        f"{names[1]}: where {names[0]} shows something this exposure is black or white, so that "
-        "nothing tells whether the camera moved. Bracket in smaller steps, or leave it out. "
-        "[brackets.moved]"
+def _warn_of_nothing_shared(names: tuple[str, str]) -> None:
+    warn(
+        f"{names[1]}: shares no code with {names[0]} that is clear in both, so that nothing tells "
+        "whether the camera moved between them, and it stays where it is. Leave it out unless it "
+        "was taken from a tripod. [brackets.moved]"
     )
 
 
