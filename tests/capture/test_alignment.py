@@ -135,16 +135,6 @@ def test_what_moved_too_far_is_refused():
         aligned(codes, NAMES)
 
 
-@pytest.mark.parametrize("stops", [8, -8])
-def test_exposures_that_share_no_clear_code_are_told(stops, capsys):
-    """Of which nobody knows whether the camera moved."""
-    light, dark = _photograph(SHAPE, decades=0.5), np.roll(_photograph(SHAPE, decades=0.5), 9, 1)
-    codes = [_shoot(view, EXPOSURES[3:4] * 2.0**by)[0] for view, by in ((light, 4), (dark, -5))]
-    codes = np.array(codes if stops > 0 else codes[::-1])
-    np.testing.assert_array_equal(aligned(codes, NAMES).stack, codes)
-    assert "whether the camera moved" in capsys.readouterr().err
-
-
 def test_parallax_is_refused():
     scene = _photograph(SHAPE, decades=3)
     near = scene.copy()

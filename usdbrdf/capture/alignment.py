@@ -20,7 +20,6 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from usdbrdf import calibration
 from usdbrdf.capture.brackets import BRIGHT_CODE, DARK_CODE
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Byte, Double, Float, Int
 
 T = TypeVar("T", bound=np.generic)
@@ -61,8 +60,7 @@ def aligned(stack: Byte, names: Sequence[str]) -> Aligned:
 
     What hardly moved stays as it is. Raises InputRefused, with ``names``, where an exposure does
     not fit onto its neighbour, and where parts of it moved by different amounts: something near was
-    seen from elsewhere; EnvironmentFailure without OpenCV. Warns where both share no code that is
-    clear in either: nothing is compared then, and none is moved onto the other.
+    seen from elsewhere. EnvironmentFailure without OpenCV.
     """
     grey = stack.astype(np.float32).mean(axis=3).astype(np.uint8)
     middle = len(stack) // 2
@@ -86,8 +84,7 @@ def between(fixed: Byte, other: Byte, names: tuple[str, str]) -> Double:
     down, right = (int(n) for n in _shift(fixed, other, _LEVELS))
     found = np.array([[1.0, 0, -right], [0, 1, -down], [0, 0, 1]])
     if _common_rank(fixed, other) is None:
-        _warn_of_nothing_shared(names)
-        return found
+        return found  # no code is clear in both
     if fixed.mean() >= other.mean():
         found = _correlated(fixed, other, found)
     else:
@@ -189,9 +186,6 @@ def _codes_by_rank(picture: Byte, other: Byte, moved: Double) -> Float:
 
 def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, str]) -> None:
     onto, both = _warped(other, moved), _inside(fixed.shape, moved)
-    if both.any() and _common_rank(fixed[both], onto[both]) is None:
-        _warn_of_nothing_shared(names)
-        return
     if both.mean() < _OVERLAP or _unlike(fixed, onto, both) > _FITS:
         raise InputRefused(
             f"{names[1]}: shows another view than {names[0]}, or one turned too far, so that one "
@@ -206,18 +200,11 @@ def _refuse_misfit(fixed: Byte, other: Byte, moved: Double, names: tuple[str, st
         )
 
 
-def _warn_of_nothing_shared(names: tuple[str, str]) -> None:
-    warn(
-        f"{names[1]}: shares no code with {names[0]} that is clear in both, so that nothing tells "
-        "whether the camera moved between them, and it stays where it is. Leave it out unless it "
-        "was taken from a tripod. [brackets.moved]"
-    )
-
-
 def _unlike(one: Byte, other: Byte, both: Bool) -> float:
     """Share of differing bits of two pictures where both show something."""
     rank = _common_rank(one[both], other[both])
-    assert rank is not None, "refused before"
+    if rank is None:
+        return 0.0
     bits = [_bitmap(p, float(np.quantile(p[both], rank))) for p in (one, other)]
     return _differing((bits[0][0], bits[0][1] & both), bits[1], np.zeros(2, np.int32))
 
