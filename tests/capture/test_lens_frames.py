@@ -309,6 +309,28 @@ def test_photographs_of_eight_bits_become_linear_frames(tmp_path):
         assert np.abs(pixels.radiance[inner] / expected - 1).max() < 0.05
 
 
+@pytest.mark.parametrize("masked", [0, 1])
+def test_eight_bits_of_lightings_are_linear_where_one_of_them_is_resampled(tmp_path, masked):
+    made = [make_capture(tmp_path / name, frames=12) for name in ("day", "night")]
+    for each in made:
+        in_eight_bits(each)
+    write_preview_png(tmp_path / "mask.png", np.full((24, 32, 3), 255, np.uint8))
+    (tmp_path / "mask.png").rename(made[masked].folder / "mask.png")
+    with edited(made[masked].manifest) as document:
+        document["frames"][3]["mask_path"] = "mask.png"
+    asset = Asset.at(tmp_path / "asset")
+    with owned_folder(asset.folder):
+        ingest([each.folder for each in made], asset, IngestOptions(assume_srgb=True))
+    frames = frames_from_stage(open_weaker(asset, "texturing"))
+    expected = np.array(made[0].radiance["walls"]) / 8
+    assert len(frames) == 24
+    for i in range(24):
+        pixels, shown = read_frame(frames, i), surface_of(made[0], frames.camera(i))
+        inner = (shown == made[0].names.index("walls")) & pixels.valid
+        assert inner.sum() > 20
+        assert np.abs(pixels.radiance[inner] / expected - 1).max() < 0.05
+
+
 def test_a_lens_that_shows_nothing_is_dropped_with_words(tmp_path):
     made = capture_through(tmp_path / "room", "OPENCV")
     with edited(made.manifest) as document:

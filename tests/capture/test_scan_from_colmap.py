@@ -200,6 +200,12 @@ def test_masks_of_subfolders_are_not_mixed_up(tmp_path):
     }
 
 
+def test_a_name_too_long_for_a_mask_has_none(tmp_path):
+    (tmp_path / "masks").mkdir()
+    for name in ("n" * 244 + ".jpg", "n" * 300, "n/" * 3000):
+        assert mask_beside(tmp_path, name, OPTIONS) is None
+
+
 def make_mask(path):
     from usdbrdf.files.images import write_preview_png
 

@@ -60,6 +60,26 @@ def test_masks_are_found_by_the_pictures_names(capture, name):
     assert any("1 masks are used" in warning for warning in scan.warnings)
 
 
+def test_masks_of_pictures_of_one_name_are_told_apart(capture):
+    images = sorted((capture / "images").iterdir())
+    for place, names in (("a", images[:5]), ("b", images[5:])):
+        (capture / "images" / place).mkdir()
+        for i, path in enumerate(names):
+            path.rename(capture / "images" / place / f"{i}.jpg")
+    (capture / "images/b/4.jpg").rename(capture / "images/b/9.jpg")
+    shown = np.ones((HEIGHT, WIDTH, 3))
+    # That of one picture, one that could be of two, and one that is of a single one.
+    for name in ("a/1.png", "2.png", "9.png"):
+        write_image(capture / "masks" / name, shown)
+    scan = read_scan(capture, OPTIONS)
+    found = {
+        path.relative_to(capture / "images").as_posix(): mask.relative_to(capture).as_posix()
+        for path, mask in zip(scan.frames.photographs, scan.frames.masks, strict=True)
+        if mask
+    }
+    assert found == {"a/1.jpg": "masks/a/1.png", "b/9.jpg": "masks/9.png"}
+
+
 def _no_mesh(capture):
     (capture / "surface.ply").unlink()
 

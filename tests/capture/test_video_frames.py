@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.video_frames import develop_video
 from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.frames import read_frame
+from usdbrdf.files.images import read_radiance
 from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted import video_files
 
@@ -177,6 +180,70 @@ def test_frames_are_upright_and_the_asked_ones(tmp_path, video):
     assert found.numbers == (3, 7)
     assert found.resolution == SIZE
     assert sorted(p.name for p in tmp_path.glob("*.png")) == ["000003.png", "000007.png"]
+
+
+def _red(path: Path, rows: int, **said: object) -> Path:
+    """A video of BT.709's red, as its luma and chroma have it."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(30))
+        stream.width, stream.height, stream.pix_fmt = 160, rows, "yuv444p"
+        stream.options = {"crf": "1"}
+        for name, value in said.items():
+            setattr(stream.codec_context, name, value)
+        codes = np.broadcast_to(np.uint8([63, 102, 240])[:, None, None], (3, rows, 160))
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(codes), format="yuv444p")
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+# Red as BT.601 reads these codes.
+@pytest.mark.parametrize(
+    ("rows", "flags", "red"),
+    [
+        (720, {}, (255, 0, 0)),
+        (120, {}, (233, 0, 2)),
+        (720, {"colorspace": 5}, (233, 0, 2)),
+        (120, {"colorspace": 1, "color_primaries": 1, "color_trc": 1}, (255, 0, 0)),
+    ],
+)
+def test_the_matrix_is_that_which_players_take(tmp_path, rows, flags, red):
+    video_files.read_here(_red(tmp_path / "red.mp4", rows, **flags), [0], str(tmp_path))
+    shown = 255 * read_radiance(video_files.place_of(tmp_path, 0))
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), red, atol=2)
+
+
+@pytest.mark.parametrize(
+    ("said", "rule"),
+    [
+        ({"color_primaries": 9, "colorspace": 9}, "BT.709.*video.colour"),
+        ({"color_trc": 16}, "PQ.*video.colour"),
+        ({"color_trc": 18}, "HLG.*video.colour"),
+        ({"sample_aspect_ratio": Fraction(4, 3)}, "4/3.*video.pixels"),
+    ],
+)
+def test_other_colours_and_pixels_are_refused(tmp_path, said, rule):
+    path = _red(tmp_path / "red.mp4", 120, **said)
+    with pytest.raises(InputRefused, match=rf"red\.mp4: .*{rule}\]$"):
+        video_files.read_here(path, [0], str(tmp_path))
+
+
+@pytest.mark.parametrize("code", [errno.ENOMEM, errno.EIO, errno.ESTALE, errno.ENOSPC])
+def test_what_the_machine_lacks_is_no_fault_of_the_video(tmp_path, video, monkeypatch, code):
+    def fails(*_, **__):
+        av.error.err_check(-code)
+
+    monkeypatch.setattr(av, "open", fails)
+    with pytest.raises(EnvironmentFailure), environment_failures("video"):
+        video_files.read_here(video, [0], str(tmp_path))
+
+
+def test_chosen_frames_of_one_exposure_are_told_by_those_beside_them(capture, tmp_path):
+    with edited(capture / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["video_frame"] = 1 + i // 4 * 12 + i % 4 * 3
+    found = develop_video(capture, tmp_path / "radiance")
+    assert (found["frames"], found["stops"]) == (12, 0)
 
 
 def test_without_pyav_a_sentence_says_how_to_get_it(tmp_path, video, monkeypatch):

@@ -25,6 +25,7 @@ from usdbrdf.files.atomic import (
     sha256_of,
     temporary_beside,
     temporary_folder,
+    whole_folder,
     write_text_atomic,
 )
 
@@ -175,6 +176,24 @@ def test_what_another_process_with_our_number_left_goes_and_ours_stays(tmp_path,
         assert mine.is_dir()
         assert half.is_file()
         assert as_usd_names_it.is_file()
+
+
+@pytest.mark.parametrize("name", [".", "..", "new", "../link"])
+def test_a_folder_may_be_named_from_within(tmp_path, monkeypatch, name):
+    here = tmp_path / "outer" / "here"
+    (tmp_path / "apart").mkdir()
+    here.mkdir(parents=True)
+    (tmp_path / "outer" / "link").symlink_to(tmp_path / "apart")
+    monkeypatch.chdir(here)
+    if name == "..":  # holds this one
+        with pytest.raises(OSError, match="not empty"), whole_folder(Path(name)):
+            pass
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["apart", "outer"]
+        return
+    with whole_folder(Path(name)) as staged:
+        (staged / "file").write_text("done")
+    target = {".": here, "new": here / "new", "../link": tmp_path / "apart"}[name]
+    assert (target / "file").read_text() == "done"
 
 
 def test_without_locks_nothing_is_swept_and_all_is_written(tmp_path, monkeypatch):

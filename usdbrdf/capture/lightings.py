@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.capture.develop import as_views
 from usdbrdf.capture.native import captured_faces, captured_points
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.naming import identifier_from
 from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras
 from usdbrdf.model.capture import Frames, Scan
@@ -88,6 +90,15 @@ def in_own_folder(scan: Scan, lighting: str) -> Scan:
     return replace(scan, frames=replace(scan.frames, image_paths=own))
 
 
+def developed_alike(scans: Mapping[str, Scan]) -> dict[str, Scan]:
+    """The scans, all of whose 8-bit photographs are resampled where those of one are: these become
+    linear, and the frames of a scene have one encoding."""
+    linear = (kind_of_encoding(scan.frames.encoding) == "linear" for scan in scans.values())
+    if all(linear) or not any(any(scan.views) for scan in scans.values()):
+        return dict(scans)
+    return {name: scan if any(scan.views) else as_views(scan) for name, scan in scans.items()}
+
+
 def refuse_other_scenes(scans: Mapping[str, Scan]) -> None:
     """InputRefused where meshes, objects, units or encodings of the images differ."""
     first, *others = scans.values()
@@ -134,6 +145,7 @@ def _refuse_another_scene(first: Scan, other: Scan) -> None:
 def _joined(scans: Mapping[str, Scan]) -> Frames:
     """The frames of all lightings, those of one after each other."""
     several = [scan.frames for scan in scans.values()]
+    assert len({frames.encoding for frames in several}) == 1, "see developed_alike"
     columns: dict[str, Any] = {}
     for field in ("world_from_camera", "intrinsics", "resolution", "exposure_time",
                   "saturation_radiance", "noise_floor_radiance"):  # fmt: skip

@@ -138,11 +138,12 @@ def _video(source: Path, document: Any) -> _Video:
             f"{source}: no exposure is stated for the frame {without} of its video. Add it to the "
             "table. [video.exposure]"
         )
-    if len({exposures[n] for n in sound}) < 2:
+    decoded = {n + step for n in sound for step in range(-1, _RUN)} & exposures.keys()
+    if len({exposures[n] for n in decoded}) < 2:
         raise InputRefused(
-            f"{source}: all its frames have one exposure, so that nothing tells the response of "
-            "the camera. Export the frames as PNG and convert these with --assume-srgb. "
-            "[video.exposure]"
+            f"{source}: its frames and those beside them all have one exposure, so that nothing "
+            "tells the response of the camera. Export the frames as PNG and convert these with "
+            "--assume-srgb. [video.exposure]"
         )
     return _Video(source, entries, sound, exposures, cycle)
 

@@ -95,7 +95,8 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(final: Path) -> Iterator[Path]:
-    """A fresh folder beside ``final``; gone at the end unless published."""
+    """A fresh folder beside ``final``, which may be "."; gone at the end unless published."""
+    final = final.resolve()
     final.parent.mkdir(parents=True, exist_ok=True)
     with _new_name() as name, _at_work_in(final.parent):
         staged = final.with_name(name)
@@ -185,6 +186,7 @@ def publish_folder(staged: Path, final: Path) -> None:
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
     """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
+    final = final.resolve()
     with temporary_folder(final) as staged:
         yield staged
         publish_folder(staged, final)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,11 @@ from usdbrdf.untrusted.bounds import read_in_child
 
 # Containers that hold their own frames; others are lists of further files and addresses.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,mxf"
+# What the machine lacks, of what FFmpeg reports; the rest is the file's.
+_OF_THE_MACHINE = (errno.ENOMEM, errno.EIO, errno.ESTALE, errno.ENOSPC)
+# ITU-T H.273: primaries that are BT.709's or nearly so, curves of high dynamic range (PQ and HLG),
+# and what says nothing of the matrix, which is BT.709's then from so many rows on, as players do.
+_PRIMARIES, _HIGH_RANGE, _UNSAID, _LARGE_ROWS = (0, 1, 2, 5, 6, 7), (16, 18), (2, 3), 720
 # Frames a video may have: two hours of 60 a second.
 MOST_FRAMES = 432_000
 
@@ -62,6 +69,7 @@ def read_here(path: Path, numbers: Sequence[int], folder: str) -> VideoFrames:
                 raise _unreadable(path, "no stream of pictures")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
+            _refuse_wide_pixels(path, stream.sample_aspect_ratio)
             for number, frame in enumerate(container.decode(stream)):
                 if number > min(max(wanted, default=0), MOST_FRAMES):
                     break
@@ -76,17 +84,43 @@ def read_here(path: Path, numbers: Sequence[int], folder: str) -> VideoFrames:
                     write_preview_png(place_of(Path(folder), number), picture)
                     found.append(number)
     except (av.FFmpegError, ValueError, EOFError) as error:
+        if getattr(error, "errno", None) in _OF_THE_MACHINE:
+            raise
         raise _unreadable(path, " ".join(str(error).split())[:160]) from error
     return VideoFrames(numbers=tuple(found), resolution=size)
 
 
 def _upright(path: Path, frame: Any) -> Byte:
-    """(H, W, 3) as players show it."""
+    """(H, W, 3) as players show it, of BT.709's primaries; InputRefused for others."""
+    from av.video.reformatter import Colorspace
+
+    _refuse_other_colours(path, frame)
     if frame.width * frame.height > MAX_PIXELS:
         raise _unreadable(path, f"frames of {frame.width} x {frame.height} pixels")
     quarters, rest = divmod(round(frame.rotation), 90)
-    picture = frame.to_ndarray(format="rgb24")
+    unsaid = int(frame.colorspace) in _UNSAID
+    usual = Colorspace.ITU709 if frame.height >= _LARGE_ROWS else Colorspace.ITU601
+    matrix = {"src_colorspace": usual} if unsaid else {}
+    picture = frame.to_ndarray(format="rgb24", **matrix)
     return np.ascontiguousarray(np.rot90(picture, quarters if rest == 0 else 0), np.uint8)
+
+
+def _refuse_wide_pixels(path: Path, ratio: Fraction | None) -> None:
+    if ratio and ratio != 1:
+        raise InputRefused(
+            f"{path}: its pixels are not square ({ratio} as wide as high). Export it with square "
+            "ones. [video.pixels]"
+        )
+
+
+def _refuse_other_colours(path: Path, frame: Any) -> None:
+    curve = int(frame.color_trc)
+    if int(frame.color_primaries) not in _PRIMARIES or curve in _HIGH_RANGE:
+        what = {16: "PQ", 18: "HLG"}.get(curve, f"primaries {int(frame.color_primaries)} of H.273")
+        raise InputRefused(
+            f"{path}: its colours are not those of BT.709 ({what}). Record without HDR, or convert "
+            "it to BT.709. [video.colour]"
+        )
 
 
 def _unreadable(path: Path, why: str) -> InputRefused:

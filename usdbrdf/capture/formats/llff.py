@@ -14,7 +14,6 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
 from usdbrdf.capture.formats.named_pictures import (
-    mask_beside,
     mesh_beside,
     pictures_of,
     refuse_without_pictures,
@@ -69,7 +68,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 world_from_camera=rigid_pose(np.stack([right, -down, back], axis=1), centre),
                 intrinsics=(focal, focal, width / 2, height / 2),
                 resolution=(int(width), int(height)),
-                mask_path=mask_beside(folder, image.name, options),
+                mask_path=pictures.mask_of(image, folder, options),
             )
         )
     mesh = mesh_beside(

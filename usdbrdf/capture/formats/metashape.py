@@ -19,7 +19,6 @@ from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
-    mask_beside,
     mesh_beside,
     pictures_of,
     refuse_without_pictures,
@@ -153,7 +152,7 @@ def frame_records(
                 intrinsics=sensor.intrinsics,
                 resolution=sensor.resolution,
                 lens=sensor.lens,
-                mask_path=mask_beside(source.parent, image.name, options),
+                mask_path=pictures.mask_of(image, source.parent, options),
             )
         )
     return sorted(records, key=lambda record: record.image_path)

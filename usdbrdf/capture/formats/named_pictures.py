@@ -4,6 +4,7 @@ beside them, in one frame and unit."""
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -77,6 +78,16 @@ class Pictures:
                 return found[0] if len(found) == 1 else None
         return None
 
+    def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
+        """``mask_beside`` of a picture by its path below the pictures' folder, else by its name
+        alone, where no other folder has a picture of this name."""
+        relative = picture.relative_to(self.folder).as_posix()
+        found = mask_beside(folder, relative, options)
+        if found is not None or relative == picture.name:
+            return found
+        alike = {path.parent for path, _ in self._by_stem[picture.stem]}
+        return mask_beside(folder, picture.name, options) if len(alike) == 1 else None
+
     @cached_property
     def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
         by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
@@ -132,10 +143,11 @@ def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None
     stem = str(PurePosixPath(name).with_suffix(""))
     for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
         for suffix in (".png", ".jpg"):
-            if (folder / "masks" / f"{usual}{suffix}").is_file():
+            # Of which nothing can be asked, as of too long a name, is not there.
+            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
                 return path_in_capture(folder, f"masks/{usual}{suffix}", options)
     same = folder / "masks" / name
-    return path_in_capture(folder, f"masks/{name}", options) if same.is_file() else None
+    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
 
 
 def drop_without_picture(label: str, findings: Findings) -> None:

@@ -23,7 +23,6 @@ from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
-    mask_beside,
     mesh_beside,
     pictures_of,
     refuse_without_pictures,
@@ -90,7 +89,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     else:
         records = list(records_of_sidecars(_sidecars(path), pictures, findings))
     records = [
-        replace(r, mask_path=mask_beside(folder, r.image_path.name, options)) for r in records
+        replace(r, mask_path=pictures.mask_of(r.image_path, folder, options)) for r in records
     ]
     records.sort(key=lambda record: record.image_path)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
