@@ -244,6 +244,7 @@ ENGINEERING: dict[str, str] = {
     "_MORE": "steps of a search",
     "_MIRRORED": "steps of a search",
     "_MOSTLY": "from here on a warning is printed",
+    "_MOSTLY_CLEAR": "half: whether most are",
     "_MOSTLY_OPEN": "from here on a warning is printed",
     "_MOST_ACROSS": "time",
     "_MOST_EFFECTS": "memory",

@@ -44,6 +44,8 @@ _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
 _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
+# Where more of the sunlit texels are clear of shadows than this, all of them tell more.
+_MOSTLY_CLEAR = 0.5
 # Lower and upper elevation of a band of patches, degrees, and their number.
 _BANDS = (
     (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
@@ -249,7 +251,8 @@ def _under_what_was_seen(
 
 def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> Asked | None:
     """Of the texels asked those around which all see as much of the sun, as many of each segment in
-    its light as in shadow where there are; None if hardly one is in the sun.
+    its light as in shadow where there are; None if hardly one is in the sun, or most of those are
+    such already.
 
     Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
     shadows passes for light from all around the sun."""
@@ -257,6 +260,8 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
     for down, right in product((-_AROUND, 0, _AROUND), repeat=2):
         beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
         clear &= np.abs(sunlit(surface, beside, sun, seed) - share) < _AS_SUNLIT
+    if clear[share > 0].mean() > _MOSTLY_CLEAR:
+        return None
     every = np.arange(int(asked.segment.max()) + 1)
     halves = [
         first_of_segments(np.flatnonzero(clear & part), asked.segment, every, _PER_SEGMENT // 2)
