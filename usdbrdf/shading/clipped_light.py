@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -30,9 +31,10 @@ from usdbrdf.shading.clipped_emitters import (
 )
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
-from usdbrdf.transport.lights import lights_from_radiance
+from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlight
+from usdbrdf.transport.surface_texture import SurfaceTexture
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
 # More lamps are not told apart; the faintest keep their bounds.
@@ -208,16 +210,32 @@ def first_of_segments(rank: Long, segment: Int, numbers: Long, most: int) -> Lon
     return rank[place < most]
 
 
+class Shining(NamedTuple):
+    """The radiance of all surfaces as rays meet it, and where that is bright."""
+
+    texture: SurfaceTexture
+    lights: Lights
+
+    @classmethod
+    def of(cls, surface: TexturedScene, light: Float) -> Shining:
+        """light (T, 3), W/(m^2 sr)."""
+        lights = lights_from_radiance(surface.scene, surface.texels, light)
+        return cls(surface.texture(light), lights)
+
+
 def irradiance_of_texels(
-    surface: TexturedScene, light: Float, outside: Environment, index: Long, seed: int
+    surface: TexturedScene,
+    shining: Shining,
+    outside: Environment,
+    index: Long,
+    seed: int,
+    sampling: Sampling = _SAMPLING,
 ) -> Float:
-    """S (N, 3), W/m^2, of a few texels with the radiance ``light`` (T, 3) and what is outside."""
+    """S (N, 3), W/m^2, of a few texels in the light of the surfaces and what is outside."""
     texels = surface.texels
     return sunlight(surface, index, outside.sun, seed) + irradiance_at(
-        surface.rays, surface.texture(light),
-        lights_from_radiance(surface.scene, texels, light), outside,
-        texels.position[index], texels.normal[index], independent_tiles(len(index)),
-        replace(_SAMPLING, seed=seed), surface.diagonal_m,
+        surface.rays, *shining, outside, texels.position[index], texels.normal[index],
+        independent_tiles(len(index)), replace(sampling, seed=seed), surface.diagonal_m,
     ).mean  # fmt: skip
 
 
@@ -235,14 +253,16 @@ def _evidence(
     lamps = []
     for k in range(len(groups)):
         alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
-        light = np.repeat(alone, 3, axis=1).astype(np.float32)
+        light = Shining.of(surface, np.repeat(alone, 3, axis=1).astype(np.float32))
         lamps.append(
             irradiance_of_texels(surface, light, black_environment(), chosen, seed + k + 1)
         )
     dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
     return Evidence(
         radiance=lit[chosen],
-        irradiance=irradiance_of_texels(surface, dark, environment, chosen, seed),
+        irradiance=irradiance_of_texels(
+            surface, Shining.of(surface, dark), environment, chosen, seed
+        ),
         lamp_irradiance=np.stack(lamps),
         position=texels.position[chosen],
         segment=segment,

@@ -21,7 +21,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.clipped_light import first_of_segments, irradiance_of_texels
+from usdbrdf.shading.clipped_light import Shining, first_of_segments, irradiance_of_texels
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -39,7 +39,7 @@ from usdbrdf.transport.warps import cosine_rays
 
 # Texels that are asked, at most and at least on one side of one object (a segment), segments, and
 # the rays by which each of them meets the sky: at first, and where it does.
-_PER_SEGMENT, _LEAST_OF_SEGMENT, _SEGMENTS = 240, 30, 80
+_PER_SEGMENT, LEAST_OF_SEGMENT, _SEGMENTS = 240, 30, 80
 _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
@@ -172,7 +172,7 @@ def light_from_outside(
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     error = jackknife(*with_sun, found)
     # What no texel sees keeps what was thought of it before, and errs by nothing.
-    sees = np.count_nonzero(with_sun[1].share[-1]) >= _LEAST_OF_SEGMENT
+    sees = np.count_nonzero(with_sun[1].share[-1]) >= LEAST_OF_SEGMENT
     shines = sees and error[-1].max() < _MOST_SUN_ERROR and strength > _LEAST_SUN
     if shines:
         many = asked_texels(surface.texels, lit, coverage, seed, _MANY_PER_SEGMENT)
@@ -216,7 +216,7 @@ def asked_texels(
     measured = coverage.measured[usable]
     area = np.bincount(segment, texels.area[usable] * measured)
     enough = np.bincount(segment, measured) >= np.maximum(
-        _LEAST_OF_SEGMENT, np.bincount(segment) / 2
+        LEAST_OF_SEGMENT, np.bincount(segment) / 2
     )
     largest = np.argsort(-area * enough, kind="stable")[:_SEGMENTS]
     largest = largest[enough[largest]]
@@ -224,7 +224,7 @@ def asked_texels(
         return None
     rank = np.random.default_rng(seed ^ _SEED).permutation(len(usable))
     kept = first_of_segments(rank, segment, largest, most)
-    many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= _LEAST_OF_SEGMENT / 2
+    many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= LEAST_OF_SEGMENT / 2
     kept = kept[many]
     if not len(kept):
         return None
@@ -235,6 +235,7 @@ def asked_texels(
         reflected=np.pi * lit[usable[kept]].astype(np.float64),
         clipped=~measured[kept],
         irradiance=np.zeros((len(kept), 3)),
+        mirrored=np.zeros((len(kept), 3)),
     )
 
 
@@ -244,7 +245,8 @@ def _under_what_was_seen(
     """The texels asked with S, W/m^2, of all that frames measured."""
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
-    irradiance = irradiance_of_texels(surface, lit, environment, asked.texel, seed)
+    shining = Shining.of(surface, lit)
+    irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, seed)
     least = _DARK * np.median(asked.reflected)
     return asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
 
@@ -267,7 +269,7 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
         first_of_segments(np.flatnonzero(clear & part), asked.segment, every, _PER_SEGMENT // 2)
         for part in (share > 0, share <= 0)
     ]
-    if len(halves[0]) < _LEAST_OF_SEGMENT:
+    if len(halves[0]) < LEAST_OF_SEGMENT:
         return None
     chosen = asked.of(np.sort(np.concatenate(halves)))
     segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
@@ -354,7 +356,7 @@ def _sky(
     below = centre[:, 2 if z_up else 1] < 0
     apart = np.where(below[near[:, 0]] == below[near[:, 1]], _ALIKE, _ALIKE_OVER_HORIZON)
     deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
-    return Sources(share[used], mean, deviation, bound, near, apart, np.zeros(len(used), np.bool_))
+    return Sources(share[used], mean, deviation, bound, near, apart)
 
 
 def _with_sun(
@@ -373,7 +375,6 @@ def _with_sun(
         bound=np.append(sky.bound, False),
         pairs=sky.pairs,
         apart=sky.apart,
-        compact=np.append(sky.compact, True),
     )
     chosen = asked.of(kept)
     segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)

@@ -1,12 +1,12 @@
 """How strong the sources of light outside are: least squares on the logarithms of what texels
 reflect, pi L_d = albedo S, where S is what was seen and each source's share times its strength.
-L_d holds the specular light that all frames see as well: of E, the light from everywhere around, a
-few per cent however dark the surface is, and none of a lamp's or the sun's. So
+L_d holds the specular light that all frames see as well: where it is told what a usual dielectric
+would mirror to them, M,
 
-    pi L_d = albedo S + a E
+    pi L_d = albedo S + m M
 
-with a of each segment about that of the scene, ``mirrored_by_scene``, without which dark surfaces
-make compact lights too dim, and most so in the colours that they reflect least.
+with m of each segment about that of the scene, ``gloss_of_scene``, without which dark surfaces make
+lamps too dim, and most so in the colours that they reflect least.
 
 On one segment (a facing of one object) the albedo varies about one value. Outliers weigh as under
 Student's t, and each segment by how much its texels scatter. What clips is a lower bound. Before
@@ -26,8 +26,8 @@ from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
 
 class Asked(NamedTuple):
     """N texels that are asked: their numbers, segments counted from 0 and objects, what they
-    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), and S
-    of what was seen."""
+    reflect (pi L_d, W/m^2; where ``clipped`` the largest channel reflects no less), (N, 3), S of
+    what was seen, and pi times what a usual dielectric would mirror to the frames, (N, 3)."""
 
     texel: Long
     segment: Int
@@ -35,6 +35,7 @@ class Asked(NamedTuple):
     reflected: Double
     clipped: Bool
     irradiance: Double
+    mirrored: Double
 
     def of(self, which: Array) -> Asked:
         return Asked._make(values[which] for values in self)
@@ -44,8 +45,8 @@ class Sources(NamedTuple):
     """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
     the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
     mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), and by how much
-    these are apart, (P,); whether a source is compact, so that most frames do not see it mirrored,
-    (K,); and what of all other light segments mirror to all frames: mean and standard deviation."""
+    these are apart, (P,); and how much of what usual dielectrics would mirror segments do: mean and
+    standard deviation."""
 
     share: Double
     mean: Double
@@ -53,8 +54,7 @@ class Sources(NamedTuple):
     bound: Bool
     pairs: Long
     apart: Double
-    compact: Bool
-    mirrored: tuple[float, float] = (0.0, 0.0)
+    gloss: tuple[float, float] = (0.0, 0.0)
 
     def irradiance(self, log_radiance: Double) -> Double:
         """(N, 3) W/m^2 of all of them."""
@@ -64,10 +64,10 @@ class Sources(NamedTuple):
 _FREEDOM = calibration.number("outside.student_freedom")
 _INDEPENDENT = calibration.number("outside.independent")
 _USUAL_ALBEDO = calibration.pair("outside.albedo")
-# Shares of the light from around that may be mirrored to all frames, up to what a dielectric does.
-_MIRRORED = (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)
-# Standard deviation of a share that is given.
-_GIVEN = 5e-4
+# How glossy a scene may be, and the standard deviation of its segments about that.
+_GLOSS, _OF_SEGMENTS = (0.0, 0.25, 0.5, 0.75, 1.0), 0.5
+# Standard deviation of a gloss that is given.
+_GIVEN = 0.01
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
 _ITERATIONS = 40
@@ -76,12 +76,12 @@ _LEAST_NOISE = calibration.number("outside.least_noise")
 
 class Solution(NamedTuple):
     """log_radiance (K, 3) of the sources, log_albedo (M, 3) of the segments, the logarithm of the
-    mean albedo, (3,), and what of the light from around segments mirror to all frames, (M, 3)."""
+    mean albedo, (3,), and the gloss of the segments, (M, 3)."""
 
     log_radiance: Double
     log_albedo: Double
     mean: Double
-    mirrored: Double
+    gloss: Double
 
 
 def solved(
@@ -93,8 +93,8 @@ def solved(
         rest = np.log(asked.reflected) - light
         num = int(asked.segment.max()) + 1
         albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
-        mirrored = np.full((num, 3), sources.mirrored[0])
-        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]), mirrored)
+        gloss = np.full((num, 3), sources.gloss[0])
+        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]), gloss)
     found = start
     # Which channel it is that clips, what does not clip tells first.
     for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
@@ -115,66 +115,69 @@ def _solved_channel(
     """One channel's part of ``solved``: Gauss-Newton steps on the weighted squares of the texels
     that are ``counted`` (N,)."""
     known, observed = asked.irradiance[:, channel], np.log(asked.reflected[:, channel])
-    g, albedo, mirrored = (
-        part[:, channel].copy() for part in (start.log_radiance, start.log_albedo, start.mirrored)
+    mirrored = asked.mirrored[:, channel]
+    g, albedo, gloss = (
+        part[:, channel].copy() for part in (start.log_radiance, start.log_albedo, start.gloss)
     )
     mean = float(start.mean[channel])
     num_sources, num_segments = len(g), len(albedo)
     size = np.bincount(asked.segment, minlength=num_segments)
     effective = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment]
-    # A texel depends on all sources, and on the albedo and the mirrored share of one segment.
+    # A texel depends on all sources, and on the albedo and the gloss of one segment.
     of_albedo = num_sources + np.arange(num_segments)
-    of_mirrored = of_albedo + num_segments
+    of_gloss = of_albedo + num_segments
 
     def by_segment(values: Double) -> Double:
         return np.bincount(asked.segment, values, num_segments).astype(np.float64)
 
     for _ in range(iterations):
         brought = np.exp(g)[:, None] * sources.share
-        around = known + brought[~sources.compact].sum(axis=0)
         scattered = known + brought.sum(axis=0)
         over_albedo = np.exp(-albedo)[asked.segment]
-        share = mirrored[asked.segment] * over_albedo
-        total = scattered + share * around
+        total = scattered + gloss[asked.segment] * over_albedo * mirrored
         residual = observed - np.log(total) - albedo[asked.segment]
         # What clips reflects at least as much: it says something where the model says less.
         counts = counted & (~asked.clipped | (residual > 0))
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
-        by_source = brought * np.where(sources.compact[:, None], 1, 1 + share) / total
-        by_albedo, by_mirrored = scattered / total, over_albedo * around / total
+        by_source = brought / total
+        by_albedo, by_gloss = scattered / total, over_albedo * mirrored / total
         rows = num_sources + 2 * num_segments + 1
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
         curvature[:num_sources, :num_sources] = by_source @ (by_source * weight).T
         gradient[:num_sources] = by_source @ (weight * residual)
-        for place, part in ((of_albedo, by_albedo), (of_mirrored, by_mirrored)):
+        for place, part in ((of_albedo, by_albedo), (of_gloss, by_gloss)):
             for source, other in enumerate(by_source):
                 both = by_segment(part * other * weight)
                 curvature[source, place] = curvature[place, source] = both
             curvature[place, place] = by_segment(part**2 * weight)
             gradient[place] = by_segment(part * weight * residual)
-        both = by_segment(by_albedo * by_mirrored * weight)
-        curvature[of_albedo, of_mirrored] = curvature[of_mirrored, of_albedo] = both
-        _add_priors(curvature, gradient, sources, channel, (g, albedo, mirrored, mean))
+        both = by_segment(by_albedo * by_gloss * weight)
+        curvature[of_albedo, of_gloss] = curvature[of_gloss, of_albedo] = both
+        _add_priors(curvature, gradient, sources, channel, (g, albedo, gloss, mean))
         damped = curvature + 1e-3 * np.diag(np.diag(curvature))
         step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
         g += step[:num_sources]
         albedo += step[of_albedo]
-        mirrored = np.maximum(mirrored + step[of_mirrored], 0)
+        gloss = np.maximum(gloss + step[of_gloss], 0)
         mean += float(step[-1])
         if np.abs(step).max() < 1e-4:
             break
-    return g, albedo, np.array(mean), mirrored
+    return g, albedo, np.array(mean), gloss
 
 
 def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
     """(M,) how much the residuals (N,) of each segment scatter: plain walls tell more than what is
     patterned."""
-    off = np.abs(residual)
-    usual = float(np.median(off[~asked.clipped]))
-    own = [off[(asked.segment == k) & ~asked.clipped] for k in range(count)]
-    middle = np.array([np.median(some) if len(some) else usual for some in own])
+    off, segment = np.abs(residual[~asked.clipped]), asked.segment[~asked.clipped]
+    middle = np.full(count, np.median(off))
+    # One sort is much faster than a median of each.
+    ordered, size = off[np.lexsort((off, segment))], np.bincount(segment, minlength=count)
+    has = size > 0
+    first = (np.cumsum(size) - size)[has]
+    lower, upper = first + (size[has] - 1) // 2, first + size[has] // 2
+    middle[has] = (ordered[lower] + ordered[upper]) / 2
     return np.maximum(_LEAST_NOISE, 1.4826 * middle)
 
 
@@ -185,8 +188,8 @@ def _add_priors(
     channel: int,
     at: tuple[Double, Double, Double, float],
 ) -> None:
-    """What is known of sources, albedos and mirrored shares before the evidence."""
-    g, albedo, mirrored, mean = at
+    """What is known of sources, albedos and gloss before the evidence."""
+    g, albedo, gloss, mean = at
     k, last = len(g), len(gradient) - 1
     index = np.arange(k)
     off = sources.mean[:, channel] - g
@@ -202,9 +205,9 @@ def _add_priors(
             gradient[one] -= pull * (g[one] - g[other])
     segment = np.arange(k, k + len(albedo))
     glossy = segment + len(albedo)
-    usual, spread = sources.mirrored[0], max(sources.mirrored[1], _GIVEN)
+    usual, spread = sources.gloss[0], max(sources.gloss[1], _GIVEN)
     curvature[glossy, glossy] += spread**-2
-    gradient[glossy] += (usual - mirrored) / spread**2
+    gradient[glossy] += (usual - gloss) / spread**2
     off = albedo - mean
     precision_of = _OF_SEGMENT**-2
     curvature[segment, segment] += precision_of
@@ -219,30 +222,44 @@ def _add_priors(
     gradient[segment] -= over * _AS_WHITE**-2
 
 
-def mirrored_by_scene(asked: Asked, sources: Sources) -> float:
-    """What of the light from around all segments mirror to all frames, if it is the same for all:
-    the likeliest under Student's t."""
+class Glossy(NamedTuple):
+    """What light gains if all were usual dielectrics: irradiance (N, 3), W/m^2, by way of their
+    lobes, of what was seen, and share (K, N) of each source."""
+
+    irradiance: Double
+    share: Double
+
+
+def gloss_of_scene(asked: Asked, sources: Sources, glossy: Glossy) -> tuple[Asked, Sources]:
+    """The same in a scene as glossy as it is likeliest to be, under Student's t, with all segments
+    about that; and with the light that ``glossy`` surfaces send elsewhere."""
     number, plain = int(asked.segment.max()) + 1, ~asked.clipped
     size = np.bincount(asked.segment[plain], minlength=number)
     counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
 
-    def cost(share: float) -> float:
-        found = solved(asked, sources._replace(mirrored=(share, 0.0)))
-        of_sources = sources.share[:, :, None] * np.exp(found.log_radiance)[:, None]
-        around = asked.irradiance + of_sources[~sources.compact].sum(axis=0)
-        light = asked.irradiance + of_sources.sum(axis=0)
-        explained = np.exp(found.log_albedo)[asked.segment] * light
-        explained += found.mirrored[asked.segment] * around
-        residual = np.log(asked.reflected / explained)
+    def with_gloss(gloss: float) -> tuple[Asked, Sources]:
+        return (
+            asked._replace(irradiance=asked.irradiance + gloss * glossy.irradiance),
+            sources._replace(
+                share=sources.share + gloss * glossy.share, gloss=(gloss, _OF_SEGMENTS)
+            ),
+        )
+
+    def cost(gloss: float) -> float:
+        lit, by = with_gloss(gloss)
+        found = solved(lit, by)
+        explained = np.exp(found.log_albedo)[asked.segment]
+        explained *= lit.irradiance + by.irradiance(found.log_radiance)
+        explained += found.gloss[asked.segment] * asked.mirrored
         total = 0.0
-        for channel in residual.T:
+        for channel in np.log(asked.reflected / explained).T:
             noise = _noise_of_segments(asked, channel, number)[asked.segment]
             square = (channel / noise)[plain] ** 2
             each = np.log(noise[plain]) + 0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
             total += float(counts @ each)
         return total
 
-    return min(_MIRRORED, key=cost)
+    return with_gloss(min(_GLOSS, key=cost))
 
 
 _MOSTLY_INFERRED = calibration.number("outside.level_unknown")
@@ -293,9 +310,7 @@ def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
         some = asked.of(kept)
         numbers, segment = np.unique(some.segment, return_inverse=True)
         some = some._replace(segment=segment.astype(np.int32))
-        start = found._replace(
-            log_albedo=found.log_albedo[numbers], mirrored=found.mirrored[numbers]
-        )
+        start = found._replace(log_albedo=found.log_albedo[numbers], gloss=found.gloss[numbers])
         part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
         moved += (part.log_radiance - found.log_radiance) ** 2
     return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))

@@ -18,6 +18,7 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map
@@ -316,6 +317,7 @@ def shade_surface(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
+    frames: Frames,
     outside: Outside | None,
     sampling: Sampling,
     lightmap_filter: str,
@@ -324,6 +326,7 @@ def shade_surface(
     """Trace S with the light ``lit`` (T, 3), L_d as texturing left it; divide; find the emitters.
 
     run      keeps what is done for a run that goes on
+    frames   which views L_d is from
     outside  the light from outside; None for none
     said     of objects, by number, whether they are lamps, where a person says so
     """
@@ -333,7 +336,7 @@ def shade_surface(
     unseen = (
         UnseenLamps.none()
         if outside
-        else estimate_unseen_lamps(run, surface, lit, coverage, sampling.seed, dark)
+        else estimate_unseen_lamps(run, surface, lit, coverage, frames, sampling.seed, dark)
     )
     lit = unseen.with_light(surface.texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed, said)

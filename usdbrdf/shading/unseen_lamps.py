@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.clipped_light import irradiance_of_texels
-from usdbrdf.shading.outside import asked_texels, looked_around
-from usdbrdf.shading.outside_light import Asked, Sources, jackknife, mirrored_by_scene, solved
+from usdbrdf.options import Sampling
+from usdbrdf.shading.clipped_light import Shining, irradiance_of_texels
+from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
+from usdbrdf.shading.outside import LEAST_OF_SEGMENT, asked_texels, looked_around
+from usdbrdf.shading.outside_light import Asked, Glossy, Sources, gloss_of_scene, jackknife, solved
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -34,6 +38,12 @@ _MOST_ERROR = calibration.number("unseen.most_error")
 # Rays from each texel that is asked, objects that may shine, and those whose light is traced.
 _RAYS, _CANDIDATES, _TRACED = 256, 32, 8
 _SEED = 0x1A3
+# How closely what a lamp brings is known, and how roughly it tells even light from shadows' edges.
+_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
+_ROUGHLY = Sampling(standard_error=0, max_rays=32)
+# Texels from one to those beside it; by what share of a lamp's light and of all other light these
+# may differ; and the share of texels in even light that is enough.
+_AROUND, _UNEVEN, _OF_OTHER_LIGHT, _LEAST_EVEN = 4, 0.1, 0.02, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,13 +83,14 @@ def estimate_unseen_lamps(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
+    frames: Frames,
     seed: int,
     dark: Sequence[int] = (),
 ) -> UnseenLamps:
     """Of a closed scan with the radiance ``lit`` (T, 3); the objects ``dark`` are none."""
 
     def compute() -> dict[str, Array]:
-        return dict(vars(lamps_that_explain(surface, lit, coverage, seed, dark)))
+        return dict(vars(lamps_that_explain(surface, lit, coverage, frames, seed, dark)))
 
     found = UnseenLamps(**run.checkpoint("unseen", compute))
     if len(found.object):
@@ -88,7 +99,12 @@ def estimate_unseen_lamps(
 
 
 def lamps_that_explain(
-    surface: TexturedScene, lit: Float, coverage: CoverageMap, seed: int, dark: Sequence[int] = ()
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    frames: Frames,
+    seed: int,
+    dark: Sequence[int] = (),
 ) -> UnseenLamps:
     """The unseen objects that must shine for plain surfaces to be plain, without those that are
     known to be ``dark``."""
@@ -113,18 +129,15 @@ def lamps_that_explain(
         return UnseenLamps.none()
     # Few rays meet a lamp, and errors of what it brings draw its strength to nothing: they only
     # say which of the objects may be one.
-    found, _, near, part = _strengths(
-        surface, lit, asked, share[candidates], candidates, seed, closely=False
-    )
+    asked = _beside_candidates(surface, lit, asked, candidates, seed)
+    found, _, near, part = _strengths(asked, _unknown(asked, share[candidates]))
     likely = np.where(np.pi * found.mean(axis=1) > near, part, 0)
     likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
-    candidates = candidates[likeliest[likely[likeliest] > _LEAST_PART / 4]]
-    traced = {int(k): _brought(surface, asked, int(k), seed) for k in candidates}
+    likeliest = likeliest[likely[likeliest] > _LEAST_PART / 4]
+    candidates, strength = candidates[likeliest], found[likeliest].mean(axis=1)
     while len(candidates):
-        shares = np.stack([traced[int(k)] for k in candidates])
-        found, error, near, part = _strengths(
-            surface, lit, asked, shares, candidates, seed, closely=True
-        )
+        even, sources = _looked_at_closely(surface, lit, frames, asked, candidates, strength, seed)
+        found, error, near, part = _strengths(even, sources)
         # Clearly brighter than what only reflects: even with as much light as the texels that see
         # it receive.
         brightness = np.log(np.pi * found.mean(axis=1) / near)
@@ -138,7 +151,7 @@ def lamps_that_explain(
                 radiance=found[order].astype(np.float32),
                 error=error[order].astype(np.float32),
             )
-        candidates = candidates[lamp]
+        candidates, strength = candidates[lamp], found[lamp].mean(axis=1)
     return UnseenLamps.none()
 
 
@@ -155,46 +168,107 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tu
     return brought, float((face < 0).mean())
 
 
-def _brought(surface: TexturedScene, asked: Asked, index: int, seed: int) -> Double:
-    """(N,) W/m^2: what an object of radiance 1 brings, by rays that are sent to it."""
+def _beside_candidates(
+    surface: TexturedScene, lit: Float, asked: Asked, candidates: Long, seed: int
+) -> Asked:
+    """The texels asked with S of all but the candidates."""
+    rest = Shining.of(surface, _without(surface, lit, candidates))
+    known = irradiance_of_texels(surface, rest, black_environment(), asked.texel, seed)
+    floor = 1e-4 * np.median(asked.reflected)
+    return asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
+
+
+def _without(surface: TexturedScene, lit: Float, objects: Long) -> Float:
+    of_objects = np.isin(surface.texels.object_index(), objects)
+    return np.where(of_objects[:, None], np.float32(0), lit)
+
+
+def _looked_at_closely(
+    surface: TexturedScene,
+    lit: Float,
+    frames: Frames,
+    asked: Asked,
+    candidates: Long,
+    strength: Double,
+    seed: int,
+) -> tuple[Asked, Sources]:
+    """What the candidates bring, by rays that are sent to them, to texels that lie evenly in their
+    light, and what surfaces mirror of it and of all other light. strength (K,): the candidates'
+    radiance so far."""
+    asked = _beside_candidates(surface, lit, asked, candidates, seed)
+    alone = [_alone(surface, int(k)) for k in candidates]
+    lights = [Shining.of(surface, light) for light in alone]
+    even = _evenly_lit(surface, asked, lights, strength, seed)
+    asked = asked.of(even)
+    asked = asked._replace(
+        segment=np.unique(asked.segment, return_inverse=True)[1].astype(np.int32)
+    )
+    texel, seed = asked.texel, seed ^ _SEED
+    share = [_brought(surface, light, texel, seed + i) for i, light in enumerate(lights)]
+    rest = _without(surface, lit, candidates)
+    mirrored = np.pi * mirrored_to_frames(surface, rest, frames, texel, seed)
+    sent_on = [
+        mirrored_irradiance(surface, light, texel, seed + i)[:, 0] for i, light in enumerate(alone)
+    ]
+    glossy = Glossy(mirrored_irradiance(surface, rest, texel, seed - 1), np.stack(sent_on))
+    asked = asked._replace(mirrored=mirrored)
+    return gloss_of_scene(asked, _unknown(asked, np.stack(share)), glossy)
+
+
+def _alone(surface: TexturedScene, index: int) -> Float:
+    """(T, 3): an object of radiance 1 in the dark."""
     alone = surface.texels.object_index() == index
-    light = np.repeat(alone[:, None].astype(np.float32), 3, axis=1)
-    found = irradiance_of_texels(surface, light, black_environment(), asked.texel, seed + index)
+    return np.repeat(alone[:, None].astype(np.float32), 3, axis=1)
+
+
+def _brought(
+    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = _SAMPLING
+) -> Double:
+    """(N,) W/m^2: what grey ``light`` brings, by rays that are sent to it."""
+    found = irradiance_of_texels(surface, light, black_environment(), texel, seed, sampling)
     return np.asarray(found[:, 0], np.float64)
 
 
-def _strengths(
-    surface: TexturedScene,
-    lit: Float,
-    asked: Asked,
-    share: Double,
-    candidates: Long,
-    seed: int,
-    *,
-    closely: bool,
-) -> tuple[Double, Double, Double, Double]:
-    """Radiance (K, 3) of the candidates, its relative error (K,), S (K,) of the texels that they
-    light, each as much as it does, and what part of all light is theirs, (K,); ``closely``: with
-    what surfaces mirror of the other light."""
-    of_candidates = np.isin(surface.texels.object_index(), candidates)
-    dark = np.where(of_candidates[:, None], np.float32(0), lit)
-    known = irradiance_of_texels(surface, dark, black_environment(), asked.texel, seed)
-    floor = 1e-4 * np.median(asked.reflected)
-    asked = asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
-    usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
-    count = len(candidates)
-    sources = Sources(
+def _evenly_lit(
+    surface: TexturedScene, asked: Asked, lights: Sequence[Shining], strength: Double, seed: int
+) -> Bool:
+    """Which of the texels asked, (N,), lie among others that are as much lit: a pixel beside a
+    shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim. All
+    are, if too few were left of a segment or of all."""
+    total, most = np.zeros(len(asked.texel)), np.zeros(len(asked.texel))
+    for light, radiance in zip(lights, strength, strict=True):
+        # The same rays from each, so that their noise is the same.
+        own = _brought(surface, light, asked.texel, seed, _ROUGHLY)
+        total += radiance * own
+        uneven = np.zeros(len(own))
+        for right, down in product((-_AROUND, 0, _AROUND), repeat=2):
+            if right or down:
+                beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
+                other = _brought(surface, light, beside, seed, _ROUGHLY)
+                uneven = np.maximum(uneven, np.abs(other - own))
+        most += radiance * uneven
+    even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)
+    count = np.bincount(asked.segment[even], minlength=int(asked.segment.max()) + 1)
+    even &= count[asked.segment] >= LEAST_OF_SEGMENT // 2
+    return even if even.mean() > _LEAST_EVEN else np.ones_like(even)
+
+
+def _unknown(asked: Asked, share: Double) -> Sources:
+    """Sources that bring ``share`` (K, N), of which nothing else is known."""
+    usual, count = np.log(np.median(asked.reflected, axis=0) / np.pi), len(share)
+    return Sources(
         share=share,
         mean=np.tile(usual, (count, 1)),
         deviation=np.full(count, _DEVIATION),
         bound=np.zeros(count, np.bool_),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
-        compact=np.ones(count, np.bool_),
     )
-    if closely:
-        mirrored = mirrored_by_scene(asked, sources)
-        sources = sources._replace(mirrored=(mirrored, mirrored))
+
+
+def _strengths(asked: Asked, sources: Sources) -> tuple[Double, Double, Double, Double]:
+    """Radiance (K, 3) of the sources, its relative error (K,), S (K,) of the texels that they
+    light, each as much as it does, and what part of all light is theirs, (K,)."""
     found = solved(asked, sources)
     error = jackknife(asked, sources, found).max(axis=1)
     light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)

@@ -48,7 +48,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     def work(run: TaskRun) -> dict[str, Any]:
         outside = outside_of(run, maps, options, task.header.up_axis)
         said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
-        given = maps.surface, maps.lit, maps.coverage, outside
+        given = maps.surface, maps.lit, maps.coverage, maps.frames, outside
         shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)

@@ -1,0 +1,99 @@
+"""What surfaces would mirror if all were usual dielectrics: of what kind they are nobody knows
+before lobes are fitted, but next to what dark ones scatter it is much.
+
+Varnish, plastics and glaze let F0 = 0.04 back at their surface, and hardly any is smoother than
+shown here or much rougher; how much of it a scene does is for the light to tell, ``outside_light``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from usdbrdf.model.arrays import Double, Float, Int, Long
+from usdbrdf.model.capture import Frames
+from usdbrdf.texturing.samples import MIN_COSINE
+from usdbrdf.transport.brdf import DIELECTRIC
+from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, TexturedScene, lit_scene
+from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
+from usdbrdf.transport.rays import lift_from_surface
+
+_PHI, _PSI = 0.2, 0.5
+# Frames at most that a texel is looked at from, and rays from each; rays that look around from a
+# texel, and from where each of them ends.
+_VIEWS, _RAYS_OF_VIEW = 8, 32
+_RAYS, _RAYS_OF_LOBE = 64, 4
+# A ray that comes so near to where it is sent, relative to the way, has met nothing.
+_ARRIVED = 1e-3
+
+
+def mirrored_to_frames(
+    surface: TexturedScene, light: Float, frames: Frames, index: Long, seed: int
+) -> Double:
+    """(N, 3) W/(m^2 sr): what texels ``index`` (N,) would mirror of the radiance ``light`` (T, 3)
+    to the frames that see them, the median of some of these; 0 where none does."""
+    lit, texels = _of_dielectrics(surface, light), surface.texels
+    eyes = np.stack([frames.camera(i).eye for i in range(len(frames))])
+    shown = np.full((_VIEWS, len(index), 3), np.nan, np.float32)
+    for row, frame in zip(shown, _some_that_see(surface, frames, index, seed).T, strict=True):
+        which = np.flatnonzero(frame >= 0)
+        own = index[which]
+        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
+        to_camera = (eyes[frame[which]] - position).astype(np.float32)
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
+        phi, psi = (np.full(len(own), value, np.float32) for value in (_PHI, _PSI))
+        row[which] = lobe_radiance(lit, points, phi, psi, _RAYS_OF_VIEW, seed, own)
+        seed += 1
+    seen = np.isfinite(shown[:, :, 0]).any(axis=0)
+    found = np.zeros((len(index), 3))
+    found[seen] = np.nanmedian(shown[:, seen], axis=0)
+    return found
+
+
+def mirrored_irradiance(surface: TexturedScene, light: Float, index: Long, seed: int) -> Double:
+    """(N, 3) W/m^2: what texels ``index`` (N,) would receive of the radiance ``light`` (T, 3) by
+    way of one mirroring surface."""
+    texels, count = surface.texels, len(surface.scene.objects)
+    found = specular_irradiance(
+        _of_dielectrics(surface, light), texels.position[index], texels.normal[index], index,
+        np.full(count, _PHI, np.float32), np.full((count, 3), _PSI, np.float32),
+        rays=_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed,
+    )  # fmt: skip
+    return found.astype(np.float64)
+
+
+def _of_dielectrics(surface: TexturedScene, light: Float) -> LitScene:
+    shines = np.zeros(len(surface.texels), np.bool_)
+    return replace(lit_scene(surface, light, shines, black_environment()), lobe=DIELECTRIC)
+
+
+def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: int) -> Int:
+    """(N, _VIEWS): frames that see texels ``index`` (N,), drawn from all that do; -1 for none."""
+    position, normal = surface.texels.position[index], surface.texels.normal[index]
+    origin = lift_from_surface(position, normal, surface.diagonal_m)
+    # The lowest numbers win; one that does not see the texel has none.
+    rank = np.full((len(frames), len(index)), np.inf, np.float32)
+    random = np.random.default_rng(seed)
+    for i in range(len(frames)):
+        camera = frames.camera(i)
+        way = camera.eye - position
+        far = np.linalg.norm(way, axis=1)
+        way = (way / np.maximum(far, 1e-9)[:, None]).astype(np.float32)
+        before = -way @ camera.world_from_camera[:3, 2] < 0
+        pixel = np.zeros((len(index), 2))
+        pixel[before] = camera.project(position[before])
+        inside = before & ((pixel > 0) & (pixel < (camera.width, camera.height))).all(axis=1)
+        which = np.flatnonzero(inside & ((normal * way).sum(axis=1) > MIN_COSINE))
+        if not len(which):
+            continue
+        hits = surface.rays.closest(origin[which], way[which])
+        free = (hits.face < 0) | (hits.distance > (1 - _ARRIVED) * far[which])
+        rank[i, which[free]] = random.random(int(free.sum()))
+    chosen = np.argsort(rank, axis=0, kind="stable")[:_VIEWS].T
+    sees = np.isfinite(np.take_along_axis(rank.T, chosen, axis=1))
+    found = np.full((len(index), _VIEWS), -1, np.int32)
+    found[:, : chosen.shape[1]] = np.where(sees, chosen, -1)
+    return found
