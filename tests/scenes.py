@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.camera import Camera
+from usdbrdf.model.capture import Frames
 from usdbrdf.transport.rays import RayScene
 
 Float = npt.NDArray[np.float32]
@@ -214,6 +215,20 @@ def poses_down_and_up(down: int, up: int) -> np.ndarray:
     lamp = np.array([2.0, 1.5, 2.4])
     places = [lamp + np.array([np.cos(a), np.sin(a), -1.3 - 0.05 * a]) for a in range(up)]
     return np.concatenate([ring_of_poses(down), [look_at(place, lamp) for place in places]])
+
+
+def frames_at(poses: Sequence[Double], size: int = 64) -> Frames:
+    """Pictures that nobody reads, (size, size) pixels with a right angle across."""
+    count = len(poses)
+    return Frames(
+        image_paths=tuple(Path(f"{i}.exr") for i in range(count)),
+        world_from_camera=np.stack(poses).astype(np.float64),
+        intrinsics=np.full((count, 4), size / 2),
+        resolution=np.full((count, 2), size, np.int32),
+        exposure_time=np.ones(count),
+        saturation_radiance=np.ones(count),
+        noise_floor_radiance=np.zeros(count),
+    )
 
 
 def look_at(centre: Double, target: Double) -> Double:

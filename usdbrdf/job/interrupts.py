@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import TracebackType
 from typing import NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Seconds until one that was swallowed comes again: by then whatever did so has returned.
+_AGAIN = 0.05
 
 
 class Terminated(BaseException):
@@ -17,20 +23,55 @@ class Terminated(BaseException):
 @contextmanager
 def interruptible() -> Iterator[None]:
     """SIGINT raises KeyboardInterrupt and SIGTERM ``Terminated`` in here, as far as they are not
-    ignored; the handlers before are back afterwards."""
+    ignored; the handlers before are back afterwards.
+
+    Compiled libraries call Python where they cannot pass an exception on: they print it and carry
+    on. One that ends there comes again."""
 
     def interrupt(number: int, _frame: object) -> NoReturn:
         raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
     before = {number: signal.getsignal(number) for number in _SIGNALS}
-    heard = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
-    for number in heard:
+    replaced = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
+    for number in replaced:
         signal.signal(number, interrupt)
+    try:
+        with _coming_again():
+            yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _coming_again() -> Iterator[None]:
+    """What is printed by those who cannot pass it on is raised again."""
+    printed, ignored = sys.excepthook, sys.unraisablehook
+
+    def again(kind: type[BaseException] | None) -> bool:
+        ends = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}
+        if kind not in ends:
+            return False
+        later = threading.Timer(_AGAIN, _thread.interrupt_main, (ends[kind],))
+        later.daemon = True
+        later.start()
+        return True
+
+    def excepthook(
+        kind: type[BaseException], value: BaseException, trace: TracebackType | None
+    ) -> None:
+        if not again(kind):
+            printed(kind, value, trace)
+
+    def unraisablehook(told: sys.UnraisableHookArgs) -> None:
+        if not again(told.exc_type):
+            ignored(told)
+
+    sys.excepthook, sys.unraisablehook = excepthook, unraisablehook
     try:
         yield
     finally:
-        for number, handler in heard.items():
-            signal.signal(number, handler)
+        sys.excepthook, sys.unraisablehook = printed, ignored
 
 
 @contextmanager

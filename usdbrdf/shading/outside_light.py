@@ -64,8 +64,8 @@ class Sources(NamedTuple):
 _FREEDOM = calibration.number("outside.student_freedom")
 _INDEPENDENT = calibration.number("outside.independent")
 _USUAL_ALBEDO = calibration.pair("outside.albedo")
-# How glossy a scene may be, and the standard deviation of its segments about that.
-_GLOSS, _OF_SEGMENTS = (0.0, 0.25, 0.5, 0.75, 1.0), 0.5
+# How glossy a scene may be.
+_GLOSS = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Standard deviation of a gloss that is given.
 _GIVEN = 0.01
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
@@ -232,7 +232,7 @@ class Glossy(NamedTuple):
 
 def gloss_of_scene(asked: Asked, sources: Sources, glossy: Glossy) -> tuple[Asked, Sources]:
     """The same in a scene as glossy as it is likeliest to be, under Student's t, with all segments
-    about that; and with the light that ``glossy`` surfaces send elsewhere."""
+    about that, give or take as much; and with the light that ``glossy`` surfaces send elsewhere."""
     number, plain = int(asked.segment.max()) + 1, ~asked.clipped
     size = np.bincount(asked.segment[plain], minlength=number)
     counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
@@ -240,9 +240,7 @@ def gloss_of_scene(asked: Asked, sources: Sources, glossy: Glossy) -> tuple[Aske
     def with_gloss(gloss: float) -> tuple[Asked, Sources]:
         return (
             asked._replace(irradiance=asked.irradiance + gloss * glossy.irradiance),
-            sources._replace(
-                share=sources.share + gloss * glossy.share, gloss=(gloss, _OF_SEGMENTS)
-            ),
+            sources._replace(share=sources.share + gloss * glossy.share, gloss=(gloss, gloss)),
         )
 
     def cost(gloss: float) -> float:

@@ -43,7 +43,7 @@ _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 _ROUGHLY = Sampling(standard_error=0, max_rays=32)
 # Texels from one to those beside it; by what share of a lamp's light and of all other light these
 # may differ; and the share of texels in even light that is enough.
-_AROUND, _UNEVEN, _OF_OTHER_LIGHT, _LEAST_EVEN = 4, 0.1, 0.02, 0.2
+_AROUND, _UNEVEN, _OF_OTHER_LIGHT, _LEAST_EVEN = 2, 0.1, 0.02, 0.2
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,80 @@
+"""What usual dielectrics would mirror, against quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.physics.surfaces import box, quad, world_of
+from tests.scenes import frames_at, look_at
+from usdbrdf.shading import gloss
+from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
+from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
+from usdbrdf.transport.directional_albedo import fitted_albedo, view_cosines
+from usdbrdf.transport.lit_scene import TexturedScene
+
+LIGHT = np.array([3.0, 2.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def furnace():
+    """A closed box of 4 m with faces inwards, all as bright."""
+    world = world_of([
+        quad((0, 0, 0), (4, 0, 0), (0, 4, 0), (12, 12)),
+        quad((0, 0, 4), (0, 4, 0), (4, 0, 0), (12, 12)),
+        quad((0, 0, 0), (0, 0, 4), (4, 0, 0), (12, 12)),
+        quad((0, 4, 0), (4, 0, 0), (0, 0, 4), (12, 12)),
+        quad((0, 0, 0), (0, 4, 0), (0, 0, 4), (12, 12)),
+        quad((4, 0, 0), (0, 0, 4), (0, 4, 0), (12, 12)),
+    ])  # fmt: skip
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    return surface, np.tile(LIGHT.astype(np.float32), (len(world.texels), 1))
+
+
+def _reflects(cosines: np.ndarray | None) -> np.ndarray:
+    f0 = np.array([F0_OF_PSI * gloss._PSI])
+    return fitted_albedo(gloss._PHI, f0, cosines, kind=DIELECTRIC)[:, 0]
+
+
+def test_in_uniform_light_frames_are_shown_the_directional_albedo_of_it(furnace):
+    surface, light = furnace
+    eye = np.array([2.0, 2.1, 1.5])
+    frames = frames_at([look_at(eye, np.array([x, y, 0.0])) for x, y in ((2, 2.4), (0.5, 2))])
+    floor = np.arange(*surface.texels.of_object(0).indices(10**6), dtype=np.int64)
+    found = mirrored_to_frames(surface, light, frames, floor, 0)
+    way = eye - surface.texels.position[floor]
+    cosine = way[:, 2] / np.linalg.norm(way, axis=1)
+    seen = found[:, 0] > 0
+    expected = np.interp(cosine, view_cosines(), _reflects(None))[:, None] * LIGHT
+    assert 0.3 < seen.mean() < 1
+    np.testing.assert_allclose(found[seen].mean(0), expected[seen].mean(0), rtol=0.02)
+    np.testing.assert_allclose(found[seen], expected[seen], rtol=0.4)
+    assert not found[~seen].any()
+
+
+def test_what_is_behind_another_surface_is_shown_to_no_frame(furnace):
+    surface, light = furnace
+    outside = frames_at([look_at(np.array([2.0, 2.1, -3.0]), np.array([2.0, 2.0, 4.1]))])
+    some = np.arange(len(light), step=7)
+    assert not mirrored_to_frames(surface, light, outside, some, 0).any()
+
+
+def test_in_uniform_light_surfaces_send_on_what_they_do_not_let_in(furnace):
+    surface, light = furnace
+    found = mirrored_irradiance(surface, light, np.arange(len(light), step=3), 0)
+    # Cosines of the views are drawn as uniform light weighs them.
+    expected = np.pi * _reflects(None).mean() * LIGHT
+    np.testing.assert_allclose(found.mean(0), expected, rtol=0.02)
+
+
+def test_a_wall_hides_what_it_hides():
+    world = world_of([quad((0, 0, 0), (2, 0, 0), (0, 2, 0), (8, 8)), *box((0.8, 0.8, 0.5),
+                      (1.2, 1.2, 0.9), (4, 4))])  # fmt: skip
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    light = np.ones((len(world.texels), 3), np.float32)
+    above = frames_at([look_at(np.array([1.0, 1.001, 3.0]), np.array([1.0, 1.0, 0.0]))])
+    floor = np.arange(64)
+    found = mirrored_to_frames(surface, light, above, floor, 0)
+    middle = np.abs(world.texels.position[:64, :2] - 1).max(axis=1)
+    assert not found[middle < 0.2].any()
+    assert (found[(middle > 0.3) & (middle < 0.5)] >= 0).all()
