@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.samples import MIN_COSINE
@@ -20,7 +21,7 @@ from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, TexturedScene, 
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
 from usdbrdf.transport.rays import lift_from_surface
 
-_PHI, _PSI = 0.2, 0.5
+_PHI, _PSI = calibration.pair("gloss.usual")
 # Frames at most that a texel is looked at from, and rays from each; rays that look around from a
 # texel, and from where each of them ends.
 _VIEWS, _RAYS_OF_VIEW = 8, 32

@@ -41,9 +41,11 @@ _SEED = 0x1A3
 # How closely what a lamp brings is known, and how roughly it tells even light from shadows' edges.
 _SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
 _ROUGHLY = Sampling(standard_error=0, max_rays=32)
-# Texels from one to those beside it; by what share of a lamp's light and of all other light these
-# may differ; and the share of texels in even light that is enough.
-_AROUND, _UNEVEN, _OF_OTHER_LIGHT, _LEAST_EVEN = 2, 0.1, 0.02, 0.2
+# Texels from one to those beside it; by what share of the lamps' light and of all other light these
+# may differ.
+_AROUND = 2
+_UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
+_LEAST_EVEN = calibration.number("unseen.least_even")
 
 
 @dataclass(frozen=True, kw_only=True)
