@@ -24,6 +24,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
+from usdbrdf.material.sample_specular import specular_of_samples, whole_tiles
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
@@ -48,8 +49,8 @@ from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import ByAngle, irradiance_at
 from usdbrdf.transport.let_through import share_let_through, share_seen, table_let_through
 from usdbrdf.transport.lights import Lights, lights_from_radiance
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
-from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
+from usdbrdf.transport.lit_scene import LitScene
+from usdbrdf.transport.lobe_radiance import specular_irradiance
 from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
@@ -178,9 +179,6 @@ def let_through_surfaces(
     return by_tiles(run, texels, "let-through", "fit: surfaces", _scattered, given)["differs"]
 
 
-# Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
-# see needs fewer of each.
-_RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
 # is left of their noise is far below the other errors.
 _MOST_SAMPLES = 24
@@ -384,14 +382,17 @@ def _means_without_lobes(
             start, observed = saved[0] + 1, MeanState(**saved[1])
         # The mean starts from its first samples, which must not all show one highlight.
         order = [own.start + i for i in spread_order(len(own))[start:]]
-        sampled = samples_from_frames(lit, frames, reader.read, order, part)
+        sampled = samples_from_frames(lit, frames, reader.read, order, whole_tiles(texels, part))
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
             texel, camera = some.texel[taken], frames.camera(some.frame)
             of_texel = lobes.take(owner[texel])
             own_seed = seed + len(frames) + some.frame
-            specular = _specular(lit, of_texel, texel, samples[texel], camera.eye, own_seed)
+            specular = specular_of_samples(
+                lit, of_texel.phi, of_texel.psi, texel, samples[texel], camera.eye, own_seed
+            )
+            within = (texel >= part.start) & (texel < part.stop)
             covered = footprints(texels, texel, camera)
             unit = level[texel] * _let_through(lit, of_texel, texel, camera.eye)
             noise = np.float32(OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
@@ -401,7 +402,8 @@ def _means_without_lobes(
             error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
             deviation = np.asarray(error * wide, np.float32)
             values = (some.radiance[taken] - specular) / unit[:, None]
-            update(observed, texel - np.int32(part.start), values, deviation, covered)
+            own_texel = texel[within] - np.int32(part.start)
+            update(observed, own_texel, values[within], deviation[within], covered[within])
             run.save_latest_in_time(name, done, observed._asdict)
         return robust_mean(observed)._asdict()
 
@@ -451,22 +453,3 @@ def _let_through(lit: LitScene, lobes: Lobes, texel: Int, eye: Double) -> Float:
     # Samples have been taken where the face is not seen at a lower angle; its normals may be.
     cosine = np.maximum(cosine, MIN_COSINE)
     return np.where(lobes.conducts, 1, share_let_through(lobes.phi, lobes.psi, cosine))
-
-
-def _specular(
-    lit: LitScene, lobes: Lobes, texel: Int, samples: Float, eye: Double, seed: int
-) -> Float:
-    """(M, 3) light that texels (M,), each with a lobe of its own and seen by ``samples`` (M,)
-    frames, reflect to ``eye``."""
-    texels = lit.texels
-    found = np.empty((len(texel), 3), np.float32)
-    often = samples >= _MANY_FRAMES
-    for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
-        own = texel[which]
-        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
-        to_camera = (eye - position).astype(np.float32)
-        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
-        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
-        phi, psi = lobes.phi[which], lobes.psi[which]
-        found[which] = lobe_radiance(lit, points, phi, psi, rays, seed, own.astype(np.int64))
-    return found

@@ -124,6 +124,14 @@ class Texels:
         texel = self.nearest_texel[self.first_pixel[owner] + row * width + column]
         return np.where(texel >= 0, texel, index).astype(np.int32)
 
+    def tile(self, index: Long, side: int) -> Long:
+        """(N,) int64, equal for texels ``index`` (N,) in one tile of side^2 pixels of an atlas."""
+        owner = self.object_index()[index]
+        first, width = self.first_pixel[owner], self.resolution[owner, 0]
+        row, column = np.divmod(self.pixel[index] - first, width)
+        found: Long = first + row // side * side * width + column // side * side
+        return found
+
     def image(self, index: int, values: npt.NDArray[Number]) -> npt.NDArray[Number]:
         """(H, W, ...) picture of per-texel values (T, ...) of one object, gutters dilated."""
         width, height = self.resolution[index]
