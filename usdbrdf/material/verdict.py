@@ -104,12 +104,15 @@ def lobe_from_costs(
 
 
 _SHARES = np.linspace(0.01, 0.99, 99)
+_LIKE_SURFACES = calibration.number("fit.share_like_surfaces")
 
 
 def share_without_lobe(no_lobe: Double) -> float:
     """The share of a scene's surfaces that have no lobe, from the probability (N,) of that for
-    each, had it been as likely before as a lobe; all shares are as likely before these."""
+    each, had it been as likely before as a lobe. Before these it is about one half, as if so many
+    surfaces had told that clearly as _LIKE_SURFACES: few that tell little change little."""
     odds = np.log(np.outer(_SHARES, no_lobe) + np.outer(1 - _SHARES, 1 - no_lobe)).sum(axis=1)
+    odds += _LIKE_SURFACES / 2 * np.log(_SHARES * (1 - _SHARES))
     return float(np.average(_SHARES, weights=np.exp(odds - odds.max())))
 
 
