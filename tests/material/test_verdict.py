@@ -110,8 +110,8 @@ def test_surfaces_that_tell_say_how_many_of_a_scene_have_no_lobe():
     random = np.random.default_rng(2)
     clear = np.array([0.01, 0.02, 0.05, 0.01, 0.03, 0.02, 0.04, 0.01])
     vague = random.uniform(0.45, 0.55, 200)
-    assert share_without_lobe(np.concatenate([clear, vague])) < 0.2
-    assert share_without_lobe(np.concatenate([1 - clear, vague])) > 0.8
+    assert share_without_lobe(np.concatenate([clear, vague])) < 0.35
+    assert share_without_lobe(np.concatenate([1 - clear, vague])) > 0.65
     assert share_without_lobe(np.concatenate([clear, 1 - clear])) == pytest.approx(0.5, abs=0.02)
     # Those that cannot tell leave open what is so.
     assert share_without_lobe(np.full(50, 0.5)) == pytest.approx(0.5)
