@@ -29,8 +29,8 @@ from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames, Scan, View
-from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.model.capture import Frames, View
+from usdbrdf.model.lens import Lens
 
 # Where a file of the asset is written: its path there, and what writes it at a place.
 Place = Callable[[str, Callable[[Path], None]], None]
@@ -99,33 +99,6 @@ def frames_of_photographs(
         lenses=tuple(view.lens.described(view.intrinsics) if view else "" for view in views),
     )
     return frames, tuple(views), which
-
-
-def as_views(scan: Scan) -> Scan:
-    """The scan, each of whose photographs that bend nothing and have no mask is to be resampled as
-    if another one did: for captures that need one encoding together."""
-    frames = scan.frames
-    rows = zip(frames.image_paths, frames.intrinsics, strict=True)
-    paths, views = [], list[View]()
-    for k, (photograph, (fx, fy, cx, cy)) in enumerate(rows):
-        paths.append(Path(f"frames/{_stem(k, photograph)}.exr"))
-        views.append(
-            View(
-                photograph=photograph,
-                mask=None,
-                lens=PINHOLE,
-                intrinsics=(float(fx), float(fy), float(cx), float(cy)),
-                photograph_from_frame=np.eye(3),
-            )
-        )
-    frames = replace(
-        frames,
-        image_paths=tuple(paths),
-        photographs=tuple(view.photograph for view in views),
-        masks=(None,) * len(views),
-        lenses=tuple(view.lens.described(view.intrinsics) for view in views),
-    )
-    return replace(scan, frames=frames, views=tuple(views))
 
 
 def _stem(number: int, photograph: Path) -> str:

@@ -46,7 +46,7 @@ from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Frames, Recorded, Scan
 from usdbrdf.model.mesh import ObjectLabel, is_closed
 
 Types = Sdf.ValueTypeNames
