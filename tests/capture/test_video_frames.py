@@ -233,7 +233,15 @@ def test_what_the_machine_lacks_is_no_fault_of_the_video(tmp_path, video, monkey
     def fails(*_, **__):
         av.error.err_check(-code)
 
+    def fails_too(_):
+        raise OSError(errno.EIO, "Input/output error")
+
     monkeypatch.setattr(av, "open", fails)
+    if code == errno.EIO:
+        # FFmpeg says so of damage too, of a file that can be read to its end.
+        with pytest.raises(InputRefused, match=r"\[video.read\]$"):
+            video_files.read_here(video, [0], str(tmp_path))
+        monkeypatch.setattr(video_files, "sha256_of", fails_too)
     with pytest.raises(EnvironmentFailure), environment_failures("video"):
         video_files.read_here(video, [0], str(tmp_path))
 
