@@ -92,7 +92,7 @@ def test_obj_may_count_its_vertices_back_from_where_a_face_stands(tmp_path):
     }
     assert height == {"near": [0, 0, 0], "far": [5, 5, 5]}
     shown = [s.points[s.triangles][..., 2].tolist() for s in model_from_file(path)]
-    assert sum(shown, []) == [[0, 0, 0], [5, 5, 5]]
+    assert np.concatenate(shown).tolist() == [[0, 0, 0], [5, 5, 5]]
 
 
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1/1 2/1 0/1", "f -1 -2 -5"])

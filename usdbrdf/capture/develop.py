@@ -24,7 +24,7 @@ from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
-from usdbrdf.files.images import needs_float, read_exr, write_exr
+from usdbrdf.files.images import needs_float, white_of_mask, write_exr
 from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
@@ -175,7 +175,7 @@ def _recorded(photograph: Path, mask: Path | None, encoding: str, saturation: fl
 def mask_at_size(path: Path, height: int, width: int) -> Bool:
     """(H, W) where a mask's picture is not black, by its nearest pixel; InputRefused for another
     shape than the photograph's."""
-    shown = read_exr(path)[..., :3].max(axis=-1) > 0.5
+    shown = white_of_mask(path)
     rows, columns = shown.shape
     if abs(columns * height - rows * width) >= max(columns, width):
         raise InputRefused(
