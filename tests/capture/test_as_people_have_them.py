@@ -142,6 +142,16 @@ def test_frames_of_another_folder_are_named_by_it(made, tmp_path):
     assert {path.parent for path in scan.frames.image_paths} == {(tmp_path / "radiance").resolve()}
 
 
+def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):
+    """Which may be its depths."""
+    _as_photographs(made, ".jpg")
+    (made.folder / "photographs" / "0004.jpg").unlink()
+    _write_bytes(made.folder / "photographs" / "0004.png", np.zeros((24, 32, 3), np.uint8))
+    scan = _read(made, assume_srgb=True)
+    assert {path.suffix for path in scan.frames.image_paths} == {".jpg"}
+    assert any("'photographs/0004.jpg': the image file does not exist" in s for s in scan.warnings)
+
+
 def test_two_files_that_a_name_might_mean_are_none(made):
     shutil.copy(made.image(0), made.folder / "frames" / "0000.Exr")
     _rename(made, "frames/{:04d}.jpg")

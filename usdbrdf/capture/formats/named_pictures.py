@@ -167,13 +167,20 @@ class Pictured:
         beside it whose name differs in nothing but case and kind of picture, radiance first: poses
         are found of JPEGs whose radiance is developed later. Of ``--frames``, the picture there
         that has its name. None where there is none. InputRefused for what leads out."""
-        name = name.replace("\\", "/")
         if self.options.frames is not None:
             return self._of_frames.named(name)
-        path = path_in_capture(self.folder, f"{below}/{name}" if below else name, self.options)
+        whole = f"{below}/{name}" if below else name
+        path = path_in_capture(self.folder, whole, self.options)
+        if "\\" in name and not path.is_file():
+            path = path_in_capture(self.folder, whole.replace("\\", "/"), self.options)
         if path.is_file():
             return path
-        alike = self._in_folder(path.parent).get(_stem(path.name), [])
+        beside = self._in_folder(path.parent)
+        alike = beside.get(_stem(path.name), [])
+        suffix = path.suffix.lower()
+        if any(one.suffix.lower() == suffix for found in beside.values() for one in found):
+            # Where some are of the kind that is named, what is of another may be their depths.
+            alike = [one for one in alike if one.suffix.lower() == suffix]
         best = min(map(_nearness, alike), default=0)
         nearest = [one for one in alike if _nearness(one) == best]
         if len(nearest) != 1:
