@@ -311,9 +311,8 @@ def at_image_size(
     if turned:
         findings.warn(
             f"{source.name}: EXIF data turn {len(turned)} of {len(records)} images, first "
-            f"{turned[0]}; their pixels are used as they are stored, as most programs that find "
-            "poses do. Save them upright, and align again, if they do not agree with the mesh. "
-            "[capture.orientation]"
+            f"{turned[0]}; their pixels are used as they are stored, as COLMAP uses them. Save "
+            "them upright if the poses are those of upright ones. [capture.orientation]"
         )
     if outside:
         findings.warn(
