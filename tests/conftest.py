@@ -58,6 +58,7 @@ SLOW = (
     "test_convert.py",
     "test_identity.py",
     "test_lightings.py",
+    "test_scales.py",
     "test_units.py",
     "texturing/test_earlier.py",
     "texturing/test_pose_steps.py",
@@ -97,6 +98,7 @@ NIGHTLY = (
     "test_many_views_find_the_material_without_knowing_the_diffuse_radiance",
     "shading/test_denoise.py::test_the_filter_gives_its_memory_back",
     "test_docs.py::test_the_commands_of_tutorials_run",
+    "test_scales.py::test_maps_and_summaries_do_not_know_how_large_the_scene_is",
 )
 
 

@@ -14,7 +14,7 @@ import pytest
 from pxr import Sdf, Usd, UsdShade
 
 import usdbrdf
-from tests.scenes import make_capture, poses_down_and_up
+from tests.scenes import edited, make_capture, poses_down_and_up
 from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.layout import ROLES, Asset
@@ -24,7 +24,8 @@ from usdbrdf.asset.readers.scene import aov_path, read_fit, read_shading
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import measured_atlas
-from usdbrdf.files.images import read_exr
+from usdbrdf.files.colour import from_working_space, to_display_srgb8
+from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.page import report
 from usdbrdf.page.report import page_data
@@ -170,6 +171,42 @@ def test_the_asset_keeps_all_rules(asset, capsys):
     capsys.readouterr()
     assert main(["validate", str(asset.folder)]) == 0
     assert "error" not in capsys.readouterr().out
+
+
+def test_each_lighting_is_read_by_its_own_encoding(base):
+    """Three captures of one scene in one light: as radiance, as that in ACEScg, and as 8-bit
+    photographs, whose unit is that of the others as they were exposed alike."""
+    radiance = {"lamp": (0.75, 0.5, 0.6)}
+    folders = [base / "encodings" / name for name in ("radiance", "acescg", "photographs")]
+    plain, wide, bytes_ = (
+        make_capture(f, subdivisions=2, poses=poses_down_and_up(6, 6), radiance=radiance)
+        for f in folders
+    )
+    for i in range(12):
+        pixels = read_exr(plain.image(i))
+        in_ap1 = from_working_space(pixels, "lin_ap1_scene")
+        write_exr(wide.image(i), in_ap1, half=False)
+        shown = to_display_srgb8(pixels, exposure_scale=1.0)
+        write_preview_png(bytes_.image(i).with_suffix(".png"), shown)
+        bytes_.image(i).unlink()
+    with edited(wide.manifest) as document:
+        document["encoding"] = "lin_ap1_scene"
+    with edited(bytes_.manifest) as document:
+        for frame in document["frames"]:
+            frame["file_path"] = frame["file_path"].replace(".exr", ".png")
+            del frame["saturation_radiance"], frame["noise_floor_radiance"]
+    out = base / "encodings" / "out"
+    assert main(["ingest", "-q", *map(str, folders), "-o", str(out), "--assume-srgb"]) == 0
+    assert main(["texture", "-q", str(out), "--texel-size", "0.3"]) == 0
+    maps = [AssetMaps(open_measured(Asset.at(out).in_lighting(folder.name))) for folder in folders]
+    known, *others = (one.map("lit") for one in maps)
+    assert [one.frames.radiometric for one in maps] == [True, True, False]
+    assert [one.frames.encoding for one in maps[:2]] == ["lin_rec709_scene", "lin_ap1_scene"]
+    seen = np.logical_and.reduce([one.coverage.measured for one in maps])
+    assert np.count_nonzero(seen) > 150
+    np.testing.assert_allclose(others[0][seen], known[seen], rtol=2e-3, atol=2e-4)
+    # Half a code of sRGB is at most so much of a radiance above 1/20.
+    np.testing.assert_allclose(others[1][seen], known[seen], rtol=0.011, atol=2e-4)
 
 
 def test_a_second_run_does_only_what_is_missing_and_of_one_lighting_alone(asset, captures):

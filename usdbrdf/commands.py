@@ -98,7 +98,8 @@ class MergeBrackets(Talking):
             f"{self.output}: written, {found['brackets']} frames of {found['photographs']} "
             f"photographs over {found['stops']:.1f} stops; radiometric up to one scale; clipped in "
             f"all {found['clipped_share']:.2%}, contradicting each other "
-            f"{found['contradicting_share']:.2%} of the pixels"
+            f"{found['contradicting_share']:.2%} of the pixels; {found['unchecked_share']:.0%} of "
+            "the exposures could not be held against the one next to them"
         )
         return self.told({"capture": str(self.output), **found}, told)
 

@@ -120,7 +120,7 @@ class CaptureOptions(Options):
     """object names (objects.json), in any place; auto: whatever the capture says, objects are
     planes, divided by colour, and what hangs together before them"""
     frames: Path | None = option("--frames DIR", None, unset="the capture's own")
-    "folder of the pictures, in any place, for formats that name pictures but not their folder"
+    "folder of the pictures, in any place, where they do not lie where the capture says"
     crease_angle_deg: float = option("--crease-angle DEG", 40.0, (0, 180))
     "faces that meet at more degrees than this meet in a sharp edge"
     decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")

@@ -74,6 +74,7 @@ def response():
 def test_shaken_brackets_are_laid_onto_each_other(response, seed, degrees, pixels):
     paths, true, codes, exposures = _bracket(seed, degrees=degrees, pixels=pixels)
     found = aligned(codes, NAMES)
+    assert not found.unchecked.any()
     assert _off(found.moved, paths) < 0.2
     # Whole pixels would not do.
     assert _off(np.round(found.moved), paths) > 0.4
@@ -133,6 +134,17 @@ def test_what_moved_too_far_is_refused():
     codes = np.array([_shoot(scene, EXPOSURES[3:4])[0], _shoot(far, EXPOSURES[4:5])[0]])
     with pytest.raises(InputRefused, match=r"\[brackets.moved\]$"):
         aligned(codes, NAMES)
+
+
+@pytest.mark.parametrize("stops", [8, -8])
+def test_exposures_that_share_no_clear_code_are_said_to_be_unchecked(stops):
+    """Of which nobody knows whether the camera moved; they stay as they are."""
+    light, dark = _photograph(SHAPE, decades=0.5), np.roll(_photograph(SHAPE, decades=0.5), 9, 1)
+    codes = [_shoot(view, EXPOSURES[3:4] * 2.0**by)[0] for view, by in ((light, 4), (dark, -5))]
+    codes = np.array(codes if stops > 0 else codes[::-1])
+    found = aligned(codes, NAMES)
+    assert found.unchecked.tolist() == [True, False]
+    np.testing.assert_array_equal(found.stack, codes)
 
 
 def test_parallax_is_refused():

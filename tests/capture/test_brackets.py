@@ -188,7 +188,11 @@ def test_a_capture_of_brackets_becomes_one_of_radiance(tmp_path, same_poses, cap
         )
         == 0
     )
-    assert checked(capsys.readouterr().out, "merge-brackets")["brackets"] > 0
+    told = checked(capsys.readouterr().out, "merge-brackets")
+    assert told["brackets"] > 0
+    # In the shortest exposure all but the lamp is too dark to be held against the next.
+    assert list(told["unchecked"].values()) == [[f"{i}_5.png"] for i in range(12)]
+    assert told["unchecked_share"] == 1 / 5
     scan = read_scan(tmp_path / "merged", IngestOptions())
     assert (len(scan.frames), scan.frames.radiometric) == (12, True)
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera)

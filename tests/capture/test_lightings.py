@@ -89,15 +89,28 @@ def test_gains_masks_and_lenses_of_some_are_none_of_the_others(pair):
 
 
 @pytest.mark.parametrize("through_a_lens", ["by_day", "by_night"])
-def test_the_photographs_encoding_is_that_of_those_that_were_resampled(pair, through_a_lens):
+def test_each_lighting_keeps_what_is_said_of_its_images(pair, through_a_lens):
     scans = _scans(*(made.folder for made in pair))
     frames = scans[through_a_lens].frames
     taken = tuple(path.with_suffix(".jpg") for path in frames.image_paths)
-    frames = replace(frames, photographs=taken, photograph_encoding="acescct_ap1")
+    said = {"encoding": "lin_ap1_scene", "photograph_encoding": "acescct_ap1"}
+    frames = replace(frames, photographs=taken, radiometric=False, **said)
     scans[through_a_lens] = replace(scans[through_a_lens], frames=frames)
+    refuse_other_scenes(scans)
     joined = scan_of_lightings(scans, CREASE).frames
-    assert joined.photograph_encoding == "acescct_ap1"
     assert sum(path is not None for path in joined.photographs) == len(taken)
+    assert not joined.radiometric
+    for name, scan in scans.items():
+        of_one = joined.of_lighting(name)
+        assert {joined.encoding_of(i) for i in of_one} == {scan.frames.encoding}
+        own = joined.at(of_one)
+        assert own.recorded == ()
+        for field in ("encoding", "photograph_encoding", "radiometric"):
+            assert getattr(own, field) == getattr(scan.frames, field)
+
+
+def test_frames_of_lightings_that_are_recorded_alike_say_nothing_of_each(pair):
+    assert scan_of_lightings(_scans(*(made.folder for made in pair)), CREASE).frames.recorded == ()
 
 
 def test_the_lens_is_what_those_tell_that_tell_of_it(pair):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, Vt
 
+from tests.capture.test_scan_from_scanner_app import make_export
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
-from tests.scenes import make_capture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
@@ -301,8 +301,9 @@ def test_pictures_in_another_place_are_inputs_and_the_stage_is_referenced(tmp_pa
 
 
 def test_frames_that_a_format_does_not_ask_for_are_refused(tmp_path):
-    made = make_capture(tmp_path / "room")
-    with pytest.raises(UsageError, match=r"'transforms' says itself.*\[usage.option\]"):
-        read_scan(made.folder, IngestOptions(frames=tmp_path / "frames"))
-    with pytest.raises(UsageError, match=r"no picture of this capture lies there"):
-        read_scan(made.folder, IngestOptions(frames=tmp_path / "elsewhere"))
+    export, _ = make_export(tmp_path)
+    options = IngestOptions(frames=tmp_path / "elsewhere", assume_srgb=True)
+    with pytest.raises(UsageError, match=r"'scanner-app' says itself.*\[usage.option\]"):
+        read_scan(export, options)
+    with pytest.raises(UsageError, match=r"no such folder.*\[usage.option\]"):
+        read_scan(tmp_path / "capture", options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from tests.capture.test_brackets import _photograph, _shoot
 from tests.json_schemas import checked
 from tests.scenes import edited, make_capture
+from usdbrdf.capture import video_frames
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.video_frames import develop_video
 from usdbrdf.cli import main
@@ -233,9 +235,38 @@ def test_what_the_machine_lacks_is_no_fault_of_the_video(tmp_path, video, monkey
     def fails(*_, **__):
         av.error.err_check(-code)
 
+    def fails_too(_):
+        raise OSError(errno.EIO, "Input/output error")
+
     monkeypatch.setattr(av, "open", fails)
+    if code == errno.EIO:
+        # FFmpeg says so of damage too, of a file that can be read to its end.
+        with pytest.raises(InputRefused, match=r"\[video.read\]$"):
+            video_files.read_here(video, [0], str(tmp_path))
+        monkeypatch.setattr(video_files, "sha256_of", fails_too)
     with pytest.raises(EnvironmentFailure), environment_failures("video"):
         video_files.read_here(video, [0], str(tmp_path))
+
+
+@pytest.mark.parametrize("at", ["decoding", "merging"])
+def test_an_interrupted_run_leaves_nothing(capture, tmp_path, monkeypatch, at):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+
+    def interrupted(*given, **_):
+        if at == "decoding":  # of which some frames are there already
+            (given[2] / "000000.png").write_bytes(b"")
+        raise KeyboardInterrupt
+
+    name = "frames_of_video" if at == "decoding" else "merge"
+    monkeypatch.setattr(video_frames, name, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        develop_video(capture, tmp_path / "made" / "radiance")
+    assert list(scratch.iterdir()) == []
+    assert not (tmp_path / "made" / "radiance").exists()
+    assert list((tmp_path / "made").glob("*")) == []
 
 
 def test_chosen_frames_of_one_exposure_are_told_by_those_beside_them(capture, tmp_path):

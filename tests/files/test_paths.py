@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.formats.named_pictures import path_in_capture
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.paths import contained, files_below, inside
 from usdbrdf.options import IngestOptions

@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -33,6 +32,7 @@ from usdbrdf.files.images import (
     stored_space,
 )
 from usdbrdf.files.published_images import copy_without_metadata
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.stamp import read_stamp
 from usdbrdf.options import IngestOptions
 from usdbrdf.transport.environment import environment_from_file
@@ -104,8 +104,8 @@ def _scan(adapter: str, *, photographs: bool = False) -> Callable[[Path], object
 
 
 def _frames_of_video(path: Path) -> object:
-    with TemporaryDirectory() as folder:
-        return video_files.read_here(path, (0, 2), folder)
+    with scratch_folder() as folder:
+        return video_files.read_here(path, (0, 2), str(folder))
 
 
 def _mesh_and_model(path: Path) -> object:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import struct
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
-from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file
+from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file, model_from_file
 
 _SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -36,6 +39,67 @@ def test_quads_become_two_triangles_in_place_and_keep_their_label(tmp_path):
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0]]
     assert mesh.face_label is not None
     assert mesh.face_label.tolist() == [6, 6, 7, 7]
+
+
+def _polygons(path: Path, order: str, faces: list[list[int]]) -> bytes:
+    """A binary PLY of faces of several sizes, with texture coordinates and labels."""
+    endian = "little" if order == "<" else "big"
+    head = (
+        f"ply\nformat binary_{endian}_endian 1.0\ncomment TextureFile a.png\n"
+        "element vertex 5\nproperty double x\nproperty double y\nproperty double z\n"
+        f"property uchar red\nelement face {len(faces)}\n"
+        "property list uchar uint vertex_indices\nproperty list uchar float texcoord\n"
+        "property int object_id\nend_header\n"
+    )
+    points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0)]
+    body = b"".join(struct.pack(f"{order}3dB", *point, 9) for point in points)
+    for i, face in enumerate(faces):
+        body += struct.pack(f"{order}B{len(face)}I", len(face), *face)
+        body += struct.pack(f"{order}B2fi", 2, 0.5, 0.5, 6 + i)
+    path.write_bytes(head.encode() + body)
+    return head.encode() + body
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_triangles_beside_quads_are_read(tmp_path, order):
+    path = tmp_path / "mixed.ply"
+    content = _polygons(path, order, [[1, 4, 2], [0, 1, 2, 3], [2, 1, 0]])
+    mesh = mesh_from_file(path)
+    assert mesh.triangles.tolist() == [[1, 4, 2], [0, 1, 2], [0, 2, 3], [2, 1, 0]]
+    assert mesh.points[4].tolist() == [2, 0, 0]
+    assert mesh.face_label is not None
+    assert mesh.face_label.tolist() == [6, 7, 7, 8]
+    path.write_bytes(content[:-3])
+    with pytest.raises(InputRefused, match=r"\[mesh\.read\]$"):
+        mesh_from_file(path)
+
+
+def test_a_polygon_of_five_corners_is_named(tmp_path):
+    _polygons(tmp_path / "five.ply", "<", [[1, 4, 2], [0, 1, 2, 3, 4]])
+    with pytest.raises(InputRefused, match=r"a face has 5 corners.*\[mesh\.read\]$"):
+        mesh_from_file(tmp_path / "five.ply")
+
+
+def test_obj_may_count_its_vertices_back_from_where_a_face_stands(tmp_path):
+    path = tmp_path / "back.obj"
+    triangle = "v 0 0 {0}\nv 1 0 {0}\nvt 0 0\nv 0 \\\n 1 {0}\nf -3/-1 -2/-1 -1/-1\n"
+    path.write_text("o near\n" + triangle.format(0) + "o far\n" + triangle.format(5))
+    mesh = mesh_from_file(path)
+    assert mesh.face_label is not None
+    height = {
+        mesh.label_names[label]: mesh.points[corners][:, 2].tolist()
+        for corners, label in zip(mesh.triangles, mesh.face_label, strict=True)
+    }
+    assert height == {"near": [0, 0, 0], "far": [5, 5, 5]}
+    shown = [s.points[s.triangles][..., 2].tolist() for s in model_from_file(path)]
+    assert np.concatenate(shown).tolist() == [[0, 0, 0], [5, 5, 5]]
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1/1 2/1 0/1", "f -1 -2 -5"])
+def test_obj_faces_with_vertices_before_the_first_are_refused(tmp_path, face):
+    (tmp_path / "from_0.obj").write_text(_SQUARE + face + "\n")
+    with pytest.raises(InputRefused, match=r"\[mesh\.read\]$"):
+        mesh_from_file(tmp_path / "from_0.obj")
 
 
 def test_obj_keeps_vertices_and_its_objects_become_labels(tmp_path):

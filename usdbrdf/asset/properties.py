@@ -164,12 +164,12 @@ class Photographs:
         samples="every", low=0)]
     vignetting: Annotated[Sequence[float], Fact(CAPTURE, "vignetting", "double2", (0, 0), """k1, k2,
         without unit: lenses pass exp(k1 r^2 + k2 r^4), r in half diagonals from the centre.""")]
-    encoding: Annotated[str, Fact(CAPTURE, "encoding", "token", "lin_rec709_scene", """Colour space
-        in which the image files are stored, in OpenColorIO's names. The textures are always
-        lin_rec709_scene.""")]
-    radiometric: Annotated[bool, Fact(CAPTURE, "radiometric", "bool", True, """True where pixel
-        values are proportional to scene radiance. False for low dynamic range photographs: what
-        was measured from them is relative.""")]
+    encoding: Annotated[Sequence[str], Fact(CAPTURE, "encoding", "token", "lin_rec709_scene",
+        """Colour space in which the image files are stored, in OpenColorIO's names; lightings may
+        differ in it. The textures are always lin_rec709_scene.""", samples="changes")]
+    radiometric: Annotated[Sequence[bool], Fact(CAPTURE, "radiometric", "bool", True, """True where
+        pixel values are proportional to scene radiance. False for low dynamic range photographs:
+        what was measured from them is relative.""", samples="changes")]
     photograph: Annotated[Sequence[str], Fact(CAPTURE, "photograph", "asset", "", """The photograph
         through a lens that the image of this time code was resampled from, a path relative to the
         layer; empty where the image is the photograph itself.""", samples="changes",
@@ -181,10 +181,10 @@ class Photographs:
         photograph: its curve and its numbers that are not 0, in pixels fx, fy, cx and cy; k, d, p
         and s are radial, dividing, tangential and prism terms as OpenCV has them.""",
         samples="changes", when=lambda taken: any(taken.lens))]
-    photograph_encoding: Annotated[str, Fact(CAPTURE, "photographEncoding", "token", "", """Colour
-        space of the photographs that images were resampled from, in OpenColorIO's names; empty
-        where the images are the photographs themselves.""",
-        when=lambda taken: bool(taken.photograph_encoding))]
+    photograph_encoding: Annotated[Sequence[str], Fact(CAPTURE, "photographEncoding", "token", "",
+        """Colour space of the photographs that images were resampled from, in OpenColorIO's names;
+        empty where the images are the photographs themselves.""", samples="changes",
+        when=lambda taken: any(taken.photograph_encoding))]
     lighting: Annotated[Sequence[str], Fact(CAPTURE, "lighting", "string", "", """Which lighting of
         the scene the photograph shows, a variant of the set lighting; empty where there is but
         one.""", samples="changes", when=lambda taken: any(taken.lighting))]

@@ -48,26 +48,32 @@ class Aligned(NamedTuple):
     silent  (K, H, W, 3) bool: where that is: beyond its edge, or between what clips and what not
     moved   (K, 3, 3) float64: places in the exposure, as homogeneous column and row with the first
             pixel's centre at (0, 0), of those in the middle one
+    unchecked  (K,) bool: no code is clear both in the exposure and in its neighbour, so that
+               nothing tells whether the camera moved between them
     """
 
     stack: Byte
     silent: Bool
     moved: Double
+    unchecked: Bool
 
 
 def aligned(stack: Byte, names: Sequence[str]) -> Aligned:
     """A bracket, (K, H, W, 3) by exposure, the longest first, laid onto its middle exposure.
 
-    What hardly moved stays as it is. Raises InputRefused, with ``names``, where an exposure does
-    not fit onto its neighbour, and where parts of it moved by different amounts: something near was
-    seen from elsewhere. EnvironmentFailure without OpenCV.
+    What hardly moved, or cannot be compared, stays as it is. Raises InputRefused, with ``names``,
+    where an exposure does not fit onto its neighbour, and where parts of it moved by different
+    amounts: something near was seen from elsewhere. EnvironmentFailure without OpenCV.
     """
     grey = stack.astype(np.float32).mean(axis=3).astype(np.uint8)
     middle = len(stack) // 2
     moved = np.broadcast_to(np.eye(3), (len(stack), 3, 3)).copy()
+    unchecked = np.zeros(len(stack), np.bool_)
     for k in [*range(middle + 1, len(stack)), *range(middle - 1, -1, -1)]:
         near = k - 1 if k > middle else k + 1
-        moved[k] = between(grey[near], grey[k], (names[near], names[k])) @ moved[near]
+        found = between(grey[near], grey[k], (names[near], names[k]))
+        unchecked[k], step = found is None, np.eye(3) if found is None else found
+        moved[k] = step @ moved[near]
     still = [_farthest(one, grey.shape[1:]) <= _STILL for one in moved]
     result, silent = stack.copy(), np.zeros(stack.shape, np.bool_)
     for k in range(len(stack)):
@@ -75,16 +81,16 @@ def aligned(stack: Byte, names: Sequence[str]) -> Aligned:
             moved[k] = np.eye(3)
         else:
             result[k], silent[k] = laid(stack[k], moved[k])
-    return Aligned(result, silent, moved)
+    return Aligned(result, silent, moved, unchecked)
 
 
-def between(fixed: Byte, other: Byte, names: tuple[str, str]) -> Double:
+def between(fixed: Byte, other: Byte, names: tuple[str, str]) -> Double | None:
     """(3, 3): the place in the picture ``other`` (H, W) of each one in ``fixed``, as ``Aligned``
-    has it; raises as ``aligned`` does."""
+    has it, None where no code is clear in both; raises as ``aligned`` does."""
+    if _common_rank(fixed, other) is None:
+        return None
     down, right = (int(n) for n in _shift(fixed, other, _LEVELS))
     found = np.array([[1.0, 0, -right], [0, 1, -down], [0, 0, 1]])
-    if _common_rank(fixed, other) is None:
-        return found  # no code is clear in both
     if fixed.mean() >= other.mean():
         found = _correlated(fixed, other, found)
     else:

@@ -22,7 +22,7 @@ from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.images import exif_exposure, is_eight_bit, needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
-from usdbrdf.job.progress import progress
+from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
 # Brackets that the response is told by.
@@ -40,7 +40,8 @@ class Bracket(NamedTuple):
 
 def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     """Write the capture with one EXR of radiance for each bracket into the new ``folder``, and say
-    what was found: numbers of brackets and photographs, shares of clipped and contradicting pixels.
+    what was found: numbers of brackets and photographs, shares of clipped and contradicting pixels,
+    and by frame the photographs of which nobody knows whether the camera moved.
 
     The unit is the same for all frames and has no other meaning: radiometric up to one scale.
     Raises InputRefused for what makes no brackets.
@@ -53,26 +54,42 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         [_aligned(bracket).stack for bracket in telling], [bracket.exposures for bracket in telling]
     )
     frames, clipped, ghosts = [], [], []
+    unchecked: dict[str, list[str]] = {}
     with environment_failures(str(folder)), whole_folder(folder) as staged:
         (staged / "frames").mkdir()
         for i, bracket in enumerate(
             progress(brackets, total=len(brackets), label="brackets", unit="brackets")
         ):
             name = f"frames/{i:05d}_{bracket.images[0].stem}.exr"
-            entry, shares = _merged(bracket, response, staged / name)
-            frames.append({**entry, "file_path": name})
-            clipped.append(shares[0])
-            ghosts.append(shares[1])
+            made = _merged(bracket, response, staged / name)
+            frames.append({**made.entry, "file_path": name})
+            clipped.append(made.clipped)
+            ghosts.append(made.ghost)
+            if made.unchecked:
+                unchecked[name] = made.unchecked
         copy_beside(source, document, staged)
         write_json(staged / "transforms.json", {**document, "frames": frames})
+    photographs = sum(len(bracket.images) for bracket in brackets)
+    alone = sum(map(len, unchecked.values()))
+    if unchecked:
+        name, files = next(iter(unchecked.items()))
+        warn(
+            f"{source}: {alone} of {photographs} photographs, in {len(unchecked)} of "
+            f"{len(brackets)} brackets, share no clear code with the exposure next to theirs, so "
+            f"that nothing tells whether the camera moved; they are merged as they are (first "
+            f"{', '.join(files)} in {name}). Bracket in smaller steps, or use a tripod. "
+            "[brackets.unchecked]"
+        )
     ranges = [float(b.exposures[0] / b.exposures[-1]) for b in brackets]
     return {
         "brackets": len(brackets),
-        "photographs": sum(len(bracket.images) for bracket in brackets),
+        "photographs": photographs,
         "stops": float(np.log2(max(ranges))),
         "clipped_share": float(np.mean(clipped)),
         "contradicting_share": float(np.mean(ghosts)),
         "contradicting_share_of_worst": float(np.max(ghosts)),
+        "unchecked_share": alone / (photographs - len(brackets)),
+        "unchecked": unchecked,
     }
 
 
@@ -89,10 +106,17 @@ def copy_beside(source: Path, document: Any, folder: Path) -> None:
             shutil.copyfile(beside, place)
 
 
-def _merged(
-    bracket: Bracket, response: Response, place: Path
-) -> tuple[dict[str, Any], tuple[float, float]]:
-    """Writes the picture; the frame's entry, and the shares of clipped and contradicting pixels."""
+class _Made(NamedTuple):
+    """The frame's entry, shares of clipped and contradicting pixels, names of unchecked files."""
+
+    entry: dict[str, Any]
+    clipped: float
+    ghost: float
+    unchecked: list[str]
+
+
+def _merged(bracket: Bracket, response: Response, place: Path) -> _Made:
+    """Writes the picture."""
     laid = _aligned(bracket)
     found = merge(laid.stack, bracket.exposures, response, laid.silent)
     # What is clearly negative is unknown to every reader of frames.
@@ -100,7 +124,8 @@ def _merged(
     write_exr(place, pixels, half=not needs_float(pixels))
     entry = {k: v for k, v in bracket.entry.items() if k not in ("brackets", "exposure_time")}
     entry.update(saturation_radiance=found.saturation, noise_floor_radiance=found.noise_floor)
-    return entry, (found.clipped, found.ghost)
+    alone = np.flatnonzero(laid.unchecked).tolist()
+    return _Made(entry, found.clipped, found.ghost, [bracket.images[k].name for k in alone])
 
 
 def _aligned(bracket: Bracket) -> Aligned:

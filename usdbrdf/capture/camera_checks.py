@@ -33,7 +33,8 @@ def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> Non
         raise InputRefused(
             f"{source}: all {len(frames)} cameras stand within {spread:.3g} of one point in a "
             f"scene {diagonal:.3g} across, there is no parallax. Capture from several places, or "
-            "check the translations of the poses. [capture.parallax]"
+            "check the translations of the poses, and that these and the mesh have one unit. "
+            "[capture.parallax]"
         )
 
 

@@ -12,12 +12,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from usdbrdf.capture.lens_views import views_of
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import encoding_of_tag, kind_of_encoding
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
-from usdbrdf.files.images import MAX_SIDE, colour_tag, image_size
+from usdbrdf.files.images import (
+    colour_tag,
+    holds_whole_numbers,
+    image_size,
+    orientation_of,
+    white_of_mask,
+)
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
@@ -91,7 +96,8 @@ _CURES = {
     "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
     "capture.alignment": "Align and calibrate these cameras, or take them out of the project.",
     "capture.camera": "Correct the focal lengths, principal points and distortion.",
-    "capture.file": "Copy the missing images, or remove their entries.",
+    "capture.file": "Copy the missing images, name their folder with --frames, or remove their "
+    "entries.",
     "capture.image": "Export the images again as R, G, B float EXR.",
     "capture.mask": "Export a mask of the photograph's size for it, or remove its entry.",
     "capture.size": "Use the images that the intrinsics are for, or state the w and h of these.",
@@ -180,37 +186,47 @@ class Findings:
 PHOTOGRAPH_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 # A frame with less than this share of pixels that are not clipped, or not black, says nothing.
 _MIN_USEFUL_SHARE = 0.001
-# Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
-_MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
-# What is so near stays as it is, and so do poses that were made rigid before.
-_EXACT = 1e-14
-# Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
-# of the image.
-LARGEST_OF_POSE = 1e9
-_FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
 
 
-def refuse_photographs(paths: Sequence[Path], *, assume_srgb: bool) -> bool:
+def refuse_photographs(
+    paths: Sequence[Path], *, assume_srgb: bool, encoding: str | None = None
+) -> bool:
     """True where all images are low dynamic range, False where none is; InputRefused otherwise.
 
-    Photographs hold display values, not radiance: they are used only if the user says so.
+    Photographs hold display values, not radiance: they are used only if the user says so. So do
+    TIFF files of whole numbers, unless their ``encoding`` is stated to be another.
     """
-    photographs = [p for p in paths if p.suffix.lower() in PHOTOGRAPH_SUFFIXES]
+    said = encoding is not None and kind_of_encoding(encoding) != "display"
+    photographs = [p for p in paths if _is_photograph(p) or (not said and _is_whole_tiff(p))]
     if not photographs:
         return False
     if len(photographs) < len(paths):
-        other = next(p for p in paths if p.suffix.lower() not in PHOTOGRAPH_SUFFIXES)
+        other = next(p for p in paths if p not in photographs)
         raise InputRefused(
             f"{photographs[0]}: a low dynamic range image in one capture with {other.name}. "
             "Use images of one kind. [capture.ldr]"
         )
     if not assume_srgb:
+        kind = photographs[0].suffix[1:].upper()
         raise InputRefused(
-            f"{photographs[0]}: {len(photographs)} frames are {photographs[0].suffix[1:].upper()}, "
-            "which does not hold radiance. Export scene-linear EXR, or accept a result that is not "
-            "radiometric with --assume-srgb. [capture.ldr]"
+            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold "
+            f"radiance{_TIFF if _is_whole_tiff(photographs[0]) else ''}. Export scene-linear EXR, "
+            "or accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
         )
     return True
+
+
+_TIFF = " as whole numbers, unless --input-space says that they are linear or logarithms"
+
+
+def _is_photograph(path: Path) -> bool:
+    return path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+
+
+def _is_whole_tiff(path: Path) -> bool:
+    with suppress(ImageRefused):  # of which the reader of its pixels will tell
+        return path.suffix.lower() in (".tif", ".tiff") and holds_whole_numbers(path)
+    return False
 
 
 def tagged_encoding(
@@ -229,102 +245,6 @@ def tagged_encoding(
         "--input-space if they are not. [capture.encoding]"
     )
     return tag
-
-
-def rigid_records(
-    records: Sequence[FrameRecord], findings: Findings, source: Path, *, pose_scale: float | None
-) -> list[FrameRecord]:
-    """Records with poses made exactly rigid; frames without a sensible camera are dropped.
-
-    Almost rigid ones are snapped; scaled, sheared and mirrored ones are refused, because each of
-    them is a convention that holds for the whole capture.
-    """
-    kept: list[FrameRecord] = []
-    worst = 0.0
-    for record in records:
-        pose = record.world_from_camera
-        if not is_camera_matrix(pose):
-            findings.drop(
-                record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
-            )
-        elif not _is_lens(record):
-            lens = ", ".join(f"{number:g}" for number in record.intrinsics)
-            size = " x ".join(map(str, record.resolution))
-            bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
-            said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
-            findings.drop(record.name, said, "capture.camera")
-        else:
-            rigid, off = _made_rigid(pose, record.name, source, pose_scale)
-            worst = max(worst, off)
-            captured = record.captured_pose
-            if captured is not None:
-                captured = _made_rigid(captured, record.name, source, pose_scale)[0]
-            kept.append(replace(record, world_from_camera=rigid, captured_pose=captured))
-    if worst > _ROUNDING:
-        findings.warn(
-            f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
-            "made rigid. [capture.pose]"
-        )
-    return kept
-
-
-def _made_rigid(
-    pose: Double, name: str, source: Path, pose_scale: float | None
-) -> tuple[Double, float]:
-    """An almost rigid pose made exactly so, and how far its axes were off; InputRefused for
-    others."""
-    axes = pose[:3, :3] / (pose_scale or 1.0)
-    off = _refuse_not_rigid(axes, name, source, pose_scale)
-    if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
-        left, _, right = np.linalg.svd(axes)
-        axes = left @ right
-    rigid = pose.copy()
-    rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
-    return rigid, off
-
-
-def is_camera_matrix(pose: Double) -> bool:
-    """Whether a 4 x 4 matrix is finite, of sensible numbers, and has the last row 0 0 0 1."""
-    return bool(
-        (np.abs(pose) <= LARGEST_OF_POSE).all()
-        and np.abs(pose[3] - [0, 0, 0, 1]).max() <= _MAX_DEVIATION
-    )
-
-
-def _is_lens(record: FrameRecord) -> bool:
-    if min(record.resolution) < 1 or max(record.resolution) > MAX_SIDE:
-        return False
-    focal, centre = np.reshape(record.intrinsics, (2, 2)) / record.resolution
-    low, high = _FOCAL_LENGTHS
-    near = np.abs(centre) <= _FARTHEST_CENTRE
-    sensible = bool(((focal >= low) & (focal <= high) & near).all())
-    return sensible and len(views_of(record.lens, record.intrinsics, record.resolution)) > 0
-
-
-def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:
-    """How far the 3 x 3 axes are from a rotation; InputRefused beyond the limit."""
-    gram = axes.T @ axes
-    deviation = float(np.abs(gram - np.eye(3)).max())
-    scale = float(np.sqrt(np.trace(gram) / 3))
-    if scale == 0 or np.abs(gram / scale**2 - np.eye(3)).max() > _MAX_DEVIATION:
-        raise InputRefused(
-            f"{source}: the pose of {name!r} is sheared or scaled unevenly (axes of length "
-            f"{', '.join(f'{length:.4g}' for length in np.sqrt(np.diag(gram)))}). Export "
-            "camera-to-world matrices that are rotation and translation. [capture.pose]"
-        )
-    if np.linalg.det(axes) < 0:
-        raise InputRefused(
-            f"{source}: the pose of {name!r} is mirrored (determinant -1): OpenCV and OpenGL axes "
-            "mixed? Turn y and z over together, never one axis alone. [capture.pose]"
-        )
-    if deviation > _MAX_DEVIATION:
-        measured = scale * (pose_scale or 1.0)
-        raise InputRefused(
-            f"{source}: the axes of the pose of {name!r} are scaled by {measured:.6g} (limit "
-            f"{_MAX_DEVIATION:g} from 1). Export rigid matrices, or, if the positions are in the "
-            f"unit of the mesh, pass --pose-scale {measured:.6g}. [capture.pose]"
-        )
-    return deviation
 
 
 def with_masks(records: Sequence[FrameRecord], findings: Findings) -> list[FrameRecord]:
@@ -358,6 +278,8 @@ def at_image_size(
     """
     kept: list[FrameRecord] = []
     scaled: list[str] = []
+    turned: list[str] = []
+    outside: list[str] = []
     for record in records:
         try:
             width, height, _ = image_size(record.image_path)
@@ -366,6 +288,11 @@ def at_image_size(
             continue
         across, down = record.resolution
         said = f"{width} x {height} pixels, but the intrinsics are for {across} x {down}"
+        orientation = orientation_of(record.image_path)
+        if orientation > 4 and (width > height) == (down > across):
+            said += "; its EXIF data turn it, so save the images upright"
+        elif orientation > 1:
+            turned.append(f"{record.name!r} (orientation {orientation})")
         # Whoever scales an image rounds its sides to whole pixels.
         if abs(width * down - height * across) >= across:
             findings.drop(record.name, said, "capture.size")
@@ -377,7 +304,22 @@ def at_image_size(
             record = replace(
                 record, resolution=(width, height), intrinsics=(fx * x, fy * y, cx * x, cy * y)
             )
+        (x, y), (width, height) = record.intrinsics[2:], record.resolution
+        if not (0 <= x <= width and 0 <= y <= height):
+            outside.append(f"{record.name!r}: {x:.0f}, {y:.0f} of {width} x {height} pixels")
         kept.append(record)
+    if turned:
+        findings.warn(
+            f"{source.name}: EXIF data turn {len(turned)} of {len(records)} images, first "
+            f"{turned[0]}; their pixels are used as they are stored, as COLMAP uses them. Save "
+            "them upright if the poses are those of upright ones. [capture.orientation]"
+        )
+    if outside:
+        findings.warn(
+            f"{source.name}: the principal points of {len(outside)} of {len(records)} frames lie "
+            f"outside of their images, as of crops alone, first {outside[0]}. Check cx and cy. "
+            "[capture.camera]"
+        )
     if scaled:
         findings.warn(
             f"{source.name}: the intrinsics of {len(scaled)} of {len(records)} frames have been "
@@ -394,24 +336,26 @@ def check_frames(
     *,
     max_nonfinite: float,
     most: int | None = None,
+    masks: Sequence[Path | None] = (),
 ) -> list[int]:
     """Indices of the frames that can be used; the others are noted in ``findings`` by their
     ``names``.
 
     max_nonfinite  share of unknown pixels above which a frame is dropped
+    masks          of the frames, where they have any; one that is black everywhere leaves nothing
     most           look at so many frames alone, evenly spread, as long as all of these can be used
     """
     some = spread_evenly(len(frames), most)
     if len(some) < len(frames) and not _any_twice(frames.image_paths):
         glance = Findings()
-        _looked_through(frames, names, some, glance, max_nonfinite)
+        _looked_through(frames, names, some, glance, max_nonfinite, masks)
         if not glance.dropped:
             findings.looked_at = some
             for name, number in glance.counts.items():
                 findings.count(name, number)
             return list(range(len(frames)))
     findings.looked_at = list(range(len(frames)))
-    return _looked_through(frames, names, findings.looked_at, findings, max_nonfinite)
+    return _looked_through(frames, names, findings.looked_at, findings, max_nonfinite, masks)
 
 
 def _any_twice(paths: Sequence[Path]) -> bool:
@@ -429,6 +373,7 @@ def _looked_through(
     which: Sequence[int],
     findings: Findings,
     max_nonfinite: float,
+    masks: Sequence[Path | None],
 ) -> list[int]:
     """Of the frames ``which`` those that can be used, as ``check_frames``."""
     usable: list[int] = []
@@ -451,6 +396,8 @@ def _looked_through(
             findings.drop(names[i], f"the same image as {name_of[digest]!r}", "capture.duplicate")
             continue
         useless = _why_useless(pixels, max_nonfinite)
+        if not useless and masks and not _shows_any(masks[i]):
+            useless = "its mask is black everywhere", "capture.mask"
         if useless:
             findings.drop(names[i], *useless)
             continue
@@ -460,6 +407,12 @@ def _looked_through(
         findings.count("pixels_negative_clamped", pixels.num_clamped)
         findings.count("pixels_clipped", int(pixels.clipped.sum()))
     return usable
+
+
+def _shows_any(mask: Path | None) -> bool:
+    with suppress(ImageRefused):  # of which who resamples the photograph will tell
+        return mask is None or bool(white_of_mask(mask).any())
+    return True
 
 
 def spread_evenly(count: int, most: int | None) -> list[int]:

@@ -24,13 +24,13 @@ from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
-from usdbrdf.files.images import needs_float, read_exr, write_exr
+from usdbrdf.files.images import needs_float, white_of_mask, write_exr
 from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames, Scan, View
-from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.model.capture import Frames, View
+from usdbrdf.model.lens import Lens
 
 # Where a file of the asset is written: its path there, and what writes it at a place.
 Place = Callable[[str, Callable[[Path], None]], None]
@@ -99,33 +99,6 @@ def frames_of_photographs(
         lenses=tuple(view.lens.described(view.intrinsics) if view else "" for view in views),
     )
     return frames, tuple(views), which
-
-
-def as_views(scan: Scan) -> Scan:
-    """The scan, each of whose photographs that bend nothing and have no mask is to be resampled as
-    if another one did: for captures that need one encoding together."""
-    frames = scan.frames
-    rows = zip(frames.image_paths, frames.intrinsics, strict=True)
-    paths, views = [], list[View]()
-    for k, (photograph, (fx, fy, cx, cy)) in enumerate(rows):
-        paths.append(Path(f"frames/{_stem(k, photograph)}.exr"))
-        views.append(
-            View(
-                photograph=photograph,
-                mask=None,
-                lens=PINHOLE,
-                intrinsics=(float(fx), float(fy), float(cx), float(cy)),
-                photograph_from_frame=np.eye(3),
-            )
-        )
-    frames = replace(
-        frames,
-        image_paths=tuple(paths),
-        photographs=tuple(view.photograph for view in views),
-        masks=(None,) * len(views),
-        lenses=tuple(view.lens.described(view.intrinsics) for view in views),
-    )
-    return replace(scan, frames=frames, views=tuple(views))
 
 
 def _stem(number: int, photograph: Path) -> str:
@@ -202,7 +175,7 @@ def _recorded(photograph: Path, mask: Path | None, encoding: str, saturation: fl
 def mask_at_size(path: Path, height: int, width: int) -> Bool:
     """(H, W) where a mask's picture is not black, by its nearest pixel; InputRefused for another
     shape than the photograph's."""
-    shown = read_exr(path)[..., :3].max(axis=-1) > 0.5
+    shown = white_of_mask(path)
     rows, columns = shown.shape
     if abs(columns * height - rows * width) >= max(columns, width):
         raise InputRefused(

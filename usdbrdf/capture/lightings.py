@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.capture.develop import as_views
 from usdbrdf.capture.native import captured_faces, captured_points
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.naming import identifier_from
 from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Frames, Scan, recorded_together
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.transport.rays import RayScene
 
@@ -90,17 +88,8 @@ def in_own_folder(scan: Scan, lighting: str) -> Scan:
     return replace(scan, frames=replace(scan.frames, image_paths=own))
 
 
-def developed_alike(scans: Mapping[str, Scan]) -> dict[str, Scan]:
-    """The scans, all of whose 8-bit photographs are resampled where those of one are: these become
-    linear, and the frames of a scene have one encoding."""
-    linear = (kind_of_encoding(scan.frames.encoding) == "linear" for scan in scans.values())
-    if all(linear) or not any(any(scan.views) for scan in scans.values()):
-        return dict(scans)
-    return {name: scan if any(scan.views) else as_views(scan) for name, scan in scans.items()}
-
-
 def refuse_other_scenes(scans: Mapping[str, Scan]) -> None:
-    """InputRefused where meshes, objects, units or encodings of the images differ."""
+    """InputRefused where meshes, objects or units of length differ."""
     first, *others = scans.values()
     for other in others:
         _refuse_another_scene(first, other)
@@ -130,22 +119,18 @@ def _refuse_another_scene(first: Scan, other: Scan) -> None:
             "objects are others",
             "objects: name one objects.json for both with --objects. [lighting.objects]",
         )
-    units = [
-        (scan.meters_per_unit, scan.up_axis, scan.frames.encoding, scan.frames.radiometric)
-        for scan in (first, other)
-    ]
+    units = [(scan.meters_per_unit, scan.up_axis) for scan in (first, other)]
     if units[0] != units[1]:
         raise refused(
-            "units or encoding are others",
-            "length of a unit, up axis and encoding of the images. State the same in options, "
-            "or convert one of the captures. [lighting.units]",
+            "units are others",
+            "length of a unit and up axis. State the same in options, or convert one of the "
+            "captures. [lighting.units]",
         )
 
 
 def _joined(scans: Mapping[str, Scan]) -> Frames:
     """The frames of all lightings, those of one after each other."""
     several = [scan.frames for scan in scans.values()]
-    assert len({frames.encoding for frames in several}) == 1, "see developed_alike"
     columns: dict[str, Any] = {}
     for field in ("world_from_camera", "intrinsics", "resolution", "exposure_time",
                   "saturation_radiance", "noise_floor_radiance"):  # fmt: skip
@@ -163,9 +148,7 @@ def _joined(scans: Mapping[str, Scan]) -> Frames:
             f.world_from_camera if f.captured_pose is None else f.captured_pose for f in several
         ]
         columns["captured_pose"] = np.concatenate(poses)
-    # Their images' encodings are one, and where none was resampled nothing is said of photographs.
-    said = [frames.photograph_encoding for frames in several if frames.photograph_encoding]
-    columns["photograph_encoding"] = said[0] if said else ""
+    columns |= recorded_together([image for f in several for image in f.recorded_each()])
     # One lens took them all, and not all tell clearly what it does.
     told = [frames.vignetting for frames in several if any(frames.vignetting)]
     columns["vignetting"] = tuple(np.mean(told or [(0.0, 0.0)], axis=0).tolist())

@@ -25,11 +25,11 @@ from usdbrdf.capture.checks import (
     at_image_size,
     check_frames,
     frames_from_records,
-    rigid_records,
     tagged_encoding,
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
+from usdbrdf.capture.rigid_poses import rigid_records
 from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
@@ -379,6 +379,7 @@ def scan_from_parts(
         findings,
         max_nonfinite=options.max_nonfinite,
         most=options.looked_at,
+        masks=[r.mask_path for r in rigid] if any(r.mask_path for r in rigid) else (),
     )
     kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
     findings.refuse_too_few_frames(source, total, views=len(kept))

@@ -28,7 +28,7 @@ from usdbrdf.files.images import needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.files.tables import csv_rows, number_in
-from usdbrdf.job.progress import progress, warn
+from usdbrdf.job.progress import progress, say, warn
 from usdbrdf.model.arrays import Byte, Double
 from usdbrdf.untrusted.video_files import MOST_FRAMES, frames_of_video, place_of
 
@@ -72,7 +72,9 @@ def develop_video(capture: Path, folder: Path) -> dict[str, Any]:
         wanted = {n + step for n in video.numbers for step in (-1, 0, 1)} | {
             n + step for n in _telling(video) for step in range(_RUN)
         }
-        found = frames_of_video(path, sorted(n for n in wanted if n in video.exposures), scratch)
+        known = sorted(n for n in wanted if n in video.exposures)
+        say(f"video: {len(known)} frames are decoded up to number {known[-1]}, then merged")
+        found = frames_of_video(path, known, scratch)
         _refuse_missing(path, video, found.numbers)
         there = frozenset(found.numbers)
         response = _response(video, there, scratch)

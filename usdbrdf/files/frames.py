@@ -93,14 +93,15 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     """
     saturation = float(frames.saturation_radiance[i])
     gain = 1.0 if frames.gain is None else float(frames.gain[i])
+    encoding = frames.encoding_of(i)
     recorded, unknown, num_clamped = read_recorded(
-        frames.image_paths[i], frames.encoding, saturation, gain
+        frames.image_paths[i], encoding, saturation, gain
     )
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
-    linear = kind_of_encoding(frames.encoding) == "linear"
-    radiance = to_working_space(recorded, frames.encoding) if linear else recorded
+    linear = kind_of_encoding(encoding) == "linear"
+    radiance = to_working_space(recorded, encoding) if linear else recorded
     if any(frames.vignetting):
         radiance = radiance / transmission(frames, i)[..., None]
     return FramePixels(

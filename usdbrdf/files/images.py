@@ -22,7 +22,7 @@ import OpenImageIO as oiio
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.files.scratch import scratch_folder
-from usdbrdf.model.arrays import Byte, Float
+from usdbrdf.model.arrays import Bool, Byte, Float
 
 T = TypeVar("T")
 MAX_SIDE = 65_536  # pixels
@@ -91,6 +91,20 @@ def read_exr(path: Path) -> Float:
     return _although_unread_once(path, read)
 
 
+def white_of_mask(path: Path) -> Bool:
+    """(H, W): where a mask's picture is not black, whatever its alpha."""
+    pixels = read_exr(path)
+    colours = pixels[..., : 3 if pixels.shape[2] > 2 else 1]
+    return np.asarray(colours.max(axis=-1) > 0.5, np.bool_)
+
+
+def orientation_of(path: Path) -> int:
+    """How a photograph's EXIF data say that it is to be turned to be upright: 1, not at all, to 8;
+    5 to 8 swap its sides. 1 where they do not say."""
+    said = open_image(path).spec().getattribute("Orientation")
+    return said if isinstance(said, int) and 1 <= said <= 8 else 1
+
+
 def _although_unread_once(path: Path, read: Callable[[], T]) -> T:
     """What is read of an image. One that is refused is read again: a disk that fails for a moment
     says nothing of the file, and would be remembered as damage of it. EnvironmentFailure where it
@@ -129,6 +143,11 @@ def stored_space(path: Path) -> tuple[str, int]:
 def is_eight_bit(path: Path) -> bool:
     """Whether the image holds bytes, from the header alone."""
     return str(open_image(path).spec().format) == "uint8"
+
+
+def holds_whole_numbers(path: Path) -> bool:
+    """Whether the image holds bytes or larger whole numbers, from the header alone."""
+    return "int" in str(open_image(path).spec().format)
 
 
 def exif_exposure(path: Path) -> float | None:

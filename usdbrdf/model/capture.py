@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,14 @@ from usdbrdf.model.arrays import Bool, Double, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.lens import Lens
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
+
+
+class Recorded(NamedTuple):
+    """How the image of a frame holds what was seen; as the fields of ``Frames`` by these names."""
+
+    encoding: str
+    radiometric: bool
+    photograph_encoding: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +50,9 @@ class Frames:
     captured_pose         (N, 4, 4) float64 or None: world_from_camera before it was refined
     lightings             the lightings of the scene that the frames show, N names, those of one
                           after each other; () where there is but one
+    recorded              how each of N images holds what was seen, where lightings differ in that;
+                          encoding and photograph_encoding are then those of the first image, and
+                          radiometric is False where any is not. () where all are alike
     """
 
     image_paths: tuple[Path, ...]
@@ -61,6 +72,7 @@ class Frames:
     captured_pose: Double | None = None
     vignetting: tuple[float, float] = (0.0, 0.0)
     lightings: tuple[str, ...] = ()
+    recorded: tuple[Recorded, ...] = ()
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -86,7 +98,18 @@ class Frames:
         for name in ("image_paths", "photographs", "masks", "lenses", "lightings"):
             found = getattr(self, name)
             columns[name] = tuple(found[i] for i in rows) if found else ()
+        if self.recorded:
+            columns |= recorded_together([self.recorded[i] for i in rows])
         return replace(self, **columns)
+
+    def encoding_of(self, i: int) -> str:
+        """Colour space of the image of frame i."""
+        return self.recorded[i].encoding if self.recorded else self.encoding
+
+    def recorded_each(self) -> tuple[Recorded, ...]:
+        """How each of the images holds what was seen."""
+        alike = Recorded(self.encoding, self.radiometric, self.photograph_encoding)
+        return self.recorded or (alike,) * len(self)
 
     def of_lighting(self, name: str) -> range:
         """The numbers of the frames that show one lighting; of all where there is but one."""
@@ -105,6 +128,15 @@ class Frames:
             height=height,
             name=self.image_paths[i].name,
         )
+
+
+def recorded_together(images: Sequence[Recorded]) -> dict[str, Any]:
+    """What ``Frames`` say of N images that are held as these are."""
+    if not images:
+        return {"recorded": ()}
+    together = images[0]._replace(radiometric=all(image.radiometric for image in images))
+    alike = len(set(images)) == 1
+    return {**together._asdict(), "recorded": () if alike else tuple(images)}
 
 
 @dataclass(frozen=True, kw_only=True)

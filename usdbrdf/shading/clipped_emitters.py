@@ -119,7 +119,7 @@ class Evidence:
     radiance        (N, 3) float32, measured L_d
     irradiance      (N, 3) float32, S_0 in W/m^2: from all light but the K lamps'
     lamp_irradiance (K, N, 3) float32, S_k: from lamp k alone, at its lower bound
-    position        (N, 3) float32, metres
+    position        (N, 3) float32, in lamps.errors.unit
     segment         (N,) int32, equal where the albedo may be taken as alike
     object          (N,) int32, equal where errors may agree beyond the segment
     prior           (K, 2) float64, mean and standard deviation of log g_k before the evidence
@@ -137,9 +137,9 @@ class Evidence:
 @dataclass(frozen=True, kw_only=True)
 class Segment:
     """Texels of one segment: log of pi L_d without ambient specular light (n, 3), its change by
-    what that light may be wrong (n,), distances (n, n) in metres, variance relative to the common
-    noise of the texels (n,) and of the whole segment (scale), and what its own specular light may
-    differ by (specular, relative)."""
+    what that light may be wrong (n,), distances (n, n) in lamps.errors.unit, variance
+    relative to the common noise of the texels (n,) and of the whole segment (scale), and what its
+    own specular light may differ by (specular, relative)."""
 
     index: npt.NDArray[np.int64]
     object: int
@@ -192,7 +192,7 @@ def segment_covariance(item: Segment, shape: Double) -> Double:
     """(n, n), of the logarithms: noise^2 variance_i on the diagonal, and a part that agrees over a
     length, of which there is more where the segment's own specular light differs.
 
-    shape (3,): logarithms of noise, agreeing part and length (metres)
+    shape (3,): logarithms of noise, agreeing part and length
     """
     noise, agreeing, length = np.exp(shape)
     smooth = (agreeing**2 + item.specular**2) * np.exp(-item.distance / length)

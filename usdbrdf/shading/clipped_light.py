@@ -42,6 +42,7 @@ _MAX_GROUPS = 24
 _REACH = calibration.number("lamps.reach")
 _NEARLY = calibration.number("lamps.nearly_as_bright")
 _AROUND = calibration.number("lamps.around")
+_UNIT = np.float32(calibration.number("lamps.errors.unit"))
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
 _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
@@ -264,7 +265,7 @@ def _evidence(
             surface, Shining.of(surface, dark), environment, chosen, seed
         ),
         lamp_irradiance=np.stack(lamps),
-        position=texels.position[chosen],
+        position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
         segment=segment,
         object=texels.object_index()[chosen].astype(np.int32),
         prior=np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in groups.lamp]),

@@ -20,7 +20,6 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_with
 from usdbrdf.capture.develop import developed
 from usdbrdf.capture.lightings import (
-    developed_alike,
     in_own_folder,
     names_of_lightings,
     refuse_other_scenes,
@@ -78,7 +77,6 @@ def ingest(
         header = StageHeader.of_scan(asset.name, *scans.values())
         check_root(asset, header)
         told: dict[str, Any] = {}
-        scans = developed_alike(scans)
         for name, scan in scans.items():
             # Photographs through lenses become frames when nothing but pixels can be refused.
             scan = in_own_folder(scan, name)

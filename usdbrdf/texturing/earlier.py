@@ -117,9 +117,13 @@ def _hashes_of_frames(frames: Frames) -> list[str]:
     )  # fmt: skip
     return [
         _hash_of(
-            [frames.encoding, sha256_of(path), *(np.asarray(n).tobytes() for n in (*row, lens))]
+            [
+                frames.encoding_of(i),
+                sha256_of(path),
+                *(np.asarray(n).tobytes() for n in (*row, lens)),
+            ]
         )
-        for path, row in zip(frames.image_paths, rows, strict=True)
+        for i, (path, row) in enumerate(zip(frames.image_paths, rows, strict=True))
     ]
 
 

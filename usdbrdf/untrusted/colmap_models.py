@@ -86,7 +86,7 @@ def read_here(images: Path) -> ColmapModel:
             found = sorted(
                 (image for image in model.images.values() if image.has_pose), key=lambda i: i.name
             )
-            names = tuple(str(image.name) for image in found)
+            names = _whole_names(images, {i.image_id: str(i.name) for i in found})
             poses = [image.cam_from_world().matrix() for image in found]
         # COLMAP says what it stumbles over in its own terms, by exceptions of several kinds.
         except Exception as error:
@@ -109,6 +109,23 @@ def read_here(images: Path) -> ColmapModel:
         camera_from_world=np.array(poses, np.float64).reshape(-1, 3, 4),
         cameras=cameras,
     )
+
+
+def _whole_names(images: Path, known: dict[int, str]) -> tuple[str, ...]:
+    """The images' names by their numbers, in the order of ``known``. In a text model a name goes on
+    to the end of its line; COLMAP itself reads it up to the first space."""
+    if images.suffix != ".txt":
+        return tuple(known.values())
+    whole = dict(known)
+    with images.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            # Number, pose (7) and camera, before the name; points are rows of numbers alone.
+            said = line.strip().split(None, 9)
+            if len(said) == 10 and said[0].isdecimal():
+                number, name = int(said[0]), said[9]
+                if number in known and name.split()[0] == known[number]:
+                    whole[number] = name
+    return tuple(whole.values())
 
 
 def _refuse_promises(file: Path) -> None:

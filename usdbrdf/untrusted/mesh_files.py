@@ -24,6 +24,7 @@ from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.material import Material, Surface, constant_map, preview_material
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
+from usdbrdf.untrusted.mesh_text import binary_ply_of_polygons, obj_counted_forwards
 
 SUFFIXES = (".ply", ".obj", ".glb")
 # The face property by which the objects of a segmented PLY are told apart.
@@ -64,7 +65,8 @@ def mesh_from_file(path: Path) -> FileMesh:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
-            f"{path}: meshes are read from {', '.join(SUFFIXES)}. Convert it to PLY. [mesh.format]"
+            f"{path}: meshes are read from {', '.join(SUFFIXES)} and USD. Convert it to PLY. "
+            "[mesh.format]"
         )
     return read_in_child("mesh", f"{__name__}:read_mesh_here", path, FileMesh)
 
@@ -161,7 +163,13 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
 
 
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
-    arrays: dict[str, Any] = load_ply(file)
+    try:
+        arrays: dict[str, Any] = load_ply(file)
+    except ValueError:
+        # Which is also what it says of triangles beside quads, if they are binary.
+        points, triangles, numbers = binary_ply_of_polygons(file)
+        label = numbers.get(LABEL_PROPERTY)
+        return _file_mesh(points, triangles, None if label is None else label.astype(np.int64))
     elements = arrays["metadata"]["_ply_raw"]
     if "vertices" not in arrays or arrays.get("faces") is None:
         return _no_faces(len(arrays.get("vertices", ())))
@@ -182,7 +190,7 @@ def _mesh_from_ply(file: BinaryIO) -> FileMesh:
 
 def _mesh_from_obj(file: BinaryIO) -> FileMesh:
     loaded: dict[str, Any] = load_obj(
-        file, skip_materials=True, maintain_order=True, split_objects=True
+        obj_counted_forwards(file), skip_materials=True, maintain_order=True, split_objects=True
     )
     parts = loaded.get("geometry", {})
     return _joined([(name, p["vertices"], p["faces"]) for name, p in parts.items()])
@@ -273,6 +281,8 @@ def read_model_here(path: Path) -> tuple[Surface, ...]:
 def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
     beside = _FilesBeside(path)
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
+    if path.suffix.lower() == ".obj":
+        file = obj_counted_forwards(file)
     stored = load(file, resolver=beside)
     if beside.refused:
         raise beside.refused[0]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.files.images import MAX_PIXELS, MAX_SIDE, write_preview_png
 from usdbrdf.model.arrays import Byte
 from usdbrdf.untrusted.bounds import read_in_child
@@ -20,7 +21,7 @@ from usdbrdf.untrusted.bounds import read_in_child
 # Containers that hold their own frames; others are lists of further files and addresses.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,mxf"
 # What the machine lacks, of what FFmpeg reports; the rest is the file's.
-_OF_THE_MACHINE = (errno.ENOMEM, errno.EIO, errno.ESTALE, errno.ENOSPC)
+_OF_THE_MACHINE = (errno.ENOMEM, errno.ESTALE, errno.ENOSPC)
 # ITU-T H.273: primaries that are BT.709's or nearly so, curves of high dynamic range (PQ and HLG),
 # and what says nothing of the matrix, which is BT.709's then from so many rows on, as players do.
 _PRIMARIES, _HIGH_RANGE, _UNSAID, _LARGE_ROWS = (0, 1, 2, 5, 6, 7), (16, 18), (2, 3), 720
@@ -86,6 +87,10 @@ def read_here(path: Path, numbers: Sequence[int], folder: str) -> VideoFrames:
     except (av.FFmpegError, ValueError, EOFError) as error:
         if getattr(error, "errno", None) in _OF_THE_MACHINE:
             raise
+        if getattr(error, "errno", None) == errno.EIO:
+            # FFmpeg says so of damage too; a disk that fails does so again.
+            with environment_failures(str(path)):
+                sha256_of(path)
         raise _unreadable(path, " ".join(str(error).split())[:160]) from error
     return VideoFrames(numbers=tuple(found), resolution=size)
 

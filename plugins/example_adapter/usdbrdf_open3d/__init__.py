@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
-from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.formats.named_pictures import path_in_capture
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,

@@ -46,7 +46,7 @@ from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Frames, Recorded, Scan
 from usdbrdf.model.mesh import ObjectLabel, is_closed
 
 Types = Sdf.ValueTypeNames
@@ -272,8 +272,16 @@ def _author_pose_and_lens(prim: Sdf.PrimSpec, scan: Scan, *, reset_transform: bo
     for name, values in zip(LENS, zip(*lens, strict=True), strict=True):
         attribute_per_frame(prim, name, Types.Float, values)
     attribute(prim, "projection", Types.Token, "perspective")
-    near, far = NEAR_M / meters_per_unit, FAR_M / meters_per_unit
-    attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(near, far))
+    attribute(prim, "clippingRange", Types.Float2, Gf.Vec2f(*_clipping_range(scan)))
+
+
+def _clipping_range(scan: Scan) -> tuple[float, float]:
+    """Near and far in scene units: the usual ones, wider where the scene is as small or large that
+    they would cut into it."""
+    seen = np.concatenate([scan.mesh.points, scan.frames.world_from_camera[:, :3, 3]])
+    across = float(np.linalg.norm(np.ptp(seen.astype(np.float64), axis=0)))
+    near, far = NEAR_M / scan.meters_per_unit, FAR_M / scan.meters_per_unit
+    return min(near, across / 100), max(far, 2 * across)
 
 
 def _author_capture(prim: Sdf.PrimSpec, frames: Frames) -> None:
@@ -296,6 +304,7 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames) -> None:
 def _record_of(frames: Frames, places: Mapping[str, Sequence[str]]) -> Photographs:
     """Of all photographs; their files and those they were made of at ``places``."""
     said: dict[str, Any] = {**places, "lens": frames.lenses, "lighting": frames.lightings}
+    said |= zip(Recorded._fields, zip(*frames.recorded_each(), strict=True), strict=True)
     said["gain"] = [1.0] * len(frames) if frames.gain is None else frames.gain.tolist()
     for name, _ in facts_of(Photographs):
         if name not in said:

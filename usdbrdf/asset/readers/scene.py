@@ -32,7 +32,7 @@ from usdbrdf.asset.properties import (
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.capture import Frames, Recorded, recorded_together
 from usdbrdf.model.mesh import INTERPOLATIONS, Triangulation, triangulate
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.options import IngestOptions
@@ -67,9 +67,13 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
     poses = np.ascontiguousarray(poses.transpose(0, 2, 1))
     poses[:, :3, 3] *= UsdGeom.GetStageMetersPerUnit(stage)
     read: dict[str, Any] = {}
+    held: dict[str, list[Any]] = {}
     for field, fact in facts_of(Photographs):
         attribute = camera.GetPrim().GetAttribute(fact.attribute())
         if fact.type in ("asset", "string"):
+            continue
+        if field in Recorded._fields:
+            held[field] = [attribute.Get(time) for time in times]
             continue
         if fact.samples:
             read[field] = np.array([attribute.Get(time) for time in times], np.float64)
@@ -90,6 +94,12 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
         return tuple(get(attribute, time) for time in times) if said else ()
 
     return Frames(
+        **recorded_together(
+            [
+                Recorded(**dict(zip(held, image, strict=True)))
+                for image in zip(*held.values(), strict=True)
+            ]
+        ),
         image_paths=tuple(paths),
         world_from_camera=poses,
         photographs=of_all("photograph", asset_file),

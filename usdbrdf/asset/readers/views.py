@@ -24,12 +24,12 @@ from usdbrdf.capture.checks import (
     check_frames,
     frames_from_records,
     refuse_photographs,
-    rigid_records,
     with_masks,
 )
 from usdbrdf.capture.develop import developed_in, frames_of_photographs
 from usdbrdf.capture.formats.transforms import frame_records
 from usdbrdf.capture.lens_views import views_of
+from usdbrdf.capture.rigid_poses import rigid_records
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, kind_of_encoding
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, PHOTOGRAPH_NOISE_FLOOR, PHOTOGRAPH_SATURATION
@@ -116,7 +116,13 @@ def photographs_of_views(
     total = len(records) + len(findings.dropped)
     encoding = captured.photograph_encoding or captured.encoding
     displayed = kind_of_encoding(encoding) == "display"
-    if refuse_photographs([r.image_path for r in records], assume_srgb=not captured.radiometric):
+    # TIFF files of whole numbers are what the capture's are, if these are such.
+    alike = any(p.suffix.lower() in (".tif", ".tiff") for p in captured.recorded_in())
+    if refuse_photographs(
+        [r.image_path for r in records],
+        assume_srgb=not captured.radiometric,
+        encoding=encoding if alike else None,
+    ):
         encoding = encoding if displayed else PHOTOGRAPH_ENCODING
         records = [_as_the_captures_photographs(r, captured) for r in records]
     elif displayed:  # which no image of radiance is

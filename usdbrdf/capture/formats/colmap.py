@@ -24,8 +24,7 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.formats.named_pictures import mask_beside, scan_of
-from usdbrdf.capture.formats.transforms import path_in_capture
+from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
@@ -159,14 +158,14 @@ def _workspaces(path: Path) -> list[_Workspace]:
 def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     """The first model that has images whose size its cameras are for, or the first with images."""
     workspaces = _workspaces(path)
+    pictured = Pictured(folder=path, options=options)
     candidates: list[_Chosen] = []
     for workspace in workspaces:
         model = colmap_model(workspace.model)
         if not model.names:
             continue
         counts = [
-            sum(path_in_capture(path, _joined(f, name), options).is_file() for name in model.names)
-            for f in workspace.images
+            sum(pictured.of(name, f) is not None for name in model.names) for f in workspace.images
         ]
         if max(counts):
             images = workspace.images[counts.index(max(counts))]
@@ -176,9 +175,10 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
         if not workspaces:
             where = f"{path}: no COLMAP model (cameras and images, .bin or .txt)"
         raise InputRefused(
-            f"{where}. Put the model in sparse/0 and the images in images/. [colmap.images]"
+            f"{where}. Put the model in sparse/0 and the images in images/, or name their folder "
+            "with --frames. [colmap.images]"
         )
-    fitting = [c for c in candidates if _images_fit(path, c, candidates, options)]
+    fitting = [c for c in candidates if _images_fit(pictured, c, candidates)]
     chosen = (fitting or candidates)[0]
     parts = [c for c in candidates if c.images == chosen.images]
     largest = max(parts, key=lambda c: len(c.model.names))
@@ -191,14 +191,12 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     return largest
 
 
-def _images_fit(
-    path: Path, one: _Chosen, others: Sequence[_Chosen], options: CaptureOptions
-) -> bool:
+def _images_fit(pictured: Pictured, one: _Chosen, others: Sequence[_Chosen]) -> bool:
     """Whether the first image that is there has the shape that its camera is for, and is not what
     another model, one of pinholes, calls its own."""
     for k, name in enumerate(one.model.names):
-        image = path_in_capture(path, _joined(one.images, name), options)
-        if not image.is_file():
+        image = pictured.of(name, one.images)
+        if image is None:
             continue
         camera = one.model.cameras[int(one.model.camera_of_image[k])]
         try:
@@ -212,9 +210,9 @@ def _images_fit(
             return True
         for other in others:
             if name in other.model.names and other.images != one.images:
-                undistorted = path_in_capture(path, _joined(other.images, name), options)
+                undistorted = pictured.of(name, other.images)
                 theirs = other.model.cameras[0]
-                same = undistorted.is_file() and sha256_of(undistorted) == sha256_of(image)
+                same = undistorted and sha256_of(undistorted) == sha256_of(image)
                 if same and not lens_of(theirs)[0].bends:
                     return False
         return True
@@ -222,7 +220,6 @@ def _images_fit(
 
 
 def _joined(folder: str, name: str) -> str:
-    name = name.replace("\\", "/")
     return f"{folder}/{name}" if folder else name
 
 
@@ -230,9 +227,10 @@ def _records(
     path: Path, chosen: _Chosen, options: CaptureOptions, findings: Findings
 ) -> list[FrameRecord]:
     records = []
+    pictured = Pictured(folder=path, options=options)
     for k, name in enumerate(chosen.model.names):
-        file = path_in_capture(path, _joined(chosen.images, name), options)
-        if not file.is_file():
+        file = pictured.of(name, chosen.images)
+        if file is None:
             findings.drop(name, "the image file does not exist", "capture.file")
             continue
         camera = chosen.model.cameras[int(chosen.model.camera_of_image[k])]
@@ -248,6 +246,7 @@ def _records(
                 mask_path=mask_beside(path, name.replace("\\", "/"), options),
             )
         )
+    pictured.warn_of_others(findings, path)
     return records
 
 

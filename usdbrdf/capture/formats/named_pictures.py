@@ -7,14 +7,14 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
-from usdbrdf.capture.formats.transforms import path_in_capture
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -23,6 +23,7 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -36,7 +37,19 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # Where programs put the pictures, beside what they say of them.
 _FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+_MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+
+
+def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path:
+    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
+    for folder in options.allow_outside if candidate else ():
+        with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
+            candidate.encode()
+            path = (root / candidate).resolve()
+            if path.is_relative_to(folder.resolve()):
+                return path
+    return contained(root, candidate)
 
 
 def rigid_pose(rotation: Double, centre: Double) -> Double:
@@ -137,12 +150,79 @@ def _below(folder: Path, *, deep: bool) -> Pictures:
     return Pictures(folder=folder, paths=tuple(sorted(paths)))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pictured:
+    """The pictures that a document names by paths below a folder.
+
+    otherwise  names of those that are there under another one alone, and the files that were taken
+    """
+
+    folder: Path
+    options: CaptureOptions
+    otherwise: dict[str, Path] = field(default_factory=dict)
+    _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
+
+    def of(self, name: str, below: str = "") -> Path | None:
+        """The picture called ``name`` in the folder ``below``: the file of this name, else the one
+        beside it whose name differs in nothing but case and kind of picture, radiance first: poses
+        are found of JPEGs whose radiance is developed later. Of ``--frames``, the picture there
+        that has its name. None where there is none. InputRefused for what leads out."""
+        if self.options.frames is not None:
+            return self._of_frames.named(name)
+        whole = f"{below}/{name}" if below else name
+        path = path_in_capture(self.folder, whole, self.options)
+        if "\\" in name and not path.is_file():
+            path = path_in_capture(self.folder, whole.replace("\\", "/"), self.options)
+        if path.is_file():
+            return path
+        beside = self._in_folder(path.parent)
+        alike = beside.get(_stem(path.name), [])
+        suffix = path.suffix.lower()
+        if any(one.suffix.lower() == suffix for found in beside.values() for one in found):
+            # Where some are of the kind that is named, what is of another may be their depths.
+            alike = [one for one in alike if one.suffix.lower() == suffix]
+        best = min(map(_nearness, alike), default=0)
+        nearest = [one for one in alike if _nearness(one) == best]
+        if len(nearest) != 1:
+            return None
+        if path.name not in (nearest[0].name, nearest[0].stem):
+            self.otherwise[name] = nearest[0]
+        return nearest[0]
+
+    def warn_of_others(self, findings: Findings, source: Path) -> None:
+        """One sentence where pictures were taken for others."""
+        if self.otherwise:
+            name, path = next(iter(self.otherwise.items()))
+            findings.warn(
+                f"{source.name}: {len(self.otherwise)} pictures are there under another name alone "
+                f"and are taken for those that it names, first {path.name!r} for {name!r}. "
+                "[capture.file]"
+            )
+
+    @cached_property
+    def _of_frames(self) -> Pictures:
+        return pictures_of(self.folder, self.options)
+
+    def _in_folder(self, folder: Path) -> dict[str, list[Path]]:
+        if folder not in self._listed:
+            of_stem = self._listed[folder] = {}
+            for path in _below(folder, deep=False).paths if folder.is_dir() else ():
+                of_stem.setdefault(_stem(path.name), []).append(path)
+        return self._listed[folder]
+
+
+def _stem(name: str) -> str:
+    """A picture's name in lower case, without its suffix if that is one of a picture."""
+    stem, _, suffix = name.lower().rpartition(".")
+    return stem if f".{suffix}" in SUFFIXES else name.lower()
+
+
 def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
     """The mask of a picture in masks/: of its name there (in subfolders too), with or without its
     suffix, as programs have it; black is what is not to be looked at."""
     stem = str(PurePosixPath(name).with_suffix(""))
     for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
-        for suffix in (".png", ".jpg"):
+        for suffix in _MASK_SUFFIXES:
             # Of which nothing can be asked, as of too long a name, is not there.
             if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
                 return path_in_capture(folder, f"masks/{usual}{suffix}", options)
@@ -199,7 +279,8 @@ def scan_of(
 
     objects   what knows the objects of the mesh; ``--objects`` comes first
     source    the document that messages name; ``folder``, the capture's own, absolute
-    encoding  of images that hold radiance, where the format says; the user's comes first
+    encoding  of the images, where the format says; the user's comes first. InputRefused where these
+              hold something of another kind
     """
     for record in records:
         if record.lens.bends and "undistort" in record.image_path.parent.name.lower():
@@ -213,13 +294,26 @@ def scan_of(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "
             "[capture.mask]"
         )
+    elif (folder / "masks").is_dir() and any((folder / "masks").iterdir()):
+        findings.warn(
+            f"{source.name}: nothing is masked: there is a folder masks, but none of its pictures "
+            "is called as one of the frames, or named by it. [capture.mask]"
+        )
+    encoding = options.encoding or encoding
     photographs = refuse_photographs(
-        [r.image_path for r in records], assume_srgb=options.assume_srgb
+        [r.image_path for r in records], assume_srgb=options.assume_srgb, encoding=encoding
     )
+    if options.encoding is None and encoding is not None:
+        if photographs != (kind_of_encoding(encoding) == "display"):
+            kind = "8-bit photographs" if photographs else "scene-linear images"
+            raise InputRefused(
+                f"{source}: encoding is {encoding!r}, but the images are {kind}. Remove or correct "
+                "it. [capture.format]"
+            )
+        options = replace(options, encoding=encoding)
     if photographs:
         records = as_photographs(records, findings, source)
     else:
-        options = replace(options, encoding=options.encoding or encoding)
         if unknown := sum(math.isinf(r.saturation_radiance) for r in records):
             findings.warn(
                 f"{source.name}: {unknown} of {len(records)} frames state no saturation, so "

@@ -4,52 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import (
-    LARGEST_OF_POSE,
-    Findings,
-    FrameRecord,
-    at_image_size,
-    clause_of,
-    is_camera_matrix,
-    refuse_photographs,
-    up_axis_of,
-)
+from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of, up_axis_of
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
-from usdbrdf.capture.parts import (
-    as_photographs,
-    geometry_from_file,
-    radiance_encoding,
-    scan_from_parts,
-)
+from usdbrdf.capture.formats.named_pictures import Pictured, path_in_capture, scan_of
+from usdbrdf.capture.parts import geometry_from_file
+from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
-from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Curve, Lens, whole_sphere
 from usdbrdf.options import CaptureOptions
-
-
-def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path:
-    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
-    for folder in options.allow_outside if candidate else ():
-        with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
-            candidate.encode()
-            path = (root / candidate).resolve()
-            if path.is_relative_to(folder.resolve()):
-                return path
-    return contained(root, candidate)
-
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -68,8 +42,6 @@ _LARGEST = 1e15
 # Where no size is stated: a principal point this far from the image's centre, or an image this much
 # wider than its angle says, in parts of its size, belongs to an image of another size.
 _OFF_CENTRE = 0.2
-# Tried where a name has no suffix, as in the NeRF authors' synthetic scenes.
-_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg")
 
 
 def matches(path: Path) -> bool:
@@ -82,26 +54,6 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     source = path / "transforms.json" if path.is_dir() else path
     findings = Findings()
     capture, records = _captured(source, options, findings)
-    photographs = refuse_photographs(
-        [r.image_path for r in records], assume_srgb=options.assume_srgb
-    )
-    stated = capture.document.get("encoding")
-    if stated is not None and not (isinstance(stated, str) and kind_of_encoding(stated)):
-        known = f"{', '.join(known_encodings())} and OpenColorIO's others"
-        said = f"encoding is {str(stated)[:40]!r}, none of {known}. Correct it."
-        raise capture.refuse(said, "capture.format")
-    if stated is not None and photographs != (kind_of_encoding(stated) == "display"):
-        kind = "8-bit photographs" if photographs else "scene-linear images"
-        said = f"encoding is {stated!r}, but the images are {kind}. Remove or correct it."
-        raise capture.refuse(said, "capture.format")
-    encoding = radiance_encoding(options, photographs=photographs, stated=stated)
-    if photographs:
-        records = as_photographs(records, findings, source)
-    elif unknown := sum(math.isinf(r.saturation_radiance) for r in records):
-        findings.warn(
-            f"{source.name}: {unknown} of {len(records)} frames state no saturation_radiance, so "
-            "clipped pixels pass for radiance. [capture.saturation]"
-        )
     up_axis = _stated(capture, "up_axis", ("Y", "Z"))
     if up_axis is None and options.up_axis is None and (up_axis := up_axis_of(records)) == "Y":
         findings.warn(
@@ -109,7 +61,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
             "[capture.up-axis]"
         )
-    return scan_from_parts(
+    return scan_of(
         records,
         lambda: geometry_from_file(
             options.mesh or _beside(capture, "mesh", "mesh.ply"),
@@ -119,16 +71,25 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             capture_root=source.parent,
             meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         ),
-        options if stated is None else replace(options, encoding=encoding),
+        options,
         findings,
-        name=source.parent.name,
         adapter=NAME,
         source=source,
-        encoding=encoding,
-        radiometric=not photographs,
+        folder=source.parent,
+        encoding=_encoding(capture),
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         up_axis=up_axis or "Z",
     )
+
+
+def _encoding(capture: _Capture) -> str | None:
+    """The colour space of the images, where the document says."""
+    stated = capture.document.get("encoding")
+    if stated is not None and not (isinstance(stated, str) and kind_of_encoding(stated)):
+        known = f"{', '.join(known_encodings())} and OpenColorIO's others"
+        said = f"encoding is {str(stated)[:40]!r}, none of {known}. Correct it."
+        raise capture.refuse(said, "capture.format")
+    return stated
 
 
 def frame_records(
@@ -156,6 +117,7 @@ class _Capture:
     source: Path
     document: Mapping[str, Any]
     options: CaptureOptions
+    pictured: Pictured
     images: bool = True
     is_legacy: bool = False
     first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
@@ -212,9 +174,16 @@ def _captured(
             "applied_transform if they are not. [capture.legacy]"
         )
     capture = _Capture(
-        source=source, document=document, options=options, images=images, is_legacy=legacy
+        source=source,
+        document=document,
+        options=options,
+        pictured=Pictured(folder=source.parent, options=options),
+        images=images,
+        is_legacy=legacy,
     )
-    return capture, [r for frame in frames if (r := _record(capture, frame, findings))]
+    records = [r for frame in frames if (r := _record(capture, frame, findings))]
+    capture.pictured.warn_of_others(findings, source)
+    return capture, records
 
 
 def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
@@ -239,8 +208,8 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
     stated = width is not None and height is not None
     lens = _lens(capture, frame, name)
     needed = capture.images or not stated
-    path = _image_path(capture, name) if needed else capture.source.parent / name
-    if needed and not path.is_file():
+    path = capture.pictured.of(name) if needed else capture.source.parent / name
+    if path is None:
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
     pose = _pose(frame.get("transform_matrix"))
@@ -274,14 +243,6 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         saturation_radiance=capture.positive(frame, "saturation_radiance") or math.inf,
         noise_floor_radiance=capture.number(frame, "noise_floor_radiance") or 0.0,
     )
-
-
-def _image_path(capture: _Capture, name: str) -> Path:
-    path = path_in_capture(capture.source.parent, name, capture.options)
-    if not path.suffix and not path.exists():
-        candidates = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-        return next((candidate for candidate in candidates if candidate.is_file()), path)
-    return path
 
 
 def _pose(matrix: object) -> Double | None:

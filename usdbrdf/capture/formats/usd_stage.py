@@ -19,11 +19,11 @@ from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
+    path_in_capture,
     pictures_of,
     refuse_without_pictures,
     scan_of,
 )
-from usdbrdf.capture.formats.transforms import path_in_capture
 from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size

@@ -1,0 +1,239 @@
+"""Captures as people have them: names, kinds of files and habits that formats allow and other
+programs have. Each is written by hand from the format's documentation, gives the scan of the room
+that it was made of, or is refused in a sentence."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from tests.scenes import MadeCapture, edited, make_capture, write_ply
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.images import read_exr, white_of_mask
+from usdbrdf.model.capture import Scan
+from usdbrdf.options import IngestOptions
+
+DIM = {"lamp": (0.75, 0.5, 0.625)}
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> MadeCapture:
+    return make_capture(tmp_path / "scan", subdivisions=1, radiance=DIM)
+
+
+def _read(made: MadeCapture, **options: object) -> Scan:
+    return read_scan(made.folder, IngestOptions(**options))
+
+
+def _rename(made: MadeCapture, name: str, *, files: str = "") -> None:
+    """Frame i is called ``name`` in the document and is the file ``files``, both of i."""
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["file_path"] = name.format(i)
+            if files:
+                place = made.folder / files.format(i)
+                place.parent.mkdir(exist_ok=True)
+                made.image(i).rename(place)
+
+
+def _write_bytes(path: Path, pixels: np.ndarray, **attributes: int) -> None:
+    """Whole numbers, (H, W, C), in the kind of file that the path says."""
+    path.parent.mkdir(exist_ok=True)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], str(pixels.dtype))
+    for key, value in attributes.items():
+        spec.attribute(key, value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(pixels)
+    assert output.close()
+
+
+def _as_photographs(made: MadeCapture, suffix: str, **attributes: int) -> None:
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["file_path"] = f"photographs/{i:04d}{suffix}"
+            del frame["saturation_radiance"], frame["noise_floor_radiance"]
+            shown = to_display_srgb8(read_exr(made.image(i)), exposure_scale=1.0)
+            _write_bytes(made.folder / frame["file_path"], shown, **attributes)
+
+
+def _quaternion(matrix: np.ndarray) -> np.ndarray:
+    """w, x, y, z of a rotation: the eigenvector of Bar-Itzhack's matrix."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    upper = np.array([
+        [xx - yy - zz, 0, 0, 0], [yx + xy, yy - xx - zz, 0, 0],
+        [zx + xz, zy + yz, zz - xx - yy, 0], [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+    ])  # fmt: skip
+    x, y, z, w = np.linalg.eigh(upper)[1][:, -1]
+    return np.array([w, x, y, z])
+
+
+def _as_colmap(made: MadeCapture, names: list[str], files: list[str]) -> None:
+    """The text model of COLMAP's documentation, of two cameras."""
+    made.manifest.unlink()
+    model = made.folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    numbers = " ".join(map(str, made.intrinsics))
+    rows = [f"3 PINHOLE 32 24 {numbers}", f"17 OPENCV 32 24 {numbers} 0 0 0 0"]
+    (model / "cameras.txt").write_text("# Camera list\n" + "\n".join(rows) + "\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for i, (name, file) in enumerate(zip(names, files, strict=True)):
+        turn = (made.world_from_camera[i][:3, :3] * (1, -1, -1)).T
+        place = -turn @ made.world_from_camera[i][:3, 3]
+        numbers = " ".join(map(str, [*_quaternion(turn), *place]))
+        # One point of the image, with a number that might be an image's.
+        lines += [f"{i + 1} {numbers} {(3, 17)[i % 2]} {name}", "1.5 2.5 -1 3 4 5"]
+        (made.folder / "images" / file).parent.mkdir(parents=True, exist_ok=True)
+        made.image(i).rename(made.folder / "images" / file)
+    (model / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _same(scan: Scan, made: MadeCapture) -> None:
+    order = np.argsort([path.stem.rpartition(" ")[2] for path in scan.frames.image_paths])
+    np.testing.assert_allclose(
+        scan.frames.world_from_camera[order], made.world_from_camera, atol=1e-6
+    )
+    np.testing.assert_allclose(scan.frames.intrinsics[0], made.intrinsics)
+
+
+@pytest.mark.parametrize("kind", ["exr", "JPG"])
+def test_names_of_colmaps_images_may_hold_anything(made, kind):
+    """Also of JPEGs, in whose place radiance lies."""
+    pytest.importorskip("pycolmap")
+    names = [f"{('linke Küche', '右/cam 2')[i % 2]}/Bild ñ {i:04d}.{kind}" for i in range(12)]
+    _as_colmap(made, names, [str(Path(name).with_suffix(".exr")) for name in names])
+    scan = _read(made)
+    _same(scan, made)
+    taken = [sentence for sentence in scan.warnings if "[capture.file]" in sentence]
+    assert len(taken) == (kind == "JPG")
+    assert all("12 pictures" in sentence for sentence in taken)
+
+
+@pytest.mark.parametrize(
+    ("name", "files", "told"),
+    [
+        ("frames\\{:04d}.exr", "", False),
+        ("./frames/{:04d}", "", False),
+        ("frames/{:04d}.jpg", "", True),
+        ("Pictures/IMG {:04d}.exr", "Pictures/Img {:04d}.EXR", True),
+        ("frame.{:04d}", "frame.{:04d}.exr", False),
+    ],
+)
+def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, told):
+    _rename(made, name, files=files)
+    scan = _read(made)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+    assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
+
+
+def test_frames_of_another_folder_are_named_by_it(made, tmp_path):
+    _rename(made, "jpegs/{:04d}.jpg")
+    (made.folder / "frames").rename(tmp_path / "radiance")
+    with pytest.raises(InputRefused, match=r"--frames.*\[capture\.file\]$"):
+        _read(made)
+    scan = _read(made, frames=tmp_path / "radiance")
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+    assert {path.parent for path in scan.frames.image_paths} == {(tmp_path / "radiance").resolve()}
+
+
+def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):
+    """Which may be its depths."""
+    _as_photographs(made, ".jpg")
+    (made.folder / "photographs" / "0004.jpg").unlink()
+    _write_bytes(made.folder / "photographs" / "0004.png", np.zeros((24, 32, 3), np.uint8))
+    scan = _read(made, assume_srgb=True)
+    assert {path.suffix for path in scan.frames.image_paths} == {".jpg"}
+    assert any("'photographs/0004.jpg': the image file does not exist" in s for s in scan.warnings)
+
+
+def test_two_files_that_a_name_might_mean_are_none(made):
+    shutil.copy(made.image(0), made.folder / "frames" / "0000.Exr")
+    _rename(made, "frames/{:04d}.jpg")
+    dropped = [s for s in _read(made).warnings if "1 of 12 frames dropped" in s]
+    assert len(dropped) == 1
+
+
+def test_tiff_of_whole_numbers_is_a_photograph_unless_its_space_is_stated(made):
+    _as_photographs(made, ".tif")
+    with pytest.raises(InputRefused, match=r"whole numbers.*--input-space.*\[capture\.ldr\]$"):
+        _read(made)
+    taken = _read(made, assume_srgb=True).frames
+    assert (taken.radiometric, taken.encoding) == (False, "srgb_rec709_scene")
+    stated = _read(made, encoding="lin_rec2020_scene").frames
+    assert (stated.radiometric, stated.encoding) == (True, "lin_rec2020_scene")
+
+
+def test_masks_have_suffixes_of_any_case(made):
+    pytest.importorskip("pycolmap")
+    names = [f"{i:04d}.exr" for i in range(12)]
+    _as_colmap(made, names, names)
+    white = np.full((24, 32, 1), 255, np.uint8)
+    white[:6] = 0
+    for name in names:
+        _write_bytes(made.folder / "masks" / f"{name}.PNG", white)
+    assert all(_read(made).frames.masks)
+
+
+def test_a_folder_of_masks_that_are_nobodys_is_told(made):
+    _write_bytes(made.folder / "masks" / "other.png", np.zeros((24, 32, 1), np.uint8))
+    said = [sentence for sentence in _read(made).warnings if "[capture.mask]" in sentence]
+    assert len(said) == 1
+    assert "nothing is masked" in said[0]
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_a_mask_is_its_colours_and_not_its_alpha(tmp_path, channels):
+    pixels = np.zeros((4, 6, channels), np.uint8)
+    pixels[:2] = 255
+    if channels in (2, 4):
+        pixels[..., -1] = 255
+    _write_bytes(tmp_path / "mask.png", pixels)
+    assert white_of_mask(tmp_path / "mask.png").all(axis=1).tolist() == [True, True, False, False]
+
+
+def test_a_mask_that_leaves_nothing_costs_its_frame(made):
+    with edited(made.manifest) as document:
+        document["frames"][3]["mask_path"] = "black.png"
+    _write_bytes(made.folder / "black.png", np.zeros((24, 32, 3), np.uint8))
+    scan = _read(made)
+    assert len(scan.frames) == 11
+    assert any("black everywhere. [capture.mask]" in sentence for sentence in scan.warnings)
+
+
+def test_photographs_that_exif_data_turn_are_taken_as_they_are_stored(made):
+    _as_photographs(made, ".jpg", Orientation=3)
+    scan = _read(made, assume_srgb=True)
+    assert any("turn 12 of 12" in s and "[capture.orientation]" in s for s in scan.warnings)
+    with edited(made.manifest) as document:
+        document.update(w=24, h=32)
+    with pytest.raises(InputRefused, match=r"for 24 x 32\. "):
+        _read(made, assume_srgb=True)
+    _as_photographs_turned(made)
+    with pytest.raises(InputRefused, match=r"EXIF data turn it.*\[capture\.size\]$"):
+        _read(made, assume_srgb=True)
+
+
+def _as_photographs_turned(made: MadeCapture) -> None:
+    """As cameras held upright leave them: lying, with the turn in their EXIF data."""
+    for i in range(12):
+        shown = to_display_srgb8(read_exr(made.image(i)), exposure_scale=1.0)
+        _write_bytes(made.folder / f"photographs/{i:04d}.jpg", shown, Orientation=6)
+
+
+def test_a_mesh_in_millimetres_beside_poses_in_metres(made):
+    write_ply(made.folder / "mesh.ply", 1000 * made.points, made.triangles, made.face_object)
+    with pytest.raises(InputRefused, match=r"one unit\. \[capture\.parallax\]$"):
+        _read(made)
+
+
+def test_a_principal_point_outside_of_the_image_is_told(made):
+    assert not any("[capture.camera]" in sentence for sentence in _read(made).warnings)
+    with edited(made.manifest) as document:
+        document["cx"] = 40.0
+    assert any("[capture.camera]" in sentence for sentence in _read(made).warnings)

@@ -1,0 +1,121 @@
+"""Poses as a capture states them, made exactly rigid, and lenses that make sense; what is a
+convention of the whole capture is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.lens_views import views_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.images import MAX_SIDE
+from usdbrdf.model.arrays import Double
+
+# Of R^T R from the identity: what is refused, and what float32 and printed digits explain.
+_MAX_DEVIATION, _ROUNDING = 1e-3, 1e-5
+# What is so near stays as it is, and so do poses that were made rigid before.
+_EXACT = 1e-14
+# Beyond this no number of a camera matrix makes sense; focal lengths and principal points, in sizes
+# of the image.
+LARGEST_OF_POSE = 1e9
+_FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
+
+
+def rigid_records(
+    records: Sequence[FrameRecord], findings: Findings, source: Path, *, pose_scale: float | None
+) -> list[FrameRecord]:
+    """Records with poses made exactly rigid; frames without a sensible camera are dropped.
+
+    Almost rigid ones are snapped; scaled, sheared and mirrored ones are refused, because each of
+    them is a convention that holds for the whole capture.
+    """
+    kept: list[FrameRecord] = []
+    worst = 0.0
+    for record in records:
+        pose = record.world_from_camera
+        if not is_camera_matrix(pose):
+            findings.drop(
+                record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
+            )
+        elif not _is_lens(record):
+            lens = ", ".join(f"{number:g}" for number in record.intrinsics)
+            size = " x ".join(map(str, record.resolution))
+            bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
+            said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
+            findings.drop(record.name, said, "capture.camera")
+        else:
+            rigid, off = _made_rigid(pose, record.name, source, pose_scale)
+            worst = max(worst, off)
+            captured = record.captured_pose
+            if captured is not None:
+                captured = _made_rigid(captured, record.name, source, pose_scale)[0]
+            kept.append(replace(record, world_from_camera=rigid, captured_pose=captured))
+    if worst > _ROUNDING:
+        findings.warn(
+            f"{source.name}: camera matrices were up to {worst:.2g} off a rotation and have been "
+            "made rigid. [capture.pose]"
+        )
+    return kept
+
+
+def _made_rigid(
+    pose: Double, name: str, source: Path, pose_scale: float | None
+) -> tuple[Double, float]:
+    """An almost rigid pose made exactly so, and how far its axes were off; InputRefused for
+    others."""
+    axes = pose[:3, :3] / (pose_scale or 1.0)
+    off = _refuse_not_rigid(axes, name, source, pose_scale)
+    if np.abs(axes.T @ axes - np.eye(3)).max() > _EXACT:
+        left, _, right = np.linalg.svd(axes)
+        axes = left @ right
+    rigid = pose.copy()
+    rigid[:3, :3], rigid[3] = axes, (0, 0, 0, 1)
+    return rigid, off
+
+
+def is_camera_matrix(pose: Double) -> bool:
+    """Whether a 4 x 4 matrix is finite, of sensible numbers, and has the last row 0 0 0 1."""
+    return bool(
+        (np.abs(pose) <= LARGEST_OF_POSE).all()
+        and np.abs(pose[3] - [0, 0, 0, 1]).max() <= _MAX_DEVIATION
+    )
+
+
+def _is_lens(record: FrameRecord) -> bool:
+    if min(record.resolution) < 1 or max(record.resolution) > MAX_SIDE:
+        return False
+    focal, centre = np.reshape(record.intrinsics, (2, 2)) / record.resolution
+    low, high = _FOCAL_LENGTHS
+    near = np.abs(centre) <= _FARTHEST_CENTRE
+    sensible = bool(((focal >= low) & (focal <= high) & near).all())
+    return sensible and len(views_of(record.lens, record.intrinsics, record.resolution)) > 0
+
+
+def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:
+    """How far the 3 x 3 axes are from a rotation; InputRefused beyond the limit."""
+    gram = axes.T @ axes
+    deviation = float(np.abs(gram - np.eye(3)).max())
+    scale = float(np.sqrt(np.trace(gram) / 3))
+    if scale == 0 or np.abs(gram / scale**2 - np.eye(3)).max() > _MAX_DEVIATION:
+        raise InputRefused(
+            f"{source}: the pose of {name!r} is sheared or scaled unevenly (axes of length "
+            f"{', '.join(f'{length:.4g}' for length in np.sqrt(np.diag(gram)))}). Export "
+            "camera-to-world matrices that are rotation and translation. [capture.pose]"
+        )
+    if np.linalg.det(axes) < 0:
+        raise InputRefused(
+            f"{source}: the pose of {name!r} is mirrored (determinant -1): OpenCV and OpenGL axes "
+            "mixed? Turn y and z over together, never one axis alone. [capture.pose]"
+        )
+    if deviation > _MAX_DEVIATION:
+        measured = scale * (pose_scale or 1.0)
+        raise InputRefused(
+            f"{source}: the axes of the pose of {name!r} are scaled by {measured:.6g} (limit "
+            f"{_MAX_DEVIATION:g} from 1). Export rigid matrices, or, if the positions are in the "
+            f"unit of the mesh, pass --pose-scale {measured:.6g}. [capture.pose]"
+        )
+    return deviation
