@@ -121,7 +121,9 @@ def test_loaded_by_mitsuba_alone_it_is_the_same_scene(tmp_path):
     assert rendered(mi, file, 1).shape[0] == 48
     sensors = ElementTree.parse(file).findall("sensor")
     assert [sensor.get("id") for sensor in sensors] == ["eye", "wide"]
-    assert sensors[0].find("sampler/integer").attrib == {"name": "sample_count", "value": "4"}
+    told = {one.get("name"): one.get("value") for one in sensors[0].findall("sampler/integer")}
+    assert told.pop("sample_count") == "4"
+    assert set(told) == {"seed"}
 
 
 def test_the_command_writes_what_it_would_render(room, tmp_path, capsys):
@@ -143,15 +145,13 @@ def test_an_earlier_scene_is_replaced_and_nothing_else(room, tmp_path):
     file, options = tmp_path / "floor.xml", RelightOptions(camera="/room/eye", width=8)
     relight(room, file, options)
     first = file.read_bytes()
-    (tmp_path / "floor.files/stale.ply").write_text("old")
+    (tmp_path / f"floor.files/mesh_0000.{'0' * 16}.ply").write_text("old")
     relight(room, file, options)
     assert file.read_bytes() == first
-    assert sorted(p.name for p in (tmp_path / "floor.files").iterdir()) == [
-        "mesh_0000.ply",
-        "mesh_0001.ply",
-        "picture_0000.exr",
-        "usdbrdf.txt",
-    ]
+    names = sorted(p.name for p in (tmp_path / "floor.files").iterdir())
+    assert [name.split(".")[0] for name in names] == [
+        "mesh_0000", "mesh_0001", "picture_0000", "usdbrdf",
+    ]  # fmt: skip
     (tmp_path / "mine.files").mkdir()
     (tmp_path / "mine.files/notes.txt").write_text("mine")
     with pytest.raises(OwnershipConflict, match=r"mine\.files"):
@@ -184,7 +184,7 @@ def test_clear_parts_of_a_mesh_are_left_out(tmp_path):
     assert len(mi.load_file(str(file)).shapes()) == 2
 
 
-@pytest.mark.parametrize("name", ["publish_folder", "move"])
+@pytest.mark.parametrize("name", ["move", "flush_folder", "publish"])
 def test_where_it_cannot_be_put_in_place_the_earlier_scene_stays(tmp_path, monkeypatch, name):
     mi, file = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml"
     write_scene_file(mi, file, SMALL, (camera(),), bounces=4, samples=1)
@@ -203,28 +203,57 @@ def test_where_it_cannot_be_put_in_place_the_earlier_scene_stays(tmp_path, monke
 
 
 KILLED = """
-import os, signal, sys
+import itertools, os, signal, sys
+from dataclasses import replace
 from pathlib import Path
 from tests.relighting import test_scene_file as tests
-def killed(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-tests.scene_file.move = killed
+from usdbrdf.files.atomic import _swept
 mi = tests.mitsuba_variant("scalar_rgb")
-tests.write_scene_file(
-    mi, Path(sys.argv[1]), tests.SMALL, (tests.camera(),), bounces=4, samples=1
-)
+file, plate = Path(sys.argv[1]), tests.plate(tests.material(0.1))
+other = replace(tests.SMALL, surfaces=(plate, plate))
+tests.write_scene_file(mi, file, tests.SMALL, (tests.camera(),), bounces=4, samples=1)
+first, kept = tests.in_words(mi, file), set()
+for number in itertools.count(1):
+    child = os.fork()
+    if child == 0:
+        passed, change = itertools.count(1), {name: getattr(os, name) for name in tests.CHANGES}
+        def at(name):
+            def changing(*arguments, **named):
+                if next(passed) == number:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return change[name](*arguments, **named)
+            return changing
+        for name in tests.CHANGES:
+            setattr(os, name, at(name))
+        tests.write_scene_file(mi, file, other, (tests.camera(),), bounces=4, samples=1)
+        os._exit(0)
+    if os.waitpid(child, 0)[1] == 0:
+        break
+    kept.add(tests.in_words(mi, file) == first)
+    _swept.clear()  # as another process
+    tests.write_scene_file(mi, file, tests.SMALL, (tests.camera(),), bounces=4, samples=1)
+    assert tests.in_words(mi, file) == first, number
+    assert len(list(file.parent.iterdir())) == 2, list(file.parent.iterdir())
+    assert len(list(file.with_name("room.files").iterdir())) == 2
+print(number, kept)
 """
+CHANGES = ("replace", "rename", "mkdir", "unlink", "rmdir")
 
 
-def test_after_a_kill_the_same_command_writes_it(tmp_path):
-    mi, file = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml"
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(file)], cwd=ROOT, check=False)
-    assert killed.returncode == -signal.SIGKILL
-    assert (tmp_path / "room.files/mesh_0000.ply").is_file()
-    assert not file.exists()
-    write_scene_file(mi, file, SMALL, (camera(),), bounces=4, samples=1)
-    # What the killed one had beside it goes too.
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["room.files", "room.xml"]
+def in_words(mi, file):
+    """What Mitsuba loads, which raises where the file or one that it names is not there."""
+    return str(mi.load_file(str(file)))
+
+
+@pytest.mark.fault("R2")
+def test_killed_at_any_change_the_earlier_scene_or_the_new_one_is_there(tmp_path):
+    file = tmp_path / "room.xml"
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(file)], cwd=ROOT, check=True, capture_output=True
+    )
+    number, kept = killed.stdout.decode().split(maxsplit=1)
+    assert int(number) > 6
+    assert kept.strip() == "{False, True}"
 
 
 # A mesh that Mitsuba's own writer has in its buffer until it closes the file, and a larger one.
@@ -243,3 +272,17 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path, triangles):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, before)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_seed_is_of_the_noise_alone(tmp_path):
+    mi, file, found = mitsuba_variant("scalar_rgb"), tmp_path / "room.xml", []
+    scene = scene_of_everything()
+    for seed in (0, 0, 1):
+        eyes = camera(), camera("other")
+        write_scene_file(mi, file, scene, eyes, bounces=4, samples=1, seed=seed)
+        loaded = mi.load_file(str(file))
+        found += [np.array(mi.render(loaded, sensor=i, spp=4)) for i in range(2)]
+    first, other, again, _, seeded, _ = found
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(first, seeded)
