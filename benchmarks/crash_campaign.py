@@ -108,7 +108,7 @@ def stop(campaign: Campaign, series: Series, runs: int) -> None:
     """SIGSTOP, the same command beside it, which has to be refused, and SIGCONT."""
     step = series.start.step
     for name, case, kind, number in each_place(campaign, series, CHANGES, runs):
-        refused = []
+        refused: list[int] = []
 
         def strike(call: Call, case: Path = case, refused: list[int] = refused) -> None:
             os.kill(call.process, signal.SIGSTOP)

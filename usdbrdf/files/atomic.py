@@ -186,10 +186,9 @@ def publish_folder(staged: Path, final: Path) -> None:
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
     """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
-    final = final.resolve()
     with temporary_folder(final) as staged:
         yield staged
-        publish_folder(staged, final)
+        publish_folder(staged, final.resolve())
 
 
 @contextmanager
