@@ -5,15 +5,13 @@ from __future__ import annotations
 import errno
 import resource
 import signal
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from tests.fault_injection import run_fresh
 from tests.json_schemas import checked
 from tests.relighting.scenes import material, plate, surface
 from usdbrdf.cli import main
@@ -28,7 +26,6 @@ from usdbrdf.relighting.relight import relight
 from usdbrdf.relighting.render import mitsuba_scene, mitsuba_variant, render_view
 from usdbrdf.relighting.scene_file import write_scene_file
 
-ROOT = Path(__file__).resolve().parents[2]
 SPP = 256
 
 
@@ -203,57 +200,35 @@ def test_where_it_cannot_be_put_in_place_the_earlier_scene_stays(tmp_path, monke
 
 
 KILLED = """
-import itertools, os, signal, sys
+import sys
 from dataclasses import replace
 from pathlib import Path
+from tests.fault_injection import killed_at_each_change
 from tests.relighting import test_scene_file as tests
-from usdbrdf.files.atomic import _swept
-mi = tests.mitsuba_variant("scalar_rgb")
-file, plate = Path(sys.argv[1]), tests.plate(tests.material(0.1))
-other = replace(tests.SMALL, surfaces=(plate, plate))
-tests.write_scene_file(mi, file, tests.SMALL, (tests.camera(),), bounces=4, samples=1)
-first, kept = tests.in_words(mi, file), set()
-for number in itertools.count(1):
-    child = os.fork()
-    if child == 0:
-        passed, change = itertools.count(1), {name: getattr(os, name) for name in tests.CHANGES}
-        def at(name):
-            def changing(*arguments, **named):
-                if next(passed) == number:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return change[name](*arguments, **named)
-            return changing
-        for name in tests.CHANGES:
-            setattr(os, name, at(name))
-        tests.write_scene_file(mi, file, other, (tests.camera(),), bounces=4, samples=1)
-        os._exit(0)
-    if os.waitpid(child, 0)[1] == 0:
-        break
-    kept.add(tests.in_words(mi, file) == first)
-    _swept.clear()  # as another process
-    tests.write_scene_file(mi, file, tests.SMALL, (tests.camera(),), bounces=4, samples=1)
-    assert tests.in_words(mi, file) == first, number
+mi, file = tests.mitsuba_variant("scalar_rgb"), Path(sys.argv[1])
+plate = tests.plate(tests.material(0.1))
+def write(surfaces):
+    scene, eyes = replace(tests.SMALL, surfaces=surfaces), (tests.camera(),)
+    tests.write_scene_file(mi, file, scene, eyes, bounces=4, samples=1)
+def found():  # which raises where the file or one that it names is not there
+    return str(mi.load_file(str(file)))
+write((plate,))
+first, kept = found(), set()
+for number in killed_at_each_change(lambda: write((plate, plate))):
+    kept.add(found() == first)
+    write((plate,))
+    assert found() == first, number
     assert len(list(file.parent.iterdir())) == 2, list(file.parent.iterdir())
     assert len(list(file.with_name("room.files").iterdir())) == 2
-print(number, kept)
+print(number, *sorted(kept))
 """
-CHANGES = ("replace", "rename", "mkdir", "unlink", "rmdir")
-
-
-def in_words(mi, file):
-    """What Mitsuba loads, which raises where the file or one that it names is not there."""
-    return str(mi.load_file(str(file)))
 
 
 @pytest.mark.fault("R2")
 def test_killed_at_any_change_the_earlier_scene_or_the_new_one_is_there(tmp_path):
-    file = tmp_path / "room.xml"
-    killed = subprocess.run(
-        [sys.executable, "-c", KILLED, str(file)], cwd=ROOT, check=True, capture_output=True
-    )
-    number, kept = killed.stdout.decode().split(maxsplit=1)
+    number, *kept = run_fresh(KILLED, tmp_path / "room.xml").split()
     assert int(number) > 6
-    assert kept.strip() == "{False, True}"
+    assert kept == ["False", "True"]
 
 
 # A mesh that Mitsuba's own writer has in its buffer until it closes the file, and a larger one.

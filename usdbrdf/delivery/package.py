@@ -47,7 +47,7 @@ from usdbrdf.errors import (
     UsageError,
     UsdBrdfError,
 )
-from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, make_folders, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -345,7 +345,7 @@ def _folder_of(output: Path) -> Iterator[None]:
     """Make the folders above a file; those that hold nothing at the end go again."""
     made = [folder for folder in output.parents if not folder.exists()]
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(output.parent)
         yield
     finally:
         for folder in made:  # the innermost first

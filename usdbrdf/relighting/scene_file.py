@@ -68,16 +68,7 @@ def write_scene_file(
     OwnershipConflict where something else stands in the place of the scene or of its files.
     """
     folder = path.with_name(f"{path.stem}.files")
-    if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
-        raise OwnershipConflict(
-            f"{folder}: this is in the place of the scene's meshes and pictures. Name another file "
-            "with -o. [relight.output]"
-        )
-    if path.exists() and not _says_so(path):
-        raise OwnershipConflict(
-            f"{path}: not a scene that usdbrdf wrote. Name another file with -o. [relight.output]"
-        )
-    with environment_failures(str(path)), temporary_folder(path) as work:
+    with environment_failures(str(path)), _taking(path, folder) as work:
         made, text = work / "made" / folder.name, work / "made" / path.name
         made.mkdir(parents=True)
         root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples, seed)
@@ -92,6 +83,22 @@ def write_scene_file(
             if _NAME.fullmatch(file.name) and file.name not in names:
                 file.unlink()
     return len(names)
+
+
+@contextmanager
+def _taking(path: Path, folder: Path) -> Iterator[Path]:
+    """A folder to make the scene in, unless something else stands in its place."""
+    if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
+        raise OwnershipConflict(
+            f"{folder}: this is in the place of the scene's meshes and pictures. Name another file "
+            "with -o. [relight.output]"
+        )
+    if path.exists() and not _says_so(path):
+        raise OwnershipConflict(
+            f"{path}: not a scene that usdbrdf wrote. Name another file with -o. [relight.output]"
+        )
+    with temporary_folder(path) as work:
+        yield work
 
 
 @contextmanager
