@@ -231,6 +231,10 @@ class Campaign:
             self.results.note(series, name, None)
             shutil.rmtree(case)
             return
+        if not where and status == -signal.SIGALRM:  # on a machine that others keep busy
+            print(f"  undecided after {LONGEST_SECONDS} s: {series.named(name)}", flush=True)
+            shutil.rmtree(case)
+            return
         if not where:
             problem = f"before any call was disturbed: ended with {status} {said(case)[-300:]}"
             self.note(series, name, problem)

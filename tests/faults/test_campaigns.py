@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -114,6 +115,15 @@ def test_a_step_that_fails_before_it_is_disturbed_is_a_problem(campaign, status)
     assert case.exists() == (status != 0)
     problems = campaign.results.tally().get(("fit", "kill"), [])
     assert [(f"with {status} why" in problem) for problem in problems] == [True] * (status != 0)
+
+
+def test_a_run_that_found_no_time_before_it_was_disturbed_is_tried_again(campaign, capsys):
+    case = campaign.work / "case"
+    case.mkdir()
+    campaign.ended(killed(campaign), 0, "", case, -signal.SIGALRM)
+    assert campaign.waiting(killed(campaign), 1) == [0]
+    assert not case.exists()
+    assert "undecided" in capsys.readouterr().out
 
 
 def test_a_campaign_goes_on_where_it_was_stopped(campaign, monkeypatch):
