@@ -17,12 +17,13 @@ A fault is ``kill@POINT`` (SIGKILL to this process) or ``enospc@POINT`` (OSError
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,53 @@ def arm_from_environment() -> None:
 def inject(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fault in this process, until ``monkeypatch`` undoes it."""
     Fault(fault).arm(monkeypatch.setattr)
+
+
+def killed_at_each_change(work: Callable[[], object]) -> Iterator[int]:
+    """Do the work in forked processes that are killed before its first change of names, its second,
+    and so on, until one is not. For processes without threads: see ``run_fresh``."""
+    for number in itertools.count(1):
+        if (child := os.fork()) == 0:
+            status = 1
+            try:
+                _kill_at(number)
+                work()
+                status = 0
+            finally:
+                os._exit(status)
+        ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        usdbrdf.files.atomic._swept.clear()  # what comes next is another process
+        assert ended in (0, -signal.SIGKILL), ended
+        if ended == 0:
+            return
+        yield number
+
+
+def _kill_at(number: int) -> None:
+    """Kill this process at its so-manieth change of names."""
+    left = itertools.count(number, -1)
+
+    def around(change: Callable[..., Any]) -> Callable[..., Any]:
+        def changing(*arguments: Any, **named: Any) -> Any:
+            if next(left) == 1:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return change(*arguments, **named)
+
+        return changing
+
+    for name in ("replace", "rename", "mkdir", "unlink", "rmdir"):
+        setattr(os, name, around(getattr(os, name)))
+
+
+def run_fresh(program: str, *arguments: str | Path) -> str:
+    """What a program says that runs in a process of its own, which imports what tests do."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def run_watched(*arguments: str | Path, timeout_s: float) -> subprocess.CompletedProcess[str]:

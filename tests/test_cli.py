@@ -221,6 +221,46 @@ def test_names_that_are_not_utf8(tmp_path, capsys):
     assert list((tmp_path / name).iterdir()) == []
 
 
+@pytest.mark.fault("R17")
+@pytest.mark.parametrize("output", ["x" * 256, "/".join(["x" * 200] * 25)])
+def test_names_longer_than_the_system_allows(output, capture, tmp_path, capsys):
+    place = tmp_path / output
+    for arguments in (["convert", capture, "-o", place], ["validate", place], ["inspect", place]):
+        status, line = refused(capsys, *arguments)
+        assert (status, "File name too long. Shorten it. [usage.path]" in line) == (2, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("R17")
+def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    for arguments in (["convert", capture, "-o", tmp_path / "loop/out"], ["validate", "loop"]):
+        arguments = [tmp_path / "loop" if word == "loop" else word for word in arguments]
+        status, line = refused(capsys, *arguments)
+        assert (status, "symbolic links" in line, "[environment.path]" in line) == (4, True, True)
+
+
+@pytest.mark.fault("R17")
+@pytest.mark.parametrize("arguments", [["convert", "scan", "-o", "out"], ["doctor"]])
+def test_a_current_folder_that_is_gone(arguments, tmp_path):
+    (gone := tmp_path / "gone").mkdir()
+    call = f'rmdir {gone}; exec {sys.executable} -P -m usdbrdf "$@"'
+    done = subprocess.run(
+        ["/bin/sh", "-c", call, "sh", *arguments],
+        cwd=gone, env=with_package(), capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count("\n")) == (4, 1), done.stderr
+    assert "the current folder: No such file" in done.stderr
+
+
+@pytest.mark.fault("R17")
+def test_a_locale_that_spells_names_otherwise_than_usd(tmp_path):
+    spelt = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = run("validate", "caf\xe9", cwd=tmp_path, env=with_package() | spelt)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "set LC_ALL=C.UTF-8" in done.stderr
+
+
 def test_missing_scan(tmp_path, capsys):
     status, line = refused(capsys, "convert", tmp_path / "none", "-o", tmp_path / "a" / "b")
     assert status == 3

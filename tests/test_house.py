@@ -228,6 +228,7 @@ ENGINEERING: dict[str, str] = {
     "_LEVEL_2": "discretisation of the search",
     "_LISTED": "what is printed",
     "_LOBES": "a filter, measured by benchmarks/lenses.py",
+    "_LONGEST": "length of a name",
     "_MANY_FRAMES": "rays: noise against time",
     "_MANY_OVER_ONE": "from here on a warning is printed",
     "_MANY_PER_SEGMENT": "time: how many are chosen from",

@@ -47,9 +47,11 @@ def _run(arguments: Sequence[str]) -> int:
 
         show(f"usdbrdf {code_version()}")
         return 0
-    command = parsed(arguments, COMMANDS)
     with loading():
+        from usdbrdf.files.paths import refuse_lost_folder
         from usdbrdf.job.memory import refuse_few_addresses
+    refuse_lost_folder()
+    command = parsed(arguments, COMMANDS)
     set_quiet(getattr(command, "quiet", False))
     refuse_few_addresses()
     return command.run()

@@ -7,6 +7,7 @@ An option that several classes in it have is given once, and reaches all of them
 from __future__ import annotations
 
 import ast
+import errno
 import inspect
 import math
 import os
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_origin
 
 from usdbrdf import options
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.job.interrupts import loading
 from usdbrdf.option import REQUIRED, Option, OptionField, Options, option_fields
 from usdbrdf.options import Insert
@@ -171,9 +172,9 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
         return text
     if option.file:
         # Said before any work is done; an input that is not there is refused as a capture would be.
-        if not Path(text).is_file():
+        if not (path := _path(text)).is_file():
             raise InputRefused(f"{text}: no such file. Check the path. [usage.file]")
-        return _path(text)
+        return path
     return _checked(field, text, f"{option.name} {text}")
 
 
@@ -192,12 +193,24 @@ def _checked(field: OptionField, text: str, subject: str) -> Any:
 
 
 def _path(text: str) -> Path:
-    try:
-        os.path.realpath(text).encode()
-    except UnicodeEncodeError as error:
+    """A path that can be asked for; whether anything is there is for the command to say."""
+    place = os.path.realpath(text)
+    # What Python makes of a name depends on the locale; USD takes it for UTF-8.
+    if os.fsencode(place) != place.encode(errors="surrogatepass"):
         raise UsageError(
             f"{text}: the name of this file, or of a folder above it, is not UTF-8, as USD asks of "
-            "all names. Rename it. [usage.path]"
+            "all names. Rename it, or set LC_ALL=C.UTF-8 if it is. [usage.path]"
+        )
+    try:
+        os.stat(text)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise UsageError(f"{text}: {error.strerror}. Shorten it. [usage.path]") from error
+        raise EnvironmentFailure(
+            f"{text}: {error.strerror}. Check the path, and the permissions of the folders above. "
+            "[environment.path]"
         ) from error
     return Path(text)
 
@@ -222,7 +235,7 @@ def _matrix(text: str) -> Any:
 
     from usdbrdf.files.tables import number_rows
 
-    path = Path(text)
+    path = _path(text)
     if not path.is_file():
         raise InputRefused(f"{path}: no such file. Check the path. [usage.file]")
     try:

@@ -31,6 +31,7 @@ from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.cluster.session import workers_of as workers_of
 from usdbrdf.errors import OwnershipConflict
+from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.first_run import compiling_beside
 from usdbrdf.job.ownership import edited_files, is_held, owned_folder
 from usdbrdf.job.progress import say
@@ -126,7 +127,9 @@ def working_on(
                 "drop them. [ownership.edited]"
             )
         if edited and hand_edits == "adopt":
-            for copy in adopt(asset, [asset.folder / file for file in edited]):
+            with environment_failures(str(asset.folder)):
+                copies = adopt(asset, [asset.folder / file for file in edited])
+            for copy in copies:
                 say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")
         yield asset
         if known_hashes(state) != before and is_edited(made := Asset.at(asset.folder)):

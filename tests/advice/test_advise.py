@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -159,6 +160,15 @@ def test_a_place_that_is_not_there_is_refused(advised, tmp_path, capsys):
     assert main(["advise", str(folder), "--clearance", "3"]) == InputRefused.exit_code
     assert "[advice.space]" in capsys.readouterr().err
     assert main(["advise", str(folder), "--lowest", "2", "--highest", "1"]) == 2
+
+
+@pytest.mark.fault("R5")
+def test_a_folder_that_cannot_be_locked_is_said(advised, tmp_path, capsys):
+    shutil.copytree(advised[0], folder := tmp_path / "room")
+    (folder / ".usdbrdf/lock").unlink()
+    (folder / ".usdbrdf/lock").mkdir()
+    assert main(["advise", str(folder)]) == 4
+    assert "[environment.io]" in capsys.readouterr().err
 
 
 def test_a_published_version_is_left_alone(advised, tmp_path):

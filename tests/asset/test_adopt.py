@@ -1,11 +1,15 @@
 """Edits made in files that are ours: kept beside edits.usda, never mixed into it."""
 
+import os
+import resource
+import signal
+
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
 from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layout import ROLES
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, OwnershipConflict
 
 
 def edit(path, change):
@@ -96,3 +100,33 @@ def test_a_binary_layer_is_damaged_where_usd_cannot_read_it_and_only_there(tmp_p
     assert is_damaged(path)
     path.with_suffix(".usda").write_text("#usda 1.0\nnot finished {")
     assert not is_damaged(path.with_suffix(".usda"))
+
+
+@pytest.mark.fault("R1")
+def test_what_is_adopted_is_on_the_disk_before_anything_is_replaced(built, monkeypatch):
+    asset, flushed, fsync = built.asset, set(), os.fsync
+
+    def flushing(descriptor):
+        flushed.add(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", flushing)
+    layer, texture = asset.layer("material"), asset.folder / "textures" / "lamp.emission.exr"
+    for copy in adopt(asset, [layer, texture]):
+        above = [folder for folder in copy.parents if folder.is_relative_to(asset.folder)]
+        assert {place.stat().st_ino for place in (copy, *above)} <= flushed
+
+
+@pytest.mark.fault("R1")
+def test_a_disk_that_takes_no_copy_is_said_and_no_half_of_one_stays(built):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+        with pytest.raises(EnvironmentFailure, match=r"adopted-1.usda: .+\[environment\.io\]$"):
+            adopt(built.asset, [built.asset.layer("material")])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert not list(built.asset.folder.glob("*adopted*"))
+    assert not list(built.asset.folder.glob(".tmp-*"))

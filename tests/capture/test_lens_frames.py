@@ -274,6 +274,22 @@ def test_what_later_steps_depend_on_is_the_photograph(tmp_path):
     assert hashed() != before
 
 
+@pytest.mark.fault("S5")
+def test_photographs_may_be_called_as_long_as_a_file_may(tmp_path):
+    made = capture_through(tmp_path / "room", "OPENCV")
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            name = f"{'x' * 240}{i:04d}.exr"  # which tell them apart at the end alone
+            made.image(i).rename(made.image(i).with_name(name))
+            frame["file_path"] = f"frames/{name}"
+    asset = Asset.at(tmp_path / "asset")
+    with owned_folder(asset.folder):
+        ingest(made.folder, asset)
+    found = [file.name for file in (asset.folder / "frames").iterdir()]
+    assert len(found) == len(document["frames"])
+    assert max(map(len, found)) < 80
+
+
 def in_eight_bits(made):
     """An eighth of the radiance as sRGB in PNG files."""
     with edited(made.manifest) as document:

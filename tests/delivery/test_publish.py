@@ -81,7 +81,9 @@ def test_versions_follow_each_other_and_never_change(room, tmp_path):
     hashes = {path: hashlib.sha256(data).hexdigest() for path, data in first.items()}
     del hashes["manifest.json"]
     assert manifest["files"] == hashes
-    assert not any(file.stat().st_mode & 0o222 for file in (dest / "v001").rglob("*.usd*"))
+    modes = [file.stat().st_mode for file in (dest / "v001").rglob("*.usd*")]
+    assert not any(mode & 0o222 for mode in modes)
+    assert all(mode & 0o777 == (room.asset.root_layer.stat().st_mode & 0o444) for mode in modes)
     again = publish(folder, dest)
     assert (again["version"], again["new"]) == ("v001", False)
     edit(room, RED)

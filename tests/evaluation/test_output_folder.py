@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fault_injection import run_fresh
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.evaluation.report import FILES, files_of, output_folder
@@ -17,7 +18,7 @@ def write(folder, *names):
         for name in names:
             (work / name).parent.mkdir(exist_ok=True)
             (work / name).write_text(name)
-        write_json(work / DOCUMENT, {FILES: [*files_of(work), DOCUMENT]})
+        write_json(work / DOCUMENT, {FILES: [*files_of(work), DOCUMENT], "whole": True})
 
 
 def test_a_second_run_replaces_what_the_first_made_and_nothing_else(tmp_path):
@@ -66,3 +67,34 @@ def test_a_stale_list_cannot_delete_outside(tmp_path):
     write_json(tmp_path / "out" / DOCUMENT, {FILES: ["../precious", "a"]})
     write(tmp_path / "out", "b")
     assert files_of(tmp_path) == ["out/b", f"out/{DOCUMENT}", "precious"]
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from tests.evaluation.test_output_folder import DOCUMENT, FILES, files_of, read_json, write
+from tests.fault_injection import killed_at_each_change
+top = Path(sys.argv[1])
+for number in killed_at_each_change(lambda: write(top / "new" / "out", "pictures/a", "b")):
+    write(top / "new" / "out", "b", "c")
+    assert files_of(top) == [f"new/out/{name}" for name in ("b", "c", DOCUMENT)], files_of(top)
+folder, mixed = top / "new" / "out", 0
+write(folder, "b", "c")
+for number in killed_at_each_change(lambda: write(folder, "a", "pictures/b")):
+    there, told = files_of(folder), read_json(folder / DOCUMENT)
+    if "whole" not in told:
+        mixed += 1
+    elif told[FILES] == ["b", "c", DOCUMENT]:
+        assert [name for name in there if name[0] != "."] == ["b", "c", DOCUMENT], there
+    else:
+        assert {"a", "pictures/b"} <= {*there}
+    write(folder, "b", "c")
+    assert files_of(top) == [f"new/out/{name}" for name in ("b", "c", DOCUMENT)], files_of(top)
+print(number, mixed)
+"""
+
+
+@pytest.mark.fault("R2")
+def test_killed_at_any_change_the_next_run_knows_the_folder_and_nobody_reads_a_mixture(tmp_path):
+    number, mixed = map(int, run_fresh(KILLED, tmp_path).split())
+    assert number > mixed > 2

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.fault_injection import run_fresh
 from tests.json_schemas import checked
 from usdbrdf.cli import main
 from usdbrdf.commands import COMMANDS
@@ -319,3 +320,42 @@ def test_names_that_would_mix_or_be_no_files(tmp_path, names, retired):
     (tmp_path / "scans.json").write_text(json.dumps(document))
     with pytest.raises(InputRefused, match=r"\[farm.list\]"):
         read_list(tmp_path / "scans.json")
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from tests.fault_injection import killed_at_each_change
+from tests.farm import test_bundle as tests
+from usdbrdf.farm.scans import known_in
+top = Path(sys.argv[1])
+scans = [tests.list_of(tests.folders(top / "scans", *names)) for names in ("ab", "cde")]
+def write(folder, number):
+    known = known_in(folder)
+    listed = tests.list_of([scans[number].root / place for place in scans[number].places], known)
+    made = tests.bundle_of("job", listed, tests.ConvertOptions(), tests.FarmOptions())
+    tests.write_bundle(folder, listed, made)
+def found(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name[0] != "."}
+write(top / "whole", 0)
+for number in killed_at_each_change(lambda: write(top / "new" / "job", 0)):
+    write(top / "new" / "job", 0)
+    assert found(top / "new" / "job") == found(top / "whole"), number
+first, seen = found(top / "whole"), set()
+write(top / "new" / "job", 1)
+second = found(top / "new" / "job")
+for number in killed_at_each_change(lambda: write(top / "whole", 1)):
+    there = found(top / "whole")
+    seen.add("first" if there == first else "second" if there == second else "none")
+    assert there in (first, second) or "template.json" not in there, number
+    write(top / "whole", 1)
+    assert found(top / "whole") == second, number
+    for name, content in first.items():
+        (top / "whole" / name).write_bytes(content)
+print(*sorted(seen))
+"""
+
+
+@pytest.mark.fault("R2")
+def test_killed_at_any_change_no_bundle_is_of_two_lists(tmp_path):
+    assert run_fresh(KILLED, tmp_path).split() == ["first", "none", "second"]

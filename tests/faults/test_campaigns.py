@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,8 +13,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import crash_campaign
+import crash_cases
 import mutation_score
-from crash_campaign import Campaign, Start
+from crash_cases import Campaign, Results, Series, Start
 from mutation_score import Copy, Mutation, is_decided
 
 ADDED = Mutation("usdbrdf/files/sums.py", 1, 4, "operator", 4, "a + b", "(a - b)")
@@ -90,15 +93,58 @@ def test_what_was_tried_beside_what_is_drawn_does_not_count(monkeypatch, tmp_pat
     assert f"all           1 of {len(every):>4} found" in capsys.readouterr().out
 
 
+@pytest.fixture
+def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Campaign:
+    """One without a capture, that keeps its results in a file."""
+    monkeypatch.setattr(crash_cases, "in_fork", lambda _: 0)
+    (tmp_path / "room").mkdir()
+    return Campaign(tmp_path, Results(tmp_path / "results"))
+
+
+def killed(campaign: Campaign) -> Series:
+    start = Start("fit", False, campaign.work / "room", calls=Counter(write=40))
+    return Series(start, "kill", (0, 0))
+
+
 @pytest.mark.parametrize("status", [0, 1, 4])
-def test_a_step_that_fails_before_it_is_disturbed_is_a_problem(tmp_path, monkeypatch, status):
-    monkeypatch.setattr(crash_campaign, "in_fork", lambda _: 0)
-    campaign = Campaign(tmp_path, 0)
-    case = tmp_path / "case"
+def test_a_step_that_fails_before_it_is_disturbed_is_a_problem(campaign, status):
+    case = campaign.work / "case"
     case.mkdir()
     (case / "said").write_text("why")
-    campaign.ended(Start("fit", False, tmp_path), "kill", "", case, status)
-    assert campaign.missed == (status == 0)
+    campaign.ended(killed(campaign), 0, "", case, status)
     assert case.exists() == (status != 0)
-    problems = campaign.tally.get(("fit", "kill"), [])
+    problems = campaign.results.tally().get(("fit", "kill"), [])
     assert [(f"with {status} why" in problem) for problem in problems] == [True] * (status != 0)
+
+
+def test_a_run_that_found_no_time_before_it_was_disturbed_is_tried_again(campaign, capsys):
+    case = campaign.work / "case"
+    case.mkdir()
+    campaign.ended(killed(campaign), 0, "", case, -signal.SIGALRM)
+    assert campaign.waiting(killed(campaign), 1) == [0]
+    assert not case.exists()
+    assert "undecided" in capsys.readouterr().out
+
+
+def test_a_campaign_goes_on_where_it_was_stopped(campaign, monkeypatch):
+    file, series = campaign.work / "results", killed(campaign)
+    for case, problem in ((0, ""), (1, None), (3, "other bytes")):
+        campaign.results.note(series, case, problem)
+    file.write_text(file.read_text() + '{"case": "fit first, ki')  # stopped while it wrote
+    again = Campaign(campaign.work, Results(file))
+    assert again.waiting(series, 6) == [2, 4, 5]
+    assert again.waiting(Series(series.start, "kill", (0, 1)), 2) == [0, 1]
+    assert again.results.tally() == {("fit", "kill"): ["", "other bytes"]}
+    again.results.note(series, 2, "")
+    assert Campaign(campaign.work, Results(file)).waiting(series, 4) == []
+    monkeypatch.setattr(crash_cases, "tasks_identity", lambda: "other sources")
+    assert Campaign(campaign.work, Results(file)).waiting(series, 2) == [0, 1]
+
+
+def test_places_are_the_same_in_each_process_and_others_in_each_round(campaign):
+    series = killed(campaign)
+    places = crash_campaign.spread(series, ("write", "sync"), 6)
+    assert len(places) == 6
+    assert places == crash_campaign.spread(killed(campaign), ("write", "sync"), 6)
+    for seed in ((0, 1), (1, 0)):
+        assert places != crash_campaign.spread(Series(series.start, "kill", seed), ("write",), 6)

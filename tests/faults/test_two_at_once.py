@@ -12,7 +12,7 @@ PROGRAM = """
 import os, shutil, sys
 from pathlib import Path
 sys.path.insert(0, "benchmarks")
-from crash_campaign import OPTIONS, in_fork
+from crash_cases import OPTIONS, in_fork
 from generated_capture import write_tiny
 from kill_sweep import STEPS, contents
 from system_calls import can_watch, run_watched

@@ -251,6 +251,14 @@ def test_a_text_is_flushed_with_its_folder(tmp_path, on_disk):
     )  # fmt: skip
 
 
+@pytest.mark.fault("R1")
+def test_folders_that_are_made_are_flushed_with_those_above(tmp_path, on_disk):
+    with whole_folder(tmp_path / "new" / "above" / "it") as staged:
+        assert on_disk == [("flush", tmp_path.name), ("flush", "new")]
+        (staged / "a").touch()
+    assert on_disk[-2:] == [("rename", "it"), ("flush", "above")]
+
+
 @pytest.mark.parametrize("error", [errno.EINVAL, errno.ENOTSUP, errno.EIO])
 def test_folders_that_cannot_be_flushed(tmp_path, monkeypatch, error):
     def failing(_descriptor):

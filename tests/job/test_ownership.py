@@ -73,6 +73,15 @@ def test_output_that_is_a_file_or_below_one(tmp_path):
 
 
 @pytest.mark.fault("R5")
+def test_output_over_a_link_that_leads_nowhere(tmp_path):
+    (tmp_path / "link").symlink_to("gone")
+    for output in (tmp_path / "link", tmp_path / "link/room"):
+        with pytest.raises(EnvironmentFailure, match=r"a link to gone, .+\[environment.output\]"):
+            own(output)
+    assert names_in(tmp_path) == ["link"]
+
+
+@pytest.mark.fault("R5")
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
 def test_unwritable_parent(tmp_path):
     tmp_path.chmod(0o500)

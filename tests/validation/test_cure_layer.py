@@ -1,6 +1,8 @@
 """validate --fix: cures go into a new layer and nowhere else, and work where it is put."""
 
 import errno
+import resource
+import signal
 from dataclasses import replace
 
 import pytest
@@ -126,6 +128,27 @@ def test_a_disk_that_is_full_leaves_no_name_behind(built, monkeypatch):
         write_cures(built.asset, built.asset.folder / "fixes.usda")
     assert not list(built.asset.folder.glob("*fixes*"))
     assert not list(built.asset.folder.glob(".tmp-*"))
+
+
+@pytest.mark.fault("R1")
+def test_a_disk_that_takes_none_of_it_is_said(built, monkeypatch):
+    FAULTS["LookMaterial"](built)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def open_then_full(root_layer):
+        stage = open_or_finding(root_layer)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+        return stage
+
+    monkeypatch.setattr("usdbrdf.validation.validate.open_or_finding", open_then_full)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        with pytest.raises(EnvironmentFailure, match=r"fixes.usda: USD could .+\[environment\.io"):
+            write_cures(built.asset, built.asset.folder / "fixes.usda")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert not list(built.asset.folder.glob("*fixes*"))
 
 
 def test_file_systems_without_hard_links_will_do(built, monkeypatch):

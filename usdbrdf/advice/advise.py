@@ -51,6 +51,7 @@ from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas, viewed_asset
+from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.material.fit_views import MIN_OBSERVATIONS
@@ -103,7 +104,8 @@ def advise(
     chosen = options or AdviseOptions()
     asset = Asset.made(Path(folder))
     refuse_published(asset)
-    with folder_lock(asset.folder / STATE_FOLDER, wait_s, without_lock=without_lock):
+    state = asset.folder / STATE_FOLDER
+    with environment_failures(str(state)), folder_lock(state, wait_s, without_lock=without_lock):
         place, atlas = measured_atlas(asset.folder, chosen.lighting)
         # Where none is asked for it is the one that the asset opens in.
         place = place.in_lighting(atlas.lighting or None)

@@ -11,9 +11,9 @@ from pathlib import Path
 from pxr import Sdf, Tf, UsdUtils
 
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path
-from usdbrdf.asset.readers.compose import try_in_child
-from usdbrdf.errors import InputRefused, OwnershipConflict
-from usdbrdf.files.atomic import temporary_beside
+from usdbrdf.asset.readers.compose import in_one_line, try_in_child
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
+from usdbrdf.files.atomic import make_folders, publish, temporary_beside
 
 _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
 
@@ -23,7 +23,8 @@ def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
     A layer becomes adopted-N.usda: text, its paths made right for the new place; one of a single
     lighting holds in that alone. Other files go to
     a folder adopted-N/, and the layers that are adopted with them point there. The artist adds
-    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it."""
+    adopted-N.usda to the sublayers of edits.usda, which is not touched, or takes parts of it.
+    All of it is on the disk when this returns: what was edited is about to be replaced."""
     layers = [path for path in edited if path.suffix in _LAYER_SUFFIXES]
     others = [path for path in edited if path.suffix not in _LAYER_SUFFIXES]
     stems = (asset.folder / f"adopted-{n}" for n in itertools.count(1))
@@ -38,10 +39,10 @@ def adopt(asset: Asset, edited: Sequence[Path]) -> list[Path]:
         for path in others:
             # The same name may occur in several folders.
             target = copies[path] = folder / path.absolute().relative_to(asset.folder)
-            target.parent.mkdir(parents=True, exist_ok=True)
+            make_folders(target.parent)
             with temporary_beside(target) as copy:
                 shutil.copyfile(path, copy)
-                os.replace(copy, target)
+                publish(copy, target)
     adopted = [next(free).with_suffix(".usda") for _ in layers]
     for path, target in zip(layers, adopted, strict=True):
         _adopt_layer(path, target, asset, copies)
@@ -112,5 +113,11 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
         "hand. Add this layer to the sublayers of edits.usda, or take from it what you need."
     )
     with temporary_beside(target) as written:
-        text.Export(str(written))
-        os.replace(written, target)
+        try:
+            text.Export(str(written))
+        except Tf.ErrorException as error:
+            raise EnvironmentFailure(
+                f"{target}: USD could not write it ({in_one_line(error)}). Free disk space or "
+                "correct the permission, then run the same command again. [environment.io]"
+            ) from error
+        publish(written, target)

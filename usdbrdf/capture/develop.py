@@ -35,6 +35,8 @@ from usdbrdf.model.lens import Lens
 # Where a file of the asset is written: its path there, and what writes it at a place.
 Place = Callable[[str, Callable[[Path], None]], None]
 _UNSAFE = r"[^A-Za-z0-9_-]"  # in names that other programs are to read
+# Of what a frame is called after its photograph, whose name may fill what a file system allows.
+_LONGEST = 64
 _LOBES = 3
 # Values of which a pixel is the mean, per side, at most.
 _MAX_TAPS = 16
@@ -102,7 +104,7 @@ def frames_of_photographs(
 
 
 def _stem(number: int, photograph: Path) -> str:
-    return f"{number:05d}_{re.sub(_UNSAFE, '_', photograph.stem)}"
+    return f"{number:05d}_{re.sub(_UNSAFE, '_', photograph.stem)[:_LONGEST]}"
 
 
 def _views(record: FrameRecord) -> list[PinholeView]:

@@ -171,16 +171,13 @@ def _reached(start: Sequence[Path], stop: set[Path]) -> dict[Path, Sdf.Layer]:
 
 def _copy_of(file: Path) -> Sdf.Layer:
     try:
-        copy = Sdf.Layer.OpenAsAnonymous(str(file))
+        copy, why = Sdf.Layer.OpenAsAnonymous(str(file)), "it is not there"
     except Tf.ErrorException as error:
-        raise InputRefused(
-            f"{file}: USD cannot open it: {in_one_line(error)}. Correct that layer, or bring back "
-            "an earlier copy. [publish.layer]"
-        ) from error
+        copy, why = None, in_one_line(error)
     if not copy:
         raise InputRefused(
-            f"{file}: USD cannot open it. Correct that layer, or bring back an earlier copy. "
-            "[publish.layer]"
+            f"{file}: USD cannot open it: {why}. Correct that layer, or bring back an earlier "
+            "copy. [publish.layer]"
         )
     return copy
 
@@ -326,16 +323,13 @@ def _lead_to_copies(found: Collection, file: Path, layer: Sdf.Layer) -> bool:
 def _export(layer: Sdf.Layer, path: Path, encoding: str) -> None:
     try:
         done = layer.Export(str(path), args={"format": encoding} if encoding else {})
-        stored = Sdf.Layer.OpenAsAnonymous(str(path)) if done else None
+        stored, why = Sdf.Layer.OpenAsAnonymous(str(path)) if done else None, ""
     except Tf.ErrorException as error:
-        raise EnvironmentFailure(
-            f"{path}: the layer could not be written ({in_one_line(error)}). Free disk space or "
-            "correct the permission. [publish.write]"
-        ) from error
+        stored, why = None, f" ({in_one_line(error)})"
     if not stored or stored.defaultPrim != layer.defaultPrim:
         raise EnvironmentFailure(
-            f"{path}: the layer could not be written completely. Free disk space or correct the "
-            "permission. [publish.write]"
+            f"{path}: the layer could not be written completely{why}. Free disk space or correct "
+            "the permission. [publish.write]"
         )
 
 

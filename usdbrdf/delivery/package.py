@@ -47,7 +47,7 @@ from usdbrdf.errors import (
     UsageError,
     UsdBrdfError,
 )
-from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, make_folders, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -345,7 +345,7 @@ def _folder_of(output: Path) -> Iterator[None]:
     """Make the folders above a file; those that hold nothing at the end go again."""
     made = [folder for folder in output.parents if not folder.exists()]
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(output.parent)
         yield
     finally:
         for folder in made:  # the innermost first
@@ -394,25 +394,19 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
     """
     pinned = time.mktime(_PINNED_TIME)
     with temporary_beside(path) as staged:
-        failed = f"{path}: the package could not be written"
-        remedy = "Free disk space or correct the permission. [package.write]"
         try:
             writer = Sdf.ZipFileWriter.CreateNew(str(staged))
             for member in members:
                 os.utime(folder / member, (pinned, pinned))
                 writer.AddFile(str(folder / member), member)
-            done = writer.Save()
+            stage, why = Usd.Stage.Open(str(staged)) if writer.Save() else None, ""
         except Tf.ErrorException as error:
-            raise EnvironmentFailure(f"{failed} ({in_one_line(error)}). {remedy}") from error
-        if not done or not staged.is_file():
-            raise EnvironmentFailure(f"{failed}. {remedy}")
-        try:
-            stage = Usd.Stage.Open(str(staged))
-        except Tf.ErrorException as error:
+            stage, why = None, f" ({in_one_line(error)})"
+        if stage is None:
             raise EnvironmentFailure(
-                f"{path}: the package could not be read back ({in_one_line(error)}). Check the "
-                "disk, then run the same command again. [environment.io]"
-            ) from error
+                f"{path}: the package could not be written completely{why}. Free disk space or "
+                "correct the permission. [package.write]"
+            )
         problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
         for attribute in (a for prim in stage.TraverseAll() for a in prim.GetAuthoredAttributes()):
             value = attribute.Get()

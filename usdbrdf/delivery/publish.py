@@ -21,7 +21,13 @@ from usdbrdf.asset.readers.compose import open_edited, outdated_steps
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import environment_failures, publish_folder, sha256_of, temporary_folder
+from usdbrdf.files.atomic import (
+    environment_failures,
+    make_folders,
+    publish_folder,
+    sha256_of,
+    temporary_folder,
+)
 from usdbrdf.job.ownership import edited_files, folder_lock, reading
 from usdbrdf.options import PublishOptions
 
@@ -89,7 +95,7 @@ def _refuse_unsound(asset: Asset) -> None:
 def _made(destination: Path) -> Iterator[None]:
     """The folder, made; gone again where nothing was published into it."""
     new = [f for f in (destination, *destination.parents) if not f.exists()]
-    destination.mkdir(parents=True, exist_ok=True)
+    make_folders(destination)
     try:
         yield
     except BaseException:
@@ -118,7 +124,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
                 "leave --version out, or name a later one. [publish.version]"
             )
         for file in (each for each in staged.rglob("*") if each.is_file()):
-            file.chmod(0o444)
+            file.chmod(file.stat().st_mode & 0o444)
         publish_folder(staged, final)
     return _summary(final, manifest, new=True)
 

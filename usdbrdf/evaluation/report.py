@@ -15,8 +15,15 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, OwnershipConflict
-from usdbrdf.files.atomic import environment_failures, publish, temporary_beside, temporary_folder
-from usdbrdf.files.documents import read_json
+from usdbrdf.files.atomic import (
+    environment_failures,
+    is_bare,
+    make_folders,
+    publish,
+    temporary_beside,
+    temporary_folder,
+)
+from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.job.progress import say
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -185,7 +192,9 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
     """A new folder to write into; at the end its files are in ``folder``, ``document`` last.
 
     The document (JSON) lists under ``files`` what lies beside it; of an earlier run those that are
-    not made again are deleted, nothing else. After an error ``folder`` is as it was.
+    not made again are deleted, nothing else. While files are put in place it holds nothing but that
+    list, so that whoever is killed then leaves a folder that the next run knows and nobody reads.
+    After an error before that ``folder`` is as it was.
     Raises UsageError for a folder inside one of ``assets``, OwnershipConflict for one that holds
     files but no such document.
     """
@@ -194,7 +203,7 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
         asset.refuse_output(folder, "evaluate.output")
     if folder.exists() and not folder.is_dir():
         raise OwnershipConflict(f"{folder}: not a folder. Name another with -o. [evaluate.output]")
-    earlier: object = None if folder.is_dir() and any(folder.iterdir()) else []
+    earlier: object = None if folder.is_dir() and not is_bare(folder) else []
     if (folder / document).is_file():
         with suppress(InputRefused, AttributeError):
             earlier = read_json(folder / document).get(FILES)
@@ -209,8 +218,10 @@ def output_folder(folder: Path, document: str, assets: tuple[Asset, ...]) -> Ite
         yield work
         with environment_failures(str(folder)):
             made = files_of(work)
+            make_folders(folder)
+            write_json(folder / document, {FILES: sorted({*earlier, *made})})
             for relative in sorted(made, key=lambda name: name == document):
-                (folder / relative).parent.mkdir(parents=True, exist_ok=True)
+                make_folders((folder / relative).parent)
                 publish(work / relative, folder / relative)
             for relative in set(earlier) - set(made):
                 stale = (folder / relative).resolve()

@@ -16,13 +16,14 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from filecmp import cmp
 from pathlib import Path
 from typing import Any
 
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.farm.options import FarmOptions
-from usdbrdf.farm.scans import RESULTS_FOLDER, SCANS_FILE, ScanList, write_list
-from usdbrdf.files.atomic import environment_failures
+from usdbrdf.farm.scans import RESULTS_FOLDER, SCANS_FILE, ScanList, list_document
+from usdbrdf.files.atomic import environment_failures, flush_folder, is_bare, move, temporary_folder
 from usdbrdf.files.documents import write_json
 from usdbrdf.option import Option, OptionField, Options, option_fields
 from usdbrdf.options import ConvertOptions
@@ -95,26 +96,42 @@ def bundle_of(
 
 
 def write_bundle(folder: Path, scans: ScanList, bundle: Bundle) -> None:
-    """Write the documents into ``folder``, made if it is not there. OwnershipConflict where it
-    holds what is no bundle of ours."""
+    """Write the documents into ``folder``, made if it is not there, all of them or none: only a
+    folder with a template is a bundle. OwnershipConflict where it holds what is no bundle of ours.
+    """
     with environment_failures(str(folder)):
         if os.path.lexists(folder) and not folder.is_dir():
             raise OwnershipConflict(
                 f"{folder}: a file, or a link that leads nowhere, has this name. Choose another. "
                 "[farm.folder]"
             )
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / SCANS_FILE).is_file():
+        if folder.is_dir() and not is_bare(folder) and not (folder / SCANS_FILE).is_file():
             raise OwnershipConflict(
                 f"{folder}: holds files, and no bundle of usdbrdf farm. Choose a new folder. "
                 "[farm.folder]"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        write_list(folder, scans)
         given = [{"name": name, "value": value} for name, value in sorted(bundle.values.items())]
-        write_json(folder / VALUES, {"parameterValues": given})
-        write_json(folder / REFERENCES, bundle.references)
-        # Last: only a folder with a template is a bundle.
-        write_json(folder / TEMPLATE, bundle.template)
+        documents = {
+            SCANS_FILE: list_document(scans, folder),
+            VALUES: {"parameterValues": given},
+            REFERENCES: bundle.references,
+            TEMPLATE: bundle.template,
+        }
+        with temporary_folder(folder / TEMPLATE) as staged:
+            for name, document in documents.items():
+                write_json(staged / name, document)
+            changed = [name for name in documents if not _are_same(staged / name, folder / name)]
+            if changed:
+                # That of an earlier list goes before the list does, and the new one comes last.
+                (folder / TEMPLATE).unlink(missing_ok=True)
+            for name in dict.fromkeys([*changed, TEMPLATE] if changed else ()):
+                flush_folder(folder)
+                move(staged / name, folder / name)
+            flush_folder(folder)
+
+
+def _are_same(one: Path, other: Path) -> bool:
+    return other.is_file() and cmp(one, other, shallow=False)
 
 
 def _job_name(name: str, count: int) -> str:

@@ -7,9 +7,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.documents import read_json, read_text, write_json
+from usdbrdf.files.documents import read_json, read_text
 from usdbrdf.files.naming import unique_identifiers
 
 SCANS_FILE = "scans.json"
@@ -103,8 +104,8 @@ def known_in(folder: Path) -> dict[str, Path]:
     return dict(scans.retired) | _placed(scans)
 
 
-def write_list(folder: Path, scans: ScanList) -> None:
-    """Write the list into a bundle, unless it is there. OwnershipConflict where a name stands for
+def list_document(scans: ScanList, folder: Path) -> dict[str, Any]:
+    """The list as the document of a bundle in ``folder``. OwnershipConflict where a name stands for
     another scan there, or did: the asset that has it would be taken for that scan's."""
     file, known, now = folder / SCANS_FILE, known_in(folder), _placed(scans)
     # Some file systems know no case.
@@ -117,9 +118,7 @@ def write_list(folder: Path, scans: ScanList) -> None:
             )
     rows = [{"name": n, "place": p} for n, p in zip(scans.names, scans.places, strict=True)]
     retired = [{"name": n, "place": str(p)} for n, p in known.items() if n.lower() in owners]
-    document = {"schema": _SCHEMA, "root": str(scans.root), "scans": rows, "retired": retired}
-    if not (file.is_file() and read_json(file) == document):
-        write_json(file, document)
+    return {"schema": _SCHEMA, "root": str(scans.root), "scans": rows, "retired": retired}
 
 
 def _placed(scans: ScanList) -> dict[str, Path]:

@@ -65,6 +65,19 @@ def flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def make_folders(folder: Path) -> None:
+    """A folder and those above it, durably: what is flushed in one whose own name is not would be
+    lost with it."""
+    for new in reversed([each for each in (folder, *folder.parents) if not each.exists()]):
+        new.mkdir(exist_ok=True)
+        flush_folder(new.parent)
+
+
+def is_bare(folder: Path) -> bool:
+    """Whether a folder holds nothing, or what a killed process of ours left of itself."""
+    return all(entry.name.startswith(TEMPORARY_PREFIX) for entry in folder.iterdir())
+
+
 def sha256_of(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes."""
     digest = hashlib.sha256()
@@ -97,7 +110,7 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 def temporary_folder(final: Path) -> Iterator[Path]:
     """A fresh folder beside ``final``, which may be "."; gone at the end unless published."""
     final = final.resolve()
-    final.parent.mkdir(parents=True, exist_ok=True)
+    make_folders(final.parent)
     with _new_name() as name, _at_work_in(final.parent):
         staged = final.with_name(name)
         staged.mkdir()
@@ -186,10 +199,9 @@ def publish_folder(staged: Path, final: Path) -> None:
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
     """A fresh folder that becomes ``final``, new or empty, at the end; gone if the work fails."""
-    final = final.resolve()
     with temporary_folder(final) as staged:
         yield staged
-        publish_folder(staged, final)
+        publish_folder(staged, final.resolve())
 
 
 @contextmanager

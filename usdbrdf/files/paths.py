@@ -7,7 +7,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from usdbrdf.errors import InputRefused, OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
 
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
@@ -69,6 +69,18 @@ def refuse_nameless(path: Path | None) -> None:
         raise InputRefused(
             f"{str(path)!r}: this name, or that of a folder above, is not UTF-8, so that USD "
             "cannot refer to it. Rename it. [paths.name]"
+        ) from error
+
+
+def refuse_lost_folder() -> None:
+    """EnvironmentFailure where the current folder was removed or its disk is gone: what is relative
+    to it leads nowhere, and libraries end the process."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise EnvironmentFailure(
+            f"the current folder: {error.strerror}. Change into one that is there. "
+            "[environment.folder]"
         ) from error
 
 

@@ -322,6 +322,12 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
             f"{asset}: {place} is not writable. Change its permission or name another folder. "
             "[environment.output]"
         )
+    for link in (folder for folder in (asset, *asset.parents) if folder.is_symlink()):
+        if not link.exists():
+            raise EnvironmentFailure(
+                f"{asset}: {link} is a link to {os.readlink(link)}, which is not there. Make that "
+                "folder or name another. [environment.output]"
+            )
     state = asset / STATE_FOLDER
     entries = {entry.name for entry in asset.iterdir()} if place == asset else set()
     # Killed between the first mkdir and job.json: nothing of anybody's can be in there yet.

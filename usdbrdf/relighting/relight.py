@@ -72,8 +72,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     }
     if is_scene:
         files = write_scene_file(
-            mitsuba, output, scene, views, bounces=options.bounces, samples=options.samples
-        )
+            mitsuba, output, scene, views, bounces=options.bounces, samples=options.samples,
+            seed=options.seed,
+        )  # fmt: skip
         return {"scene": str(output), "files": files, "cameras": len(views), **told}
     loaded = mitsuba_scene(mitsuba, scene, bounces=options.bounces)
     with environment_failures(str(output)):

@@ -1,13 +1,14 @@
 """A scene as Mitsuba's own format: NAME.xml, and beside it the folder NAME.files with meshes (PLY)
-and pictures (EXR). It needs no plug-in of ours: materials are what Mitsuba's BSDFs can say of
-them, see ``description.two_of_mitsuba``."""
+and pictures (EXR), whose names tell what is in them: so those of two scenes stand side by side
+until the one text has replaced the other. It needs no plug-in of ours: materials are what Mitsuba's
+BSDFs can say of them, see ``description.two_of_mitsuba``."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,7 +20,9 @@ from usdbrdf.files.atomic import (
     environment_failures,
     flush_folder,
     move,
+    publish,
     publish_folder,
+    sha256_of,
     temporary_folder,
     write_text_atomic,
 )
@@ -42,19 +45,49 @@ _TAGS = {
 _OURS = "A scene of usdbrdf for Mitsuba 3: metres, linear Rec.709, radiance in the asset's unit. "
 # In the folder it says whose that is; of the scene it is at its beginning.
 _MARK, _BEGINNING = "usdbrdf.txt", 4096
+_NAME = re.compile(r"(mesh|picture)_\d{4,}\.[0-9a-f]{16}\.(ply|exr)")
 
 
 def write_scene_file(
-    mi: Any, path: Path, scene: RelitScene, cameras: Sequence[Camera], *, bounces: int, samples: int
+    mi: Any,
+    path: Path,
+    scene: RelitScene,
+    cameras: Sequence[Camera],
+    *,
+    bounces: int,
+    samples: int,
+    seed: int = 0,
 ) -> int:
     """Write the scene with all cameras, of which Mitsuba renders the first; returns how many meshes
     and pictures lie beside it. What stood there of an earlier scene is replaced, or stays if that
-    fails.
+    fails or is killed.
+
+    seed  of the noise; each camera has its own
 
     Pictures have square pixels: a camera whose pixels are not has more or fewer rows. Raises
     OwnershipConflict where something else stands in the place of the scene or of its files.
     """
     folder = path.with_name(f"{path.stem}.files")
+    with environment_failures(str(path)), _taking(path, folder) as work:
+        made, text = work / "made" / folder.name, work / "made" / path.name
+        made.mkdir(parents=True)
+        root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples, seed)
+        names = {file.name for file in made.iterdir()}
+        write_text_atomic(made / _MARK, f"{_OURS}\n")
+        ElementTree.indent(root)
+        plain = ElementTree.tostring(root, encoding="unicode")
+        write_text_atomic(text, f'<?xml version="1.0" encoding="utf-8"?>\n{plain}\n')
+        with _added(made, folder):
+            publish(text, path)
+        for file in folder.iterdir():  # what the scene before named
+            if _NAME.fullmatch(file.name) and file.name not in names:
+                file.unlink()
+    return len(names)
+
+
+@contextmanager
+def _taking(path: Path, folder: Path) -> Iterator[Path]:
+    """A folder to make the scene in, unless something else stands in its place."""
     if folder.exists() and not (folder.is_dir() and _is_ours(folder)):
         raise OwnershipConflict(
             f"{folder}: this is in the place of the scene's meshes and pictures. Name another file "
@@ -64,33 +97,31 @@ def write_scene_file(
         raise OwnershipConflict(
             f"{path}: not a scene that usdbrdf wrote. Name another file with -o. [relight.output]"
         )
-    with environment_failures(str(path)), temporary_folder(path) as work:
-        made, text = work / "made" / folder.name, work / "made" / path.name
-        made.mkdir(parents=True)
-        root = _scene_element(mi, _Files(made), scene, cameras, bounces, samples)
-        count = sum(1 for _ in made.iterdir())
-        write_text_atomic(made / _MARK, f"{_OURS}\n")
-        ElementTree.indent(root)
-        plain = ElementTree.tostring(root, encoding="unicode")
-        write_text_atomic(text, f'<?xml version="1.0" encoding="utf-8"?>\n{plain}\n')
-        _replace(path, folder, text, made, work / "earlier")
-    return count
+    with temporary_folder(path) as work:
+        yield work
 
 
-def _replace(path: Path, folder: Path, text: Path, made: Path, earlier: Path) -> None:
-    """Put the scene and its files in the place of those that are there, or leave these."""
-    earlier.mkdir()
-    with ExitStack() as undo:
-        # Its text goes first and comes last: it never names files of another scene.
-        for place in (path, folder):
-            if place.exists():
-                os.replace(place, earlier / place.name)
-                undo.callback(os.replace, earlier / place.name, place)
-        undo.callback(shutil.rmtree, folder, ignore_errors=True)
-        publish_folder(made, folder)
-        move(text, path)
-        undo.pop_all()
-    flush_folder(path.parent)
+@contextmanager
+def _added(made: Path, folder: Path) -> Iterator[None]:
+    """The files of a folder in another, which may hold some already; gone again if the block fails,
+    but for those that were there before."""
+    before = {file.name for file in folder.iterdir()} if folder.exists() else set()
+    try:
+        if before:
+            for file in made.iterdir():
+                move(file, folder / file.name)
+            flush_folder(folder)
+        else:
+            publish_folder(made, folder)
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for file in [*folder.iterdir()]:
+                if file.name not in before:
+                    file.unlink()
+            if not before:
+                folder.rmdir()
+        raise
 
 
 def _is_ours(folder: Path) -> bool:
@@ -118,30 +149,42 @@ class _Files:
     def picture(self, pixels: Float) -> str:
         key = pixels.shape, pixels.tobytes()
         if key not in self._known:
-            name = f"picture_{len(self._known):04d}.exr"
-            write_exr(self.folder / name, pixels, half=False)
-            self._known[key] = name
+            file = self.folder / "picture.exr"
+            write_exr(file, pixels, half=False)
+            name = f"picture_{len(self._known):04d}.{sha256_of(file)[:16]}.exr"
+            self._known[key] = file.rename(self.folder / name).name
         return self.named(self._known[key])
+
+    def mesh(self, number: int, ply: bytes) -> str:
+        name = f"mesh_{number:04d}.{hashlib.sha256(ply).hexdigest()[:16]}.ply"
+        (self.folder / name).write_bytes(ply)
+        return self.named(name)
 
 
 def _scene_element(
-    mi: Any, files: _Files, scene: RelitScene, cameras: Sequence[Camera], bounces: int, samples: int
+    mi: Any,
+    files: _Files,
+    scene: RelitScene,
+    cameras: Sequence[Camera],
+    bounces: int,
+    samples: int,
+    seed: int,
 ) -> ElementTree.Element:
     root = ElementTree.Element("scene", version=VERSION)
     root.append(ElementTree.Comment(f" {_OURS}"))
     _add(root, "", description.integrator(bounces), files)
-    for camera in cameras:
+    for i, camera in enumerate(cameras):
         sensor = description.pinhole(camera, *description.square_pixels(camera))
-        sensor["sampler"] = {**sensor["sampler"], "sample_count": samples}
+        noise = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
+        sensor["sampler"] = {**sensor["sampler"], "sample_count": samples, "seed": noise}
         _add(root, "", sensor, files).set("id", camera.name)
     for i, surface in enumerate(s for s in scene.surfaces if not s.material.clear):
-        name = f"mesh_{i:04d}.ply"
         # Into memory: where the disk is full, a mesh's own writer may leave half a file unnoticed.
         written = mi.MemoryStream()
         mesh_of_surface(mi, surface, mi.Properties()).write_ply(written)
-        (files.folder / name).write_bytes(written.raw_buffer())
+        mesh = files.mesh(i, written.raw_buffer())
         bsdf = description.two_of_mitsuba(surface)
-        shape: dict[str, Any] = {"type": "ply", "filename": files.named(name)}
+        shape: dict[str, Any] = {"type": "ply", "filename": mesh}
         shape["bsdf"] = {"type": "twosided", "bsdf": bsdf} if surface.two_sided else bsdf
         if surface.material.emits:
             shape["emitter"] = description.emitter(surface)

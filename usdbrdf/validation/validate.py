@@ -16,7 +16,7 @@ from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.job.ownership import reading
 from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
@@ -208,6 +208,18 @@ class Cured:
     findings: tuple[Finding, ...]
 
 
+@contextmanager
+def _on_disk(path: Path) -> Iterator[None]:
+    """What USD says while it writes a file is about the disk."""
+    try:
+        yield
+    except Tf.ErrorException as error:
+        raise EnvironmentFailure(
+            f"{path}: USD could not write it ({in_one_line(error)}). Free disk space or correct "
+            "the permission, then run the same command again. [environment.io]"
+        ) from error
+
+
 def write_cures(asset: Asset, layer: Path) -> Cured:
     """Write ``layer``, a new .usda file, with what sets faults right beyond doubt.
 
@@ -238,7 +250,8 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
             "Cures by usdbrdf validate --fix. They take effect as the first sublayer of "
             f"{asset.root_layer.name}."
         )
-        header.Export(str(written))
+        with _on_disk(path):
+            header.Export(str(written))
         cures = Sdf.Layer.FindOrOpen(str(written))
         # Stronger than all other layers, in memory alone.
         stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
@@ -251,7 +264,8 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         after = {complaint(found) for _, _, found in _curable(stage)}
         cured = tuple(found for found in applied if complaint(found) not in after)
         if cured:
-            cures.Save()
+            with _on_disk(path):
+                cures.Save()
             _publish_new(written, path, taken)
     return Cured(layer=path, findings=cured)
 
