@@ -11,13 +11,12 @@ from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
+    NEUTRAL,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
-    UNKNOWN,
+    UNASKED,
     LobeEstimate,
     lobe_from_costs,
-    nothing_asked,
-    share_without_lobe,
     verdict_on_frame,
     verdict_on_metal,
     verdict_on_views,
@@ -27,7 +26,7 @@ from usdbrdf.material.verdict import (
 def _lobe(**numbers: float) -> LobeEstimate:
     sharp = LobeEstimate(
         phi=0.1, psi=0.8, phi_error=0.02, psi_error=0.05, unresolved=0.0, cost=1.0, evidence=1.0,
-        phi_median=0.3, psi_quarter=0.4, psi_median=0.6, psi_upper=0.9, no_lobe=0.0,
+        phi_median=0.3, psi_median=0.6, psi_upper=0.9,
     )  # fmt: skip
     return sharp._replace(**numbers)
 
@@ -78,15 +77,12 @@ def test_no_highlight_where_one_would_show_bounds_psi():
     # Where nothing was asked nothing is known, and no lobe is as likely as one.
     terms[:, 2] = 0
     found = lobe_from_costs(phis, terms, without=1.0, noisy=1.0, freedom=1, blur=0.0)
-    assert found.psi_median == pytest.approx(0.5, abs=0.01)
-    assert found.no_lobe == pytest.approx(0.5, abs=0.02)
-    assert found.most_likely_psi(0.5) < 0.03
+    assert found.psi_median < 0.03
     assert found.psi_upper == pytest.approx(0.95, abs=0.01)
     assert found.phi_median == pytest.approx(0.5, abs=0.03)
 
 
-@pytest.mark.parametrize("without", [0.1, 0.5, 0.7])
-def test_the_most_likely_psi_leaves_room_for_there_being_no_lobe(without: float):
+def test_the_median_of_psi_leaves_room_for_there_being_no_lobe():
     # A lobe of psi = 0.8 is some times as likely as none; that of the rest falls off by distance.
     phis = np.linspace(0, 1, 21)
     gain = 2 * np.log(20.0)
@@ -94,37 +90,11 @@ def test_the_most_likely_psi_leaves_room_for_there_being_no_lobe(without: float)
     found = lobe_from_costs(phis, terms, without=gain, noisy=0.0, freedom=1, blur=0.0)
     psi = np.linspace(0, 1, 201)
     density = np.exp(-0.5 * gain * (psi / 0.8 - 1) ** 2)
-    none, one = without * np.exp(-0.5 * gain), (1 - without) * density.mean()
-    none /= none + one
+    none = np.exp(-0.5 * gain) / (np.exp(-0.5 * gain) + density.mean())
     below = none + (1 - none) * np.cumsum(density) / density.sum()
-    assert none < 0.3
-    expected = psi[np.searchsorted(below, 0.5)]
-    assert found.most_likely_psi(without) == pytest.approx(expected, abs=0.03)
-    assert found.most_likely_psi(without) < found.psi_median
-    # Where hardly a surface has one, this has none either.
-    assert found.most_likely_psi(0.999) == 0
-    assert found.most_likely_psi(0.0) == pytest.approx(found.psi_median)
-
-
-def test_surfaces_that_tell_say_how_many_of_a_scene_have_no_lobe():
-    random = np.random.default_rng(2)
-    clear = np.array([0.01, 0.02, 0.05, 0.01, 0.03, 0.02, 0.04, 0.01])
-    vague = random.uniform(0.45, 0.55, 200)
-    assert share_without_lobe(np.concatenate([clear, vague])) < 0.35
-    assert share_without_lobe(np.concatenate([1 - clear, vague])) > 0.65
-    assert share_without_lobe(np.concatenate([clear, 1 - clear])) == pytest.approx(0.5, abs=0.02)
-    # Those that cannot tell leave open what is so.
-    assert share_without_lobe(np.full(50, 0.5)) == pytest.approx(0.5)
-    assert share_without_lobe(np.zeros(0)) == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("without", [0.1, 0.5, 0.9])
-def test_of_what_could_not_be_asked_the_scene_tells(without: float):
-    random = np.random.default_rng(0)
-    psi = np.where(random.random(10**6) < without, 0, random.random(10**6))
-    found = nothing_asked(True, without)
-    assert found.psi == pytest.approx(np.median(psi), abs=0.005)
-    assert found.psi_error == pytest.approx(np.sqrt(((psi - found.psi) ** 2).mean()), abs=0.005)
+    assert 0.05 < none < 0.3
+    assert found.psi_median == pytest.approx(psi[np.searchsorted(below, 0.5)], abs=0.01)
+    assert found.psi_median < psi[np.searchsorted(np.cumsum(density) / density.sum(), 0.5)] - 0.01
 
 
 def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
@@ -159,7 +129,7 @@ def test_a_lobe_that_explains_less_is_less_certain_of_phi():
 def test_what_no_frame_sees_is_unseen():
     found = verdict_on_views(None, False)
     assert (found.phi, found.psi, found.psi_upper, found.status) == (0.5, 0.0, 1.0, "unseen")
-    assert (found.phi_error, found.psi_error) == pytest.approx((NOTHING_KNOWN, 1 / math.sqrt(6)))
+    assert (found.phi_error, found.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.
     assert verdict_on_views(None, True).status == "prior"
@@ -180,14 +150,15 @@ def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, 
     kept = verdict_on_frame((0.1, flat), 0.8, evidence, True, True)
     assert (kept.phi, kept.psi, kept.status) == (0.1, 0.8, "failed")
     prior = verdict_on_frame((0.1, flat), 0.8, evidence, True, False)
-    assert prior == nothing_asked(True, UNKNOWN)
+    assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "prior")
+    assert (prior.phi_error, prior.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
 
 
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize(("seen", "status"), [(True, "prior"), (False, "unseen")])
 def test_without_a_fit_there_is_nothing_to_keep(keep: bool, seen: bool, status: str):
     found = verdict_on_frame((math.nan, math.nan), math.nan, math.nan, seen, keep)
-    assert (found.phi, found.psi, found.status) == (0.5, 0.0, status)
+    assert (found.phi, found.psi, found.status) == (*NEUTRAL, status)
 
 
 def test_one_frame_is_sure_of_nothing_of_a_metal():

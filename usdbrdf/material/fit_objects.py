@@ -37,11 +37,8 @@ from usdbrdf.material.fit_views import (
 )
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
-    UNKNOWN,
     LobeEstimate,
     Verdict,
-    nothing_asked,
-    share_without_lobe,
     usual_lobe,
     verdict_on_frame,
     verdict_on_metal,
@@ -90,8 +87,7 @@ class ObjectFit(NamedTuple):
     phi, psi, phi_error, psi_error  parameters of the lobe and their standard deviations
     unresolved    share of the highlight that the pixels do not resolve
     cost          at the minimum; evidence: 1 - cost / cost without a lobe
-    phi_median, psi_quarter, psi_median, psi_upper, no_lobe  of what remains likely, see
-                  ``LobeEstimate``
+    phi_median, psi_median, psi_upper  of what remains likely, see ``LobeEstimate``
     metal_phi, red, green, blue, metal_phi_error, f0_error, clearer  of the metal that explains the
                   samples better, see ``Conductor``
     num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
@@ -105,10 +101,8 @@ class ObjectFit(NamedTuple):
     cost: float = math.nan
     evidence: float = math.nan
     phi_median: float = math.nan
-    psi_quarter: float = math.nan
     psi_median: float = math.nan
     psi_upper: float = math.nan
-    no_lobe: float = math.nan
     metal_phi: float = math.nan
     red: float = math.nan
     green: float = math.nan
@@ -365,7 +359,7 @@ def fit_object(
     first = look.lobes.get(lobe) if look else None
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     found = ObjectFit(
-        *fitted[:7], *fitted[8:],
+        *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
         num_samples=used, target=target,
     )  # fmt: skip
     if not metal:
@@ -410,24 +404,13 @@ def _fit_of_frame(
     )  # fmt: skip
 
 
-def without_lobe(found: Sequence[ObjectFit]) -> float:
-    """The share of a scene's surfaces, metals aside, that have none."""
-    told = [one.no_lobe for one in found if math.isfinite(one.no_lobe) and math.isnan(one.clearer)]
-    return share_without_lobe(np.array(told)) if told else UNKNOWN
-
-
 def judged(
-    found: ObjectFit,
-    obj: SceneObject,
-    options: FitOptions,
-    observed: bool,
-    asked: str = "",
-    without: float = UNKNOWN,
+    found: ObjectFit, obj: SceneObject, options: FitOptions, observed: bool, asked: str = ""
 ) -> Verdict:
     """What to publish and to show of a fit; ``observed``: some frame shows the object; ``asked``:
-    what a person wanted of it; ``without``: see ``without_lobe``."""
+    what a person wanted of it."""
     if asked == GLASS:
-        return replace(nothing_asked(observed, without), kind="transparent")
+        return replace(verdict_on_views(None, observed), kind="transparent")
     if math.isfinite(found.clearer):
         f0 = found.red, found.green, found.blue
         errors = found.metal_phi_error, found.f0_error
@@ -435,9 +418,9 @@ def judged(
     if options.method == "views":
         lobe = LobeEstimate(
             found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
-            found.evidence, (0.0, 0.0), *found[7:12],
+            found.evidence, (0.0, 0.0), found.phi_median, found.psi_median, found.psi_upper,
         )  # fmt: skip
-        verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed, without)
+        verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
     else:
         keep, phi = options.method == "paper", (found.phi, found.phi_error)
         verdict = verdict_on_frame(phi, found.psi, found.evidence, observed, keep)

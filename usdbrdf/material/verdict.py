@@ -16,7 +16,7 @@ from usdbrdf.transport.brdf import F0_OF_PSI
 
 _PSI_GRID = np.linspace(0, 1, 201)
 # What an estimate says of the posterior beside its least cost.
-POSTERIOR = ("phi_median", "psi_quarter", "psi_median", "psi_upper", "no_lobe")
+POSTERIOR = ("phi_median", "psi_median", "psi_upper")
 MODEL_DISCREPANCY = calibration.number("fit.model_discrepancy")
 _BADLY_KNOWN = calibration.number("fit.footprint_uncertainty")
 # Standard deviation of a number in [0, 1] of which nothing is known.
@@ -28,10 +28,10 @@ class LobeEstimate(NamedTuple):
     tell, which near NOTHING_KNOWN say just that; unresolved, how much of phi may be due to the
     samples' footprint; cost per degree of freedom; evidence = 1 - cost / cost without any specular
     light; of_rays, what the rays' noise alone does to phi and psi, beside the stated errors until
-    ``mean_of_repeats`` adds it to them. phi_median, psi_quarter, psi_median, psi_upper: medians of
-    either, and what psi exceeds with probabilities of 75 and 5 %, if there is a lobe and all in
-    [0, 1] was equally likely before: where no highlight shows, the frames still say that psi is
-    small or phi large. no_lobe: the probability of that, if it was as likely before as one."""
+    ``mean_of_repeats`` adds it to them. phi_median, psi_median, psi_upper: medians of either, and
+    what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
+    highlight shows, the frames still say that psi is small or phi large. For psi_median no lobe at
+    all was as likely before as one: it is 0 where the simpler model explains as much."""
 
     phi: float
     psi: float
@@ -42,17 +42,8 @@ class LobeEstimate(NamedTuple):
     evidence: float
     of_rays: tuple[float, float] = (0.0, 0.0)
     phi_median: float = 0.5
-    psi_quarter: float = 0.25
     psi_median: float = 0.5
     psi_upper: float = 1.0
-    no_lobe: float = 0.5
-
-    def most_likely_psi(self, without: float) -> float:
-        """The median of psi where the share ``without`` of the scene's surfaces has no lobe."""
-        none, one = without * self.no_lobe, (1 - without) * (1 - self.no_lobe)
-        # How much of what remains below one half is a lobe's.
-        below = (one - none) / (2 * one) if none < one else 0.0
-        return float(np.interp(below, (0, 0.25, 0.5), (0, self.psi_quarter, self.psi_median)))
 
 
 def lobe_from_costs(
@@ -78,6 +69,7 @@ def lobe_from_costs(
     lowest = min(float(surface.min()), without)
     density = np.exp(-0.5 * (surface - lowest) / temper)
     density *= np.gradient(phis)[:, None]
+    # There may be no lobe at all, which was as likely before as that there is one.
     none = math.exp(-0.5 * (without - lowest) / temper)
     none /= none + float(density.sum()) / len(_PSI_GRID)
     density /= density.sum()
@@ -85,7 +77,9 @@ def lobe_from_costs(
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
-    of_psi = _quantiles(density.sum(axis=0), _PSI_GRID, (0.25, 0.5, 0.95))
+    middle = (0.5 - none) / (1 - none) if none < 0.5 else 0.0
+    psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (middle, 0.95))
+    psi_median = psi_median if middle > 0 else 0.0
     (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
@@ -96,24 +90,9 @@ def lobe_from_costs(
         cost=least / max(freedom, 1),
         evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
         phi_median=phi_median,
-        psi_quarter=of_psi[0],
-        psi_median=of_psi[1],
-        psi_upper=of_psi[2],
-        no_lobe=none,
+        psi_median=psi_median,
+        psi_upper=psi_upper,
     )
-
-
-_SHARES = np.linspace(0.01, 0.99, 99)
-_LIKE_SURFACES = calibration.number("fit.share_like_surfaces")
-
-
-def share_without_lobe(no_lobe: Double) -> float:
-    """The share of a scene's surfaces that have no lobe, from the probability (N,) of that for
-    each, had it been as likely before as a lobe. Before these it is about one half, as if so many
-    surfaces had told that clearly as _LIKE_SURFACES: few that tell little change little."""
-    odds = np.log(np.outer(_SHARES, no_lobe) + np.outer(1 - _SHARES, 1 - no_lobe)).sum(axis=1)
-    odds += _LIKE_SURFACES / 2 * np.log(_SHARES * (1 - _SHARES))
-    return float(np.average(_SHARES, weights=np.exp(odds - odds.max())))
 
 
 def least_costs(terms: Double, scale: float) -> tuple[Double, Double, Double]:
@@ -170,6 +149,9 @@ def _deviation(density: Double, values: Double, about: float) -> float:
     return float(np.sqrt((density * (values - about) ** 2).sum()))
 
 
+# The medians of what could not be asked, no lobe being as likely as one; and the deviation of psi
+# about its median then.
+NEUTRAL, UNASKED = (0.5, 0.0), 1 / math.sqrt(6)
 _OF_WORD = calibration.pairs("prior.classes")
 
 
@@ -217,23 +199,8 @@ class Verdict:
     f0_error: float = math.nan
 
 
-# What is taken of a scene of which nothing is known: it may have a lobe or not.
-UNKNOWN = 0.5
-_UNASKED = LobeEstimate(0.5, 0.5, 0.3, 0.3, 0.0, 1.0, 0.0)
-
-
-def nothing_asked(seen: bool, without: float = UNKNOWN) -> Verdict:
-    """On what could not be fitted, in a scene where the share ``without`` has no lobe: medians, and
-    deviations about them."""
-    psi = _UNASKED.most_likely_psi(without)
-    psi_error = math.sqrt(without * psi**2 + (1 - without) * (1 / 12 + (0.5 - psi) ** 2))
-    status = "prior" if seen else "unseen"
-    return Verdict(0.5, psi, float(NOTHING_KNOWN), psi_error, status, psi_upper=1.0)
-
-
-def verdict_on_views(lobe: LobeEstimate | None, seen: bool, without: float = UNKNOWN) -> Verdict:
-    """On a fit of many views; None: there were too few samples for one. without: the share of the
-    scene's surfaces that have no lobe.
+def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
+    """On a fit of many views; None: there were too few samples for one.
 
     What the frames determine is published as found. Of a highlight that is hardly larger than the
     samples' footprint they say something, but the stated error includes what the footprint may have
@@ -242,7 +209,8 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool, without: float = UNK
     Names and classes of objects tell nothing here.
     """
     if lobe is None:
-        return nothing_asked(seen, without)
+        errors = float(NOTHING_KNOWN), UNASKED
+        return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
     phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)
@@ -259,7 +227,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool, without: float = UNK
 
     sure = confidence(phi_error, MAX_PHI_ERROR), confidence(psi_error, MAX_PSI_ERROR)
     phi = lobe.phi if sure[0] == "high" else lobe.phi_median
-    psi = lobe.psi if sure[1] == "high" else lobe.most_likely_psi(without)
+    psi = lobe.psi if sure[1] == "high" else lobe.psi_median
     status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
     upper = max(lobe.psi_upper, psi)
     return Verdict(phi, psi, float(phi_error), float(psi_error), status, *sure, psi_upper=upper)
@@ -297,4 +265,5 @@ def verdict_on_frame(
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
         return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
-    return nothing_asked(seen)
+    errors = float(NOTHING_KNOWN), UNASKED
+    return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)

@@ -16,7 +16,7 @@ from usdbrdf.asset.preview_lobe import MICROFACET
 from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material.fit_objects import ObjectFit, judged, without_lobe
+from usdbrdf.material.fit_objects import ObjectFit, judged
 from usdbrdf.material.refine import Lighting, Lobes, refined_light
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
@@ -33,7 +33,7 @@ def fitted_objects(
 ) -> list[FittedObject]:
     """What is published of each object's fit; ``asked``: what a person wants of some, by number."""
     mapping = MICROFACET if microfacet and options.mapping == "matched" else options.mapping
-    objects, without = [], without_lobe(found)
+    objects = []
     for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True)):
         word, observed = asked.get(i, ""), any(some.is_observed(i) for some in maps)
         objects.append(
@@ -48,7 +48,7 @@ def fitted_objects(
                 mapping=mapping,
                 lobe=MICROFACET if microfacet else "paper",
                 directive=word,
-                **vars(judged(own, obj, options, observed, word, without)),
+                **vars(judged(own, obj, options, observed, word)),
             )
         )
     return objects
