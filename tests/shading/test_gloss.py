@@ -44,7 +44,8 @@ def test_in_uniform_light_frames_are_shown_the_directional_albedo_of_it(furnace)
     found = mirrored_to_frames(surface, light, frames, floor, 0)
     way = eye - surface.texels.position[floor]
     cosine = way[:, 2] / np.linalg.norm(way, axis=1)
-    seen = found[:, 0] > 0
+    pixels = [frames.camera(i).project(surface.texels.position[floor]) for i in range(2)]
+    seen = np.any([((p > 1) & (p < 63)).all(axis=1) for p in pixels], axis=0)
     expected = np.interp(cosine, view_cosines(), _reflects(None))[:, None] * LIGHT
     assert 0.3 < seen.mean() < 1
     np.testing.assert_allclose(found[seen].mean(0), expected[seen].mean(0), rtol=0.02)
@@ -77,4 +78,5 @@ def test_a_wall_hides_what_it_hides():
     found = mirrored_to_frames(surface, light, above, floor, 0)
     middle = np.abs(world.texels.position[:64, :2] - 1).max(axis=1)
     assert not found[middle < 0.2].any()
-    assert (found[(middle > 0.3) & (middle < 0.5)] >= 0).all()
+    # Beside it the floor mirrors its sides.
+    assert (found[(middle > 0.3) & (middle < 0.5)] > 0).mean() > 0.5

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
-from usdbrdf.shading.outside_light import Asked, Glossy, Sources, gloss_of_scene, solved
+from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
 from usdbrdf.transport.environment import black_environment
@@ -109,7 +109,6 @@ def test_a_lamp_is_told_by_what_lies_evenly_in_its_light(hall, monkeypatch):
     even = off()
     monkeypatch.setattr("usdbrdf.shading.unseen_lamps._LEAST_EVEN", 2.0)
     every = off()
-    print(even, every)
     assert even < 0.1
     assert every > 2 * even
 
@@ -157,10 +156,9 @@ def test_dark_surfaces_that_mirror_their_surroundings_do_not_dim_a_lamp():
             pairs=np.zeros((0, 2), np.int64),
             apart=np.zeros(0),
         )
-        glossy = Glossy(np.zeros_like(around), sent_on[None])
-        with_it = gloss_of_scene(asked, sources, glossy)
-        lamps = (np.exp(solved(*one).log_radiance[0]) for one in ((asked, sources), with_it))
-        return with_it[1].gloss[0], *lamps
+        glossy = gloss_of_scene(asked, sources, sent_on[None])
+        lamps = (np.exp(solved(asked, one).log_radiance[0]) for one in (sources, glossy))
+        return glossy.gloss[0], *lamps
 
     told, without, with_it = found(0.6)
     assert told in (0.5, 0.75)

@@ -45,8 +45,10 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def _coming_again() -> Iterator[None]:
-    """What is printed by those who cannot pass it on is raised again."""
+    """An exception of ours that somebody hands to Python's hooks, for he cannot pass it on, is
+    raised again."""
     printed, ignored = sys.excepthook, sys.unraisablehook
+    waiting: list[threading.Timer] = []
 
     def again(kind: type[BaseException] | None) -> bool:
         ends = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}
@@ -54,6 +56,7 @@ def _coming_again() -> Iterator[None]:
             return False
         later = threading.Timer(_AGAIN, _thread.interrupt_main, (ends[kind],))
         later.daemon = True
+        waiting.append(later)
         later.start()
         return True
 
@@ -71,6 +74,8 @@ def _coming_again() -> Iterator[None]:
     try:
         yield
     finally:
+        for later in waiting:
+            later.cancel()
         sys.excepthook, sys.unraisablehook = printed, ignored
 
 

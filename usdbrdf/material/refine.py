@@ -24,7 +24,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material.sample_specular import specular_of_samples, whole_tiles
+from usdbrdf.material.sample_specular import specular_of_samples, with_whole_tiles
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
@@ -382,7 +382,9 @@ def _means_without_lobes(
             start, observed = saved[0] + 1, MeanState(**saved[1])
         # The mean starts from its first samples, which must not all show one highlight.
         order = [own.start + i for i in spread_order(len(own))[start:]]
-        sampled = samples_from_frames(lit, frames, reader.read, order, whole_tiles(texels, part))
+        sampled = samples_from_frames(
+            lit, frames, reader.read, order, with_whole_tiles(texels, part)
+        )
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)

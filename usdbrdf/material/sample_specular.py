@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.texels import Texels
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
@@ -14,7 +15,8 @@ from usdbrdf.transport.lobe_radiance import lobe_radiance
 _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 # Texels to a side of a tile, over which a frame's specular light is averaged, and to what share of
 # a lobe's width this may spread the mirrored directions.
-_SIDE, _BLUNT = 4, 0.5
+_SIDE = 4
+_BLUNT = calibration.number("refine.turn_of_tile")
 
 
 def specular_of_samples(
@@ -36,7 +38,7 @@ def specular_of_samples(
     return _shared(texels, phi, texel, eye, found)
 
 
-def whole_tiles(texels: Texels, part: slice) -> slice:
+def with_whole_tiles(texels: Texels, part: slice) -> slice:
     """The ``part`` with what its first and last tiles, of which texels are averaged, hold beside:
     what becomes of a texel does not depend on its group."""
     ends = np.array([part.start, part.stop - 1])
@@ -71,5 +73,7 @@ def _shared(texels: Texels, phi: Float, texel: Int, eye: Double, specular: Float
     away = np.linalg.norm(position - eye, axis=1)
     turn = np.linalg.norm(position - mean(position), axis=1) / np.maximum(away, 1e-12)
     turn += 2 * np.linalg.norm(normal - mean(normal), axis=1)
-    narrow = mean((turn > _BLUNT * phi)[:, None])
+    # Other charts may lie in the same tile.
+    apart = np.linalg.norm(position - mean(position), axis=1) > _SIDE * np.sqrt(texels.area[texel])
+    narrow = mean(((turn > _BLUNT * phi) | apart)[:, None])
     return np.where(narrow > 0, specular, mean(specular)).astype(np.float32)

@@ -14,20 +14,19 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.texturing.samples import MIN_COSINE
+from usdbrdf.texturing.agreement import SurfacePoints as PointsOfFaces
+from usdbrdf.texturing.agreement import seen_points
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, TexturedScene, lit_scene
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
-from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.warps import shifts_of
 
 _PHI, _PSI = calibration.pair("gloss.usual")
 # Frames at most that a texel is looked at from, and rays from each; rays that look around from a
 # texel, and from where each of them ends.
 _VIEWS, _RAYS_OF_VIEW = 8, 32
 _RAYS, _RAYS_OF_LOBE = 64, 4
-# A ray that comes so near to where it is sent, relative to the way, has met nothing.
-_ARRIVED = 1e-3
 
 
 def mirrored_to_frames(
@@ -72,29 +71,17 @@ def _of_dielectrics(surface: TexturedScene, light: Float) -> LitScene:
 
 
 def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: int) -> Int:
-    """(N, _VIEWS): frames that see texels ``index`` (N,), drawn from all that do; -1 for none."""
-    position, normal = surface.texels.position[index], surface.texels.normal[index]
-    origin = lift_from_surface(position, normal, surface.diagonal_m)
+    """(N, _VIEWS): frames that see texels ``index`` (N,), drawn from all that do; -1 for none. What
+    a texel gets depends on nothing but its number."""
+    texels, count = surface.texels, len(index)
+    position, normal = texels.position[index], texels.geometric_normal[index]
+    points = PointsOfFaces(position.astype(np.float64), normal.astype(np.float64))
     # The lowest numbers win; one that does not see the texel has none.
-    rank = np.full((len(frames), len(index)), np.inf, np.float32)
-    random = np.random.default_rng(seed)
+    best, frame = np.full((count, _VIEWS), np.inf), np.full((count, _VIEWS), -1, np.int32)
     for i in range(len(frames)):
-        camera = frames.camera(i)
-        way = camera.eye - position
-        far = np.linalg.norm(way, axis=1)
-        way = (way / np.maximum(far, 1e-9)[:, None]).astype(np.float32)
-        before = -way @ camera.world_from_camera[:3, 2] < 0
-        pixel = np.zeros((len(index), 2))
-        pixel[before] = camera.project(position[before])
-        inside = before & ((pixel > 0) & (pixel < (camera.width, camera.height))).all(axis=1)
-        which = np.flatnonzero(inside & ((normal * way).sum(axis=1) > MIN_COSINE))
-        if not len(which):
-            continue
-        hits = surface.rays.closest(origin[which], way[which])
-        free = (hits.face < 0) | (hits.distance > (1 - _ARRIVED) * far[which])
-        rank[i, which[free]] = random.random(int(free.sum()))
-    chosen = np.argsort(rank, axis=0, kind="stable")[:_VIEWS].T
-    sees = np.isfinite(np.take_along_axis(rank.T, chosen, axis=1))
-    found = np.full((len(index), _VIEWS), -1, np.int32)
-    found[:, : chosen.shape[1]] = np.where(sees, chosen, -1)
-    return found
+        seen = seen_points(points, surface.rays, frames.camera(i))[0]
+        drawn = np.where(seen, shifts_of(index, 1, seed + i)[:, 0], np.inf)
+        last = best.argmax(axis=1)
+        better = np.flatnonzero(drawn < np.take_along_axis(best, last[:, None], axis=1)[:, 0])
+        best[better, last[better]], frame[better, last[better]] = drawn[better], i
+    return frame

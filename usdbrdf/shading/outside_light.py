@@ -3,7 +3,7 @@ reflect, pi L_d = albedo S, where S is what was seen and each source's share tim
 L_d holds the specular light that all frames see as well: where it is told what a usual dielectric
 would mirror to them, M,
 
-    pi L_d = albedo S + m M
+    pi L_d = albedo S + m pi M
 
 with m of each segment about that of the scene, ``gloss_of_scene``, without which dark surfaces make
 lamps too dim, and most so in the colours that they reflect least.
@@ -44,9 +44,9 @@ class Asked(NamedTuple):
 class Sources(NamedTuple):
     """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
     the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
-    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), and by how much
-    these are apart, (P,); and how much of what usual dielectrics would mirror segments do: mean and
-    standard deviation."""
+    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), by how much
+    these are apart, (P,); and the gloss of segments, the share that they mirror of what usual
+    dielectrics would: mean and standard deviation."""
 
     share: Double
     mean: Double
@@ -156,6 +156,10 @@ def _solved_channel(
         both = by_segment(by_albedo * by_gloss * weight)
         curvature[of_albedo, of_gloss] = curvature[of_gloss, of_albedo] = both
         _add_priors(curvature, gradient, sources, channel, (g, albedo, gloss, mean))
+        # What would be less glossy than not at all stays as it is.
+        held = of_gloss[(gloss <= 0) & (gradient[of_gloss] < 0)]
+        curvature[held], curvature[:, held], gradient[held] = 0, 0, 0
+        curvature[held, held] = 1
         damped = curvature + 1e-3 * np.diag(np.diag(curvature))
         step = np.clip(np.linalg.solve(damped, gradient), -1, 1)
         g += step[:num_sources]
@@ -222,32 +226,23 @@ def _add_priors(
     gradient[segment] -= over * _AS_WHITE**-2
 
 
-class Glossy(NamedTuple):
-    """What light gains if all were usual dielectrics: irradiance (N, 3), W/m^2, by way of their
-    lobes, of what was seen, and share (K, N) of each source."""
-
-    irradiance: Double
-    share: Double
-
-
-def gloss_of_scene(asked: Asked, sources: Sources, glossy: Glossy) -> tuple[Asked, Sources]:
-    """The same in a scene as glossy as it is likeliest to be, under Student's t, with all segments
-    about that, give or take as much; and with the light that ``glossy`` surfaces send elsewhere."""
+def gloss_of_scene(asked: Asked, sources: Sources, sent_on: Double) -> Sources:
+    """The sources in a scene as glossy as it is likeliest to be, under Student's t, with all its
+    segments about that, give or take as much; and with what surfaces send on of them, ``sent_on``
+    (K, N) if all were usual dielectrics. What these send on of the light that was seen is in it:
+    frames saw it mirrored."""
     number, plain = int(asked.segment.max()) + 1, ~asked.clipped
     size = np.bincount(asked.segment[plain], minlength=number)
     counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
 
-    def with_gloss(gloss: float) -> tuple[Asked, Sources]:
-        return (
-            asked._replace(irradiance=asked.irradiance + gloss * glossy.irradiance),
-            sources._replace(share=sources.share + gloss * glossy.share, gloss=(gloss, gloss)),
-        )
+    def with_gloss(gloss: float) -> Sources:
+        return sources._replace(share=sources.share + gloss * sent_on, gloss=(gloss, gloss))
 
     def cost(gloss: float) -> float:
-        lit, by = with_gloss(gloss)
-        found = solved(lit, by)
+        glossy = with_gloss(gloss)
+        found = solved(asked, glossy)
         explained = np.exp(found.log_albedo)[asked.segment]
-        explained *= lit.irradiance + by.irradiance(found.log_radiance)
+        explained *= asked.irradiance + glossy.irradiance(found.log_radiance)
         explained += found.gloss[asked.segment] * asked.mirrored
         total = 0.0
         for channel in np.log(asked.reflected / explained).T:

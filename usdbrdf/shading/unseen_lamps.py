@@ -24,7 +24,7 @@ from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import Shining, irradiance_of_texels
 from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
 from usdbrdf.shading.outside import LEAST_OF_SEGMENT, asked_texels, looked_around
-from usdbrdf.shading.outside_light import Asked, Glossy, Sources, gloss_of_scene, jackknife, solved
+from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, jackknife, solved
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -206,15 +206,18 @@ def _looked_at_closely(
         segment=np.unique(asked.segment, return_inverse=True)[1].astype(np.int32)
     )
     texel, seed = asked.texel, seed ^ _SEED
-    share = [_brought(surface, light, texel, seed + i) for i, light in enumerate(lights)]
+    share = [
+        _brought(surface, light, texel, seed + int(k))
+        for k, light in zip(candidates, lights, strict=True)
+    ]
     rest = _without(surface, lit, candidates)
     mirrored = np.pi * mirrored_to_frames(surface, rest, frames, texel, seed)
     sent_on = [
-        mirrored_irradiance(surface, light, texel, seed + i)[:, 0] for i, light in enumerate(alone)
+        mirrored_irradiance(surface, light, texel, seed + int(k))[:, 0]
+        for k, light in zip(candidates, alone, strict=True)
     ]
-    glossy = Glossy(mirrored_irradiance(surface, rest, texel, seed - 1), np.stack(sent_on))
     asked = asked._replace(mirrored=mirrored)
-    return gloss_of_scene(asked, _unknown(asked, np.stack(share)), glossy)
+    return asked, gloss_of_scene(asked, _unknown(asked, np.stack(share)), np.stack(sent_on))
 
 
 def _alone(surface: TexturedScene, index: int) -> Float:
@@ -235,8 +238,8 @@ def _evenly_lit(
     surface: TexturedScene, asked: Asked, lights: Sequence[Shining], strength: Double, seed: int
 ) -> Bool:
     """Which of the texels asked, (N,), lie among others that are as much lit: a pixel beside a
-    shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim. All
-    are, if too few were left of a segment or of all."""
+    shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim.
+    Segments of which few are measured leave; if too few were left in all, all stay."""
     total, most = np.zeros(len(asked.texel)), np.zeros(len(asked.texel))
     for light, radiance in zip(lights, strength, strict=True):
         # The same rays from each, so that their noise is the same.
@@ -250,7 +253,9 @@ def _evenly_lit(
                 uneven = np.maximum(uneven, np.abs(other - own))
         most += radiance * uneven
     even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)
-    count = np.bincount(asked.segment[even], minlength=int(asked.segment.max()) + 1)
+    count = np.bincount(
+        asked.segment[even & ~asked.clipped], minlength=int(asked.segment.max()) + 1
+    )
     even &= count[asked.segment] >= LEAST_OF_SEGMENT // 2
     return even if even.mean() > _LEAST_EVEN else np.ones_like(even)
 
