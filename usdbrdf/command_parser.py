@@ -208,6 +208,8 @@ def _path(text: str) -> Path:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise UsageError(f"{text}: {error.strerror}. Shorten it. [usage.path]") from error
+        if error.errno == errno.ELOOP:
+            raise InputRefused(f"{text}: {error.strerror}. Mend the link. [usage.path]") from error
         raise EnvironmentFailure(
             f"{text}: {error.strerror}. Check the path, and the permissions of the folders above. "
             "[environment.path]"

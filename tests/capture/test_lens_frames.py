@@ -284,7 +284,7 @@ def test_photographs_may_be_called_as_long_as_a_file_may(tmp_path):
             frame["file_path"] = f"frames/{name}"
     asset = Asset.at(tmp_path / "asset")
     with owned_folder(asset.folder):
-        ingest(made.folder, asset)
+        ingest(made.folder, asset, IngestOptions())
     found = [file.name for file in (asset.folder / "frames").iterdir()]
     assert len(found) == len(document["frames"])
     assert max(map(len, found)) < 80

@@ -233,7 +233,8 @@ def transforms(folder: Path) -> list[Seed]:
     made[1].manifest.write_text(json.dumps(document))
     document = json.loads(made[2].manifest.read_text("utf-8"))
     document |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0, "k1": 0.0}
-    document["frames"][0] |= {"mask_path": "frames/0001.exr", "distortion_params": [0.0] * 6}
+    document["frames"][0] |= {"mask_path": "mask.png", "distortion_params": [0.0] * 6}
+    write_preview_png(made[2].folder / "mask.png", np.full((10, 12, 3), 255, np.uint8))
     made[2].manifest.write_text(json.dumps(document))
     folders = [each.folder for each in made]
     folders += [_other_lens(folder / name, changes) for name, changes in OTHER_LENSES.items()]

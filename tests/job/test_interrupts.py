@@ -14,6 +14,14 @@ from usdbrdf.job.interrupts import Terminated, interruptible
 ENDS = [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)]
 
 
+@pytest.fixture(autouse=True)
+def _heard():
+    """A shell that runs this in the background has its SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("number", "ends"), ENDS)
 def test_one_that_a_callback_swallows_comes_again(number, ends):
     @ctypes.CFUNCTYPE(None)
