@@ -237,7 +237,7 @@ def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
     for arguments in (["convert", capture, "-o", tmp_path / "loop/out"], ["validate", "loop"]):
         arguments = [tmp_path / "loop" if word == "loop" else word for word in arguments]
         status, line = refused(capsys, *arguments)
-        assert (status, "symbolic links" in line, "[environment.path]" in line) == (4, True, True)
+        assert (status, "symbolic links" in line, "[usage.path]" in line) == (3, True, True)
 
 
 @pytest.mark.fault("R17")
