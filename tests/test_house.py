@@ -298,6 +298,7 @@ ENGINEERING: dict[str, str] = {
     "_ROWS": "memory",
     "_RUN": "time",
     "_SAMPLING": "rays: noise against time",
+    "_SAVED_UPRIGHT": "EXIF's numbers",
     "_SEED": "a seed",
     "_SEGMENTS": "time: how many are asked",
     "_SHARE": "memory",

@@ -206,26 +206,6 @@ def test_a_mask_that_leaves_nothing_costs_its_frame(made):
     assert any("black everywhere. [capture.mask]" in sentence for sentence in scan.warnings)
 
 
-def test_photographs_that_exif_data_turn_are_taken_as_they_are_stored(made):
-    _as_photographs(made, ".jpg", Orientation=3)
-    scan = _read(made, assume_srgb=True)
-    assert any("turn 12 of 12" in s and "[capture.orientation]" in s for s in scan.warnings)
-    with edited(made.manifest) as document:
-        document.update(w=24, h=32)
-    with pytest.raises(InputRefused, match=r"for 24 x 32\. "):
-        _read(made, assume_srgb=True)
-    _as_photographs_turned(made)
-    with pytest.raises(InputRefused, match=r"EXIF data turn it.*\[capture\.size\]$"):
-        _read(made, assume_srgb=True)
-
-
-def _as_photographs_turned(made: MadeCapture) -> None:
-    """As cameras held upright leave them: lying, with the turn in their EXIF data."""
-    for i in range(12):
-        shown = to_display_srgb8(read_exr(made.image(i)), exposure_scale=1.0)
-        _write_bytes(made.folder / f"photographs/{i:04d}.jpg", shown, Orientation=6)
-
-
 def test_a_mesh_in_millimetres_beside_poses_in_metres(made):
     write_ply(made.folder / "mesh.ply", 1000 * made.points, made.triangles, made.face_object)
     with pytest.raises(InputRefused, match=r"one unit\. \[capture\.parallax\]$"):

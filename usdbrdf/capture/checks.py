@@ -44,6 +44,7 @@ class FrameRecord:
     mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
                        not used; or None
     captured_pose      world_from_camera before somebody refined it; None where it is as captured
+    size_of_image      resolution is the image's own, for lack of a statement
     """
 
     name: str
@@ -57,6 +58,7 @@ class FrameRecord:
     lens: Lens = PINHOLE
     mask_path: Path | None = None
     captured_pose: Double | None = None
+    size_of_image: bool = False
 
 
 def frames_from_records(
@@ -122,6 +124,8 @@ class Findings:
 
     frames, geometry  as far as they were read, for who is told why a capture was refused
     looked_at         the frames whose pixels were checked, by number
+    turned            images that EXIF data turn, of which sizes do not tell whether their poses are
+                      those of the pixels as stored: 2 to 8, see ``files.images.orientation_of``
     """
 
     def __init__(self) -> None:
@@ -131,6 +135,7 @@ class Findings:
         self.frames: Frames | None = None
         self.geometry: ScanGeometry | None = None
         self.looked_at: list[int] = []
+        self.turned: dict[Path, int] = {}
 
     def warn(self, sentence: str) -> None:
         """Keep a sentence for the user. It is published, so it names files without their folder."""
@@ -274,11 +279,13 @@ def at_image_size(
     """Records with the sizes of their images, and intrinsics that belong to these.
 
     Images that are larger or smaller than their intrinsics say, by one factor in both axes, have
-    the intrinsics scaled; frames with other sizes, or unreadable ones, are dropped.
+    the intrinsics scaled; frames with other sizes, or unreadable ones, are dropped. Images that
+    EXIF data turn go to ``findings.turned``.
     """
     kept: list[FrameRecord] = []
     scaled: list[str] = []
-    turned: list[str] = []
+    turned: dict[Path, int] = {}
+    as_stored = False  # some image that is to be turned has the shape that its camera is for
     outside: list[str] = []
     for record in records:
         try:
@@ -289,10 +296,11 @@ def at_image_size(
         across, down = record.resolution
         said = f"{width} x {height} pixels, but the intrinsics are for {across} x {down}"
         orientation = orientation_of(record.image_path)
-        if orientation > 4 and (width > height) == (down > across):
+        if orientation > 4 and (width > height) == (down > across) and width != height:
             said += "; its EXIF data turn it, so save the images upright"
         elif orientation > 1:
-            turned.append(f"{record.name!r} (orientation {orientation})")
+            turned[record.image_path] = orientation
+            as_stored |= orientation > 4 and width != height and not record.size_of_image
         # Whoever scales an image rounds its sides to whole pixels.
         if abs(width * down - height * across) >= across:
             findings.drop(record.name, said, "capture.size")
@@ -308,12 +316,8 @@ def at_image_size(
         if not (0 <= x <= width and 0 <= y <= height):
             outside.append(f"{record.name!r}: {x:.0f}, {y:.0f} of {width} x {height} pixels")
         kept.append(record)
-    if turned:
-        findings.warn(
-            f"{source.name}: EXIF data turn {len(turned)} of {len(records)} images, first "
-            f"{turned[0]}; their pixels are used as they are stored, as COLMAP uses them. Save "
-            "them upright if the poses are those of upright ones. [capture.orientation]"
-        )
+    if not as_stored:  # one program made all poses
+        findings.turned |= turned
     if outside:
         findings.warn(
             f"{source.name}: the principal points of {len(outside)} of {len(records)} frames lie "

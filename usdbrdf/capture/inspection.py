@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -59,6 +59,7 @@ class Inspection:
     own_faces             of the mesh; second skins come after them
     dropped               frames that cannot be used
     looked_at             frames whose pixels were checked
+    turned_images         of a Scan
     agreement             by how much frames that show the same points differ, as a share of what
                           any two pixels do
     granted               options that were taken as given to read on after a refusal
@@ -80,6 +81,7 @@ class Inspection:
     looked_at: int = 0
     counts: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    turned_images: Mapping[Path, int] = field(default_factory=dict)
     agreement: float | None = None
     granted: tuple[str, ...] = ()
     refusals: tuple[UsdBrdfError, ...] = ()
@@ -238,6 +240,7 @@ def _of_scan(seen: Inspection, scan: Scan, options: CaptureOptions) -> Inspectio
         looked_at=scan.counts.get("frames_looked_at", len(scan.frames)),
         counts=scan.counts,
         warnings=scan.warnings,
+        turned_images=scan.turned_images,
     )
 
 

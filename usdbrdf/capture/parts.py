@@ -410,6 +410,7 @@ def scan_from_parts(
         turned_faces=sides.turned,
         label_source=geometry.label_source,
         has_normals=geometry.has_normals,
+        turned_images=dict(findings.turned),
         warnings=tuple(findings.warnings),
         counts=dict(findings.counts),
     )

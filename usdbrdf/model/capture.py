@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -169,6 +169,8 @@ class Scan:
     turned_faces   (F,) bool: the mesh's faces that the file has wound away from the cameras; in
                    ``mesh`` they are turned
     label_source   who divided it into objects, see ``ScanGeometry``
+    turned_images  images that EXIF data turn (2 to 8: how), as far as sizes do not tell whether the
+                   poses are those of the pixels as stored
     has_normals    (F,) bool: faces whose normals are the file's; None: of none
     warnings       sentences that were printed, kept for the record
     counts         numbers of the checks (degenerate faces removed, frames dropped, ...)
@@ -188,5 +190,6 @@ class Scan:
     turned_faces: Bool | None = None
     label_source: str = "capture"
     has_normals: Bool | None = None
+    turned_images: Mapping[Path, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     counts: dict[str, int] = field(default_factory=dict)

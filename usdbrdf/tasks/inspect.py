@@ -18,6 +18,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
+from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 
 
@@ -36,8 +37,13 @@ def inspect(
 
     try:
         with scratch_folder() as folder:
-            frames = developed_frames(spread_evenly(len(every), ASKED), folder)
             surface, rays = surface_and_rays(mesh)
+            if found.turned_images:
+                numbers = frames_to_compare(every, found.turned_images)
+                frames = developed_frames(numbers, folder)
+                read = partial(read_frame, frames)
+                refuse_turned(surface, rays, frames, found.turned_images, read, capture)
+            frames = developed_frames(spread_evenly(len(every), ASKED), folder)
             read = partial(read_frame, frames)
             agrees = agreement_of_frames(surface, rays, frames, read, capture)
             objects = found.objects

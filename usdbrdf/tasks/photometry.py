@@ -24,6 +24,7 @@ from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
 from usdbrdf.tasks.task import warned
+from usdbrdf.tasks.turned import refuse_turned
 from usdbrdf.texturing.agreement import (
     Agreement,
     SurfacePoints,
@@ -48,6 +49,7 @@ def asked_of_its_pixels(
     what was found, for the record: under "warnings" what the user has been warned of."""
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     surface, rays = surface_and_rays(scan.mesh)
+    refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
     agrees = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
     estimate = options.vignetting == "estimate"

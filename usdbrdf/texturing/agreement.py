@@ -104,11 +104,15 @@ class Agreement(NamedTuple):
     samples: int
 
 
-def agreement(logarithm: Float) -> Agreement | None:
-    """Of logarithms (P, N); None where too few points are seen by several frames."""
+def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
+    """Of logarithms (P, N); None where too few points are seen by several frames.
+
+    judged  (N,) bool: how far these frames agree with all; None: each of them
+    """
     known = np.isfinite(logarithm)
     known &= (known.sum(axis=1) > 1)[:, None]
-    samples = int(known.sum())
+    compared = known if judged is None else known & judged
+    samples = int(compared.sum())
     if samples < _FEWEST:
         return None
     rows = known.any(axis=1)
@@ -118,7 +122,7 @@ def agreement(logarithm: Float) -> Agreement | None:
     number = known[rows].sum(axis=1, keepdims=True)
     off *= np.sqrt(number / (number - 1))
     # Means, for where most of a scene is one colour the median pixel fits any pose.
-    scatter = float(np.abs(off[known[rows]]).mean())
+    scatter = float(np.abs(off[compared[rows]]).mean())
     level = value[known[rows]]
     spread = float(np.abs(level - np.median(level)).mean())
     return Agreement(scatter, scatter / max(spread, 1e-6), samples)

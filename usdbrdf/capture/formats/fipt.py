@@ -157,6 +157,7 @@ def _record(
         world_from_camera=pose,
         intrinsics=intrinsics,
         resolution=(width, height),
+        size_of_image=True,
     )
 
 

@@ -215,5 +215,6 @@ def _record(
             height / 2 + centre[1] * longer,
         ),
         resolution=(width, height),
+        size_of_image=True,
         lens=lens if lens.bends else PINHOLE,
     )

@@ -109,7 +109,8 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
     # The size of the image that the intrinsics belong to is told by the OpenGL projection.
     projection = _numbers(document, "projectionMatrix", 16)
     try:
-        if projection is not None and projection[0] > 0 and projection[5] > 0:
+        told = projection is not None and projection[0] > 0 and projection[5] > 0
+        if projection is not None and told:
             sides = 2 * camera[0] / projection[0], 2 * camera[4] / projection[5]
             resolution = round(min(sides[0], MAX_SIDE + 1)), round(min(sides[1], MAX_SIDE + 1))
         else:
@@ -128,6 +129,7 @@ def _record(document: Any, path: Path, photograph: Path, findings: Findings) -> 
         # The first pixel's centre is (0, 0) there and (0.5, 0.5) here.
         intrinsics=(camera[0], camera[4], camera[2] + 0.5, camera[5] + 0.5),
         resolution=resolution,
+        size_of_image=not told,
         exposure_time=float(exposure),
     )
 

@@ -237,6 +237,7 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
         captured_pose=_captured_pose(capture, frame, name),
         intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
+        size_of_image=not stated,
         lens=lens,
         mask_path=_mask(capture, frame, name),
         exposure_time=capture.positive(frame, "exposure_time") or 1.0,

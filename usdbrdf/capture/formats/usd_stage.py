@@ -198,6 +198,7 @@ def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecor
         world_from_camera=pose,
         intrinsics=pinhole_from_lens(shot.camera.lens[shot.i], width, height),
         resolution=(width, height),
+        size_of_image=True,
         exposure_time=exposure if 0 < exposure < math.inf else 1.0,
     )
 
