@@ -201,7 +201,8 @@ def _telling(video: _Video) -> list[int]:
 def _response(video: _Video, there: frozenset[int], folder: Path) -> Response:
     """Of the runs of frames that can be laid onto each other."""
     stacks, exposures, why = list[Byte](), list[Double](), "none that follow each other are there"
-    for first in _telling(video):
+    telling = _telling(video)
+    for first in progress(telling, total=len(telling), label="response", unit="runs"):
         run = [n for n in range(first, first + _RUN) if n in there]
         run = sorted(
             {video.exposures[n]: n for n in run}.values(), key=lambda n: -video.exposures[n]
@@ -230,7 +231,8 @@ def _contradicting(
     """Stops by which frames are brighter than their stated exposure makes of what those beside
     them show, where both of these say so."""
     off: dict[int, float] = {}
-    for n in video.numbers:
+    total = len(video.numbers)
+    for n in progress(video.numbers, total=total, label="exposures", unit="frames"):
         beside = [m for m in (n - 1, n + 1) if m in there]
         own = _codes(folder, n)[::_STRIDE, ::_STRIDE]
         said = []
