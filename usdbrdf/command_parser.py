@@ -127,6 +127,8 @@ def _made(owner: type[Any], given: Mapping[str, Any]) -> Any:
             # A flag says the opposite of the default.
             flag = field.kind is bool
             known[field.name] = given[key] is not field.default if flag else given[key]
+            if field.option.joined:
+                known[field.name] = ",".join(given[key])
     return owner(**known)
 
 
@@ -134,7 +136,7 @@ def _argument(said: _Said) -> inspect.Parameter:
     from cyclopts import Parameter
 
     option, field = said.option, said.field
-    kind, several = field.kind, get_origin(field.kind) is tuple
+    kind, several = field.kind, get_origin(field.kind) is tuple or option.joined
 
     def read(_kind: Any, tokens: Any) -> Any:
         return _value(field, option, [(token.index, token.value) for token in tokens])
@@ -165,6 +167,8 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
         texts = [word for _, word in words]
         bounds = [*(i for i, (number, _) in enumerate(words) if number == 0), len(words)]
         return tuple(_insert(*texts[first:end]) for first, end in pairwise(bounds))
+    if option.joined:
+        return [word for _, word in words]
     text = words[-1][1]
     if text == option.none:
         return None

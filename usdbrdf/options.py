@@ -131,9 +131,12 @@ class CaptureOptions(Options):
     "without labels, connected parts of at least this many m^2 become objects"
     assume_srgb: bool = option("--assume-srgb", False)
     "accept 8-bit photographs as sRGB; the result is then not radiometric"
-    encoding: str | None = option("--input-space --encoding NAME", None, unset="as the format says")
+    encoding: str | None = option(
+        "--input-space --encoding NAME", None, unset="as the format says", joined=True
+    )
     """colour space of the images by its OpenColorIO name: scene-linear (lin_ap1_scene), a camera's
-    logarithm (ARRI LogC4), or for 8-bit photographs a display's (srgb_p3d65_scene)"""
+    logarithm (ARRI LogC4), or for 8-bit photographs a display's (srgb_p3d65_scene); of one of
+    several lightings LIGHTING=NAME, and then again"""
     pose_scale: float | None = option(
         "--pose-scale S", None, _LENGTH, unset="1, others are refused"
     )

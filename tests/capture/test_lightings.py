@@ -13,9 +13,12 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.lightings import (
     in_own_folder,
     names_of_lightings,
+    options_of_lightings,
     refuse_other_scenes,
     scan_of_lightings,
 )
+from usdbrdf.command_parser import parsed
+from usdbrdf.commands import COMMANDS
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
@@ -49,6 +52,37 @@ def test_lightings_have_the_names_of_their_folders(tmp_path):
     (tmp_path / "other" / "BY DAY").mkdir(parents=True)
     with pytest.raises(UsageError, match=r"would be called BY_DAY.*\[lighting.name\]"):
         names_of_lightings([tmp_path / "other" / "BY DAY", folders[0]])
+
+
+def test_each_lighting_may_be_told_its_colour_space():
+    def said(text: str | None, *names: str) -> dict[str, str | None]:
+        found = options_of_lightings(IngestOptions(encoding=text), names)
+        return {name: one.encoding for name, one in found.items()}
+
+    assert said("day=ACEScg,night=lin_rec709_scene", "day", "night") == {
+        "day": "ACEScg", "night": "lin_rec709_scene",
+    }  # fmt: skip
+    assert said("lin_rec709_scene,night=ACEScg", "day", "night") == {
+        "day": "lin_rec709_scene", "night": "ACEScg",
+    }  # fmt: skip
+    assert said("day=ACEScg", "day", "night") == {"day": "ACEScg", "night": None}
+    assert said(None, "day", "night") == {"day": None, "night": None}
+    assert said("ACEScg") == {"": "ACEScg"}
+    for text, names, problem in (
+        ("dusk=ACEScg", ("day", "night"), "no lighting is called 'dusk'.*day, night"),
+        ("day=ACEScg", (), "no lighting is called 'day'.*of one alone"),
+        ("day=a,day=b", ("day", "night"), "one lighting twice"),
+        ("a,b", ("day", "night"), "one lighting twice"),
+        ("day=", ("day", "night"), "names no colour space"),
+    ):
+        with pytest.raises(UsageError, match=rf"--input-space .*{problem}.*\[usage.option\]"):
+            said(text, *names)
+
+
+def test_the_command_line_takes_a_colour_space_for_each_lighting():
+    words = ["a", "b", "-o", "out", "--input-space", "a=ACEScg", "--input-space", "b=x"]
+    command = parsed(["convert", *words], COMMANDS)
+    assert command.options.ingest.encoding == "a=ACEScg,b=x"
 
 
 def test_frames_follow_each_other_and_know_their_lighting(pair):

@@ -20,6 +20,7 @@ from usdbrdf.files.naming import identifier_from
 from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras
 from usdbrdf.model.capture import Frames, Scan, recorded_together
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.options import IngestOptions
 from usdbrdf.transport.rays import RayScene
 
 # Points of two files that hold one mesh differ by no more than this, of its size.
@@ -41,6 +42,32 @@ def names_of_lightings(captures: Sequence[Path]) -> tuple[str, ...]:
                 "Rename one of the folders. [lighting.name]"
             )
     return tuple(names)
+
+
+def options_of_lightings(options: IngestOptions, names: Sequence[str]) -> dict[str, IngestOptions]:
+    """What holds for the capture of each lighting: of ``options.encoding``, which may say several,
+    LIGHTING=NAME with commas between, that one's; a NAME alone is that of all the others. ``names``
+    is () for a single capture. UsageError for lightings that there are not, or said twice."""
+    said: dict[str, str] = {}
+    for text in options.encoding.split(",") if options.encoding else ():
+        name, equals, encoding = (part.strip() for part in text.rpartition("="))
+        if equals and name not in names:
+            there = f"they are {', '.join(names)}" if names else "of one alone, say NAME"
+            raise UsageError(
+                f"--input-space {text}: no lighting is called {name!r}; they have the names of "
+                f"their captures' folders, {there}. Correct it. [usage.option]"
+            )
+        if name in said or not encoding:
+            problem = "it names no colour space" if not encoding else "it says one lighting twice"
+            raise UsageError(
+                f"--input-space {options.encoding}: {problem}. Say LIGHTING=NAME once for each. "
+                "[usage.option]"
+            )
+        said[name] = encoding
+    return {
+        name: replace(options, encoding=said.get(name, said.get("")))
+        for name in (tuple(names) or ("",))
+    }
 
 
 def scan_of_lightings(scans: Mapping[str, Scan], crease_angle_deg: float) -> Scan:

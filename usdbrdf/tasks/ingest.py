@@ -22,6 +22,7 @@ from usdbrdf.capture.develop import developed
 from usdbrdf.capture.lightings import (
     in_own_folder,
     names_of_lightings,
+    options_of_lightings,
     refuse_other_scenes,
     scan_of_lightings,
 )
@@ -51,6 +52,7 @@ def ingest(
     paths = (capture,) if isinstance(capture, Path) else tuple(capture)
     lightings = names_of_lightings(paths)
     captures = dict(zip(lightings or ("",), paths, strict=True))
+    options_of = options_of_lightings(options, lightings)
     if copy_to is not None:
         if lightings:
             raise UsageError(
@@ -71,7 +73,7 @@ def ingest(
     task = Task(asset=asset, name="ingest", role="scan", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
-        scans = {name: read_with(chosen[name], path, options) for name, path in captures.items()}
+        scans = {k: read_with(chosen[k], path, options_of[k]) for k, path in captures.items()}
         refuse_other_scenes(scans)
         warnings = warned(sentence for scan in scans.values() for sentence in scan.warnings)
         header = StageHeader.of_scan(asset.name, *scans.values())
@@ -85,6 +87,7 @@ def ingest(
             images = [run.kept.get(str(file), file) for file in files]
             scans[name], told[name] = asked_of_its_pixels(scan, images, options)
             warnings += told[name].pop("warnings")
+            told[name]["encoding"] = scan.frames.photograph_encoding or scan.frames.encoding
             if copy_to:
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
@@ -108,7 +111,7 @@ def ingest(
 
     result = task.run(work)
     if copy_to is not None and not result.reran:
-        scan = read_with(chosen[""], paths[0], options)
+        scan = read_with(chosen[""], paths[0], options_of[""])
         frames = developed(scan.frames, scan.views, asset.folder, lambda *_: None)
         scan = replace(scan, frames=frames)
         again = options.refine_poses or options.objects == AUTO
