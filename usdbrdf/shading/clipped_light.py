@@ -46,7 +46,8 @@ _UNIT = np.float32(calibration.number("lamps.errors.unit"))
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
 _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
-_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
+# How closely it is known what these receive.
+CLOSELY = Sampling(standard_error=0.01, max_rays=1024)
 _WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
@@ -230,7 +231,7 @@ def irradiance_of_texels(
     outside: Environment,
     index: Long,
     seed: int,
-    sampling: Sampling = _SAMPLING,
+    sampling: Sampling = CLOSELY,
 ) -> Float:
     """S (N, 3), W/m^2, of a few texels in the light of the surfaces and what is outside."""
     texels = surface.texels

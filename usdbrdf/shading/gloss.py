@@ -14,11 +14,10 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.texturing.agreement import SurfacePoints as PointsOfFaces
-from usdbrdf.texturing.agreement import seen_points
+from usdbrdf.texturing.agreement import MeshPoints, seen_points
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, TexturedScene, lit_scene
+from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene, points_of_texels
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
 from usdbrdf.transport.warps import shifts_of
 
@@ -40,10 +39,7 @@ def mirrored_to_frames(
     for row, frame in zip(shown, _some_that_see(surface, frames, index, seed).T, strict=True):
         which = np.flatnonzero(frame >= 0)
         own = index[which]
-        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
-        to_camera = (eyes[frame[which]] - position).astype(np.float32)
-        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
+        points = points_of_texels(texels, own, eyes[frame[which]])
         phi, psi = (np.full(len(own), value, np.float32) for value in (_PHI, _PSI))
         row[which] = lobe_radiance(lit, points, phi, psi, _RAYS_OF_VIEW, seed, own)
         seed += 1
@@ -75,7 +71,7 @@ def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: in
     a texel gets depends on nothing but its number."""
     texels, count = surface.texels, len(index)
     position, normal = texels.position[index], texels.geometric_normal[index]
-    points = PointsOfFaces(position.astype(np.float64), normal.astype(np.float64))
+    points = MeshPoints(position.astype(np.float64), normal.astype(np.float64))
     # The lowest numbers win; one that does not see the texel has none.
     best, frame = np.full((count, _VIEWS), np.inf), np.full((count, _VIEWS), -1, np.int32)
     for i in range(len(frames)):

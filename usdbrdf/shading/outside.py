@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -259,8 +258,7 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
     Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
     shadows passes for light from all around the sun."""
     share, clear = sunlit(surface, asked.texel, sun, seed), np.ones(len(asked.texel), np.bool_)
-    for down, right in product((-_AROUND, 0, _AROUND), repeat=2):
-        beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
+    for beside in surface.texels.around(asked.texel, _AROUND):
         clear &= np.abs(sunlit(surface, beside, sun, seed) - share) < _AS_SUNLIT
     if clear[share > 0].mean() > _MOSTLY_CLEAR:
         return None
@@ -271,9 +269,7 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
     ]
     if len(halves[0]) < LEAST_OF_SEGMENT:
         return None
-    chosen = asked.of(np.sort(np.concatenate(halves)))
-    segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
-    return chosen._replace(segment=segment)
+    return asked.of(np.sort(np.concatenate(halves)))
 
 
 def _patches(clipped: Bool, z_up: bool) -> Int:
@@ -376,9 +372,7 @@ def _with_sun(
         pairs=sky.pairs,
         apart=sky.apart,
     )
-    chosen = asked.of(kept)
-    segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
-    return chosen._replace(segment=segment), sources
+    return asked.of(kept), sources
 
 
 def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double, z_up: bool) -> Float:

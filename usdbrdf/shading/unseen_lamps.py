@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import Shining, irradiance_of_texels
+from usdbrdf.shading.clipped_light import CLOSELY, Shining, irradiance_of_texels
 from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
 from usdbrdf.shading.outside import LEAST_OF_SEGMENT, asked_texels, looked_around
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, jackknife, solved
@@ -38,8 +37,7 @@ _MOST_ERROR = calibration.number("unseen.most_error")
 # Rays from each texel that is asked, objects that may shine, and those whose light is traced.
 _RAYS, _CANDIDATES, _TRACED = 256, 32, 8
 _SEED = 0x1A3
-# How closely what a lamp brings is known, and how roughly it tells even light from shadows' edges.
-_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
+# How roughly what a lamp brings tells even light from shadows' edges.
 _ROUGHLY = Sampling(standard_error=0, max_rays=32)
 # Texels from one to those beside it; by what share of the lamps' light and of all other light these
 # may differ.
@@ -202,9 +200,6 @@ def _looked_at_closely(
     lights = [Shining.of(surface, light) for light in alone]
     even = _evenly_lit(surface, asked, lights, strength, seed)
     asked = asked.of(even)
-    asked = asked._replace(
-        segment=np.unique(asked.segment, return_inverse=True)[1].astype(np.int32)
-    )
     texel, seed = asked.texel, seed ^ _SEED
     share = [
         _brought(surface, light, texel, seed + int(k))
@@ -227,7 +222,7 @@ def _alone(surface: TexturedScene, index: int) -> Float:
 
 
 def _brought(
-    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = _SAMPLING
+    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = CLOSELY
 ) -> Double:
     """(N,) W/m^2: what grey ``light`` brings, by rays that are sent to it."""
     found = irradiance_of_texels(surface, light, black_environment(), texel, seed, sampling)
@@ -246,11 +241,9 @@ def _evenly_lit(
         own = _brought(surface, light, asked.texel, seed, _ROUGHLY)
         total += radiance * own
         uneven = np.zeros(len(own))
-        for right, down in product((-_AROUND, 0, _AROUND), repeat=2):
-            if right or down:
-                beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
-                other = _brought(surface, light, beside, seed, _ROUGHLY)
-                uneven = np.maximum(uneven, np.abs(other - own))
+        for beside in surface.texels.around(asked.texel, _AROUND):
+            other = _brought(surface, light, beside, seed, _ROUGHLY)
+            uneven = np.maximum(uneven, np.abs(other - own))
         most += radiance * uneven
     even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)
     count = np.bincount(
