@@ -300,7 +300,6 @@ ENGINEERING: dict[str, str] = {
     "_ROUNDS": "steps of a search",
     "_ROWS": "memory",
     "_RUN": "time",
-    "_SAMPLING": "rays: noise against time",
     "_SEED": "a seed",
     "_SEGMENTS": "time: how many are asked",
     "_SHARE": "memory",
