@@ -206,12 +206,13 @@ def _told_by_even_light(
     first: EstimatedRadiance,
     seed: int,
 ) -> EstimatedRadiance:
-    """The estimate with those of its lamps that are determined looked at closely; where that tells
-    less, or less than the lamps' bounds, the ``first`` one."""
+    """The estimate with those of its lamps that are determined looked at closely; where these say
+    too little of a lamp, or that it is darker than its bound, the ``first`` one."""
     lamps = np.flatnonzero(groups.lamp & first.determined)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if not len(lamps) or asked is None:
         return first
+    asked = asked.of(groups.group[asked.texel] < 0)
     number = np.full(len(groups) + 1, -1, np.int32)
     number[lamps] = np.arange(len(lamps))
     bound = groups.bound[lamps].astype(np.float64)
