@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
+from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
@@ -60,10 +61,12 @@ def truth(world: World) -> np.ndarray:
 
 
 def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
+    eyes = [np.array(eye) for eye in ((0.4, 0.4, 1.5), (3.6, 2.6, 1.5), (0.4, 2.6, 1.2))]
+    frames = frames_at([look_at(eye, np.array([2.0, 1.5, 1.0])) for eye in eyes])
     surface = TexturedScene(world.scene, world.texels, world.rays)
     run = TaskRun(folder, "shade", folder / "work")
     coverage = CoverageMap.of(~clipped, clipped)
-    return estimate_clipped_light(run, surface, lit, coverage, black_environment(), 0)
+    return estimate_clipped_light(run, surface, lit, coverage, frames, black_environment(), 0)
 
 
 def test_the_lamps_are_as_bright_as_their_light_says(

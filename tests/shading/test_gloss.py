@@ -11,6 +11,7 @@ from usdbrdf.shading import gloss
 from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.directional_albedo import fitted_albedo, view_cosines
+from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
 LIGHT = np.array([3.0, 2.0, 1.0])
@@ -41,7 +42,7 @@ def test_in_uniform_light_frames_are_shown_the_directional_albedo_of_it(furnace)
     eye = np.array([2.0, 2.1, 1.5])
     frames = frames_at([look_at(eye, np.array([x, y, 0.0])) for x, y in ((2, 2.4), (0.5, 2))])
     floor = np.arange(*surface.texels.of_object(0).indices(10**6), dtype=np.int64)
-    found = mirrored_to_frames(surface, light, frames, floor, 0)
+    found = mirrored_to_frames(surface, light, black_environment(), frames, floor, 0)
     way = eye - surface.texels.position[floor]
     cosine = way[:, 2] / np.linalg.norm(way, axis=1)
     pixels = [frames.camera(i).project(surface.texels.position[floor]) for i in range(2)]
@@ -57,7 +58,7 @@ def test_what_is_behind_another_surface_is_shown_to_no_frame(furnace):
     surface, light = furnace
     outside = frames_at([look_at(np.array([2.0, 2.1, -3.0]), np.array([2.0, 2.0, 4.1]))])
     some = np.arange(len(light), step=7)
-    assert not mirrored_to_frames(surface, light, outside, some, 0).any()
+    assert not mirrored_to_frames(surface, light, black_environment(), outside, some, 0).any()
 
 
 def test_in_uniform_light_surfaces_send_on_what_they_do_not_let_in(furnace):
@@ -75,7 +76,7 @@ def test_a_wall_hides_what_it_hides():
     light = np.ones((len(world.texels), 3), np.float32)
     above = frames_at([look_at(np.array([1.0, 1.001, 3.0]), np.array([1.0, 1.0, 0.0]))])
     floor = np.arange(64)
-    found = mirrored_to_frames(surface, light, above, floor, 0)
+    found = mirrored_to_frames(surface, light, black_environment(), above, floor, 0)
     middle = np.abs(world.texels.position[:64, :2] - 1).max(axis=1)
     assert not found[middle < 0.2].any()
     # Beside it the floor mirrors its sides.

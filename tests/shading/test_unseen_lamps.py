@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
-from usdbrdf.model.texels import CoverageMap
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.shading.clipped_light import estimate_clipped_light
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
@@ -94,23 +98,50 @@ def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
 
 
 def test_a_lamp_is_told_by_what_lies_evenly_in_its_light(hall, monkeypatch):
-    # Pixels blur shadows: beside an edge there is light of a lamp where none falls.
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
-    texels, shown = surface.texels, lit.copy()
-    for i in range(len(texels.resolution)):
-        if i not in (LAMP, SHELF):
-            picture = gaussian_filter(texels.image(i, lit), (1.5, 1.5, 0), mode="nearest")
-            shown[texels.of_object(i)] = texels.from_image(i, picture)
+    shown = _blurred(surface.texels, lit)
 
     def off() -> float:
         found = lamps_that_explain(surface, shown, coverage, FRAMES, 0)
         return float(np.abs(found.radiance[0] / RADIANCE - 1).max())
 
     even = off()
-    monkeypatch.setattr("usdbrdf.shading.unseen_lamps._LEAST_EVEN", 2.0)
+    monkeypatch.setattr("usdbrdf.shading.lamp_light._LEAST_EVEN", 2.0)
     every = off()
     assert even < 0.1
     assert every > 2 * even
+
+
+def _blurred(texels: Texels, lit: np.ndarray) -> np.ndarray:
+    """Pixels blur shadows: beside an edge there is light of a lamp where none falls."""
+    shown = lit.copy()
+    for i in range(len(texels.resolution)):
+        if i not in (LAMP, SHELF):
+            picture = gaussian_filter(texels.image(i, lit), (1.5, 1.5, 0), mode="nearest")
+            shown[texels.of_object(i)] = texels.from_image(i, picture)
+    return shown
+
+
+def test_so_is_a_lamp_that_clips(hall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    texels, shown = surface.texels, _blurred(surface.texels, lit)
+    clipped = texels.object_index() == LAMP
+    shown[clipped] = 5.0
+    coverage = CoverageMap.of(coverage.observed & ~clipped, clipped)
+
+    def off(name: str) -> float:
+        run = TaskRun(tmp_path, "shade", tmp_path / name)
+        light = estimate_clipped_light(
+            run, surface, shown, coverage, FRAMES, black_environment(), 0
+        )
+        assert light.estimate.determined.all()
+        return float(np.abs(light.lit[clipped][0] / RADIANCE - 1).max())
+
+    closely = off("closely")
+    monkeypatch.setattr("usdbrdf.shading.clipped_light._CLOSELY", 0)
+    every = off("every")
+    assert closely < 0.1
+    assert every > 2 * closely
 
 
 def test_what_only_reflects_is_none(hall):

@@ -7,7 +7,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
+from usdbrdf.transport.lit_scene import LitScene, points_of_texels
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 
 # Rays per sample: the mean over the frames averages their noise out, so a texel that many frames
@@ -28,13 +28,9 @@ def specular_of_samples(
     found = np.empty((len(texel), 3), np.float32)
     often = samples >= _MANY_FRAMES
     for rays, which in ((_RAYS, ~often), (_RAYS_OF_MANY, often)):
-        own = texel[which]
-        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
-        to_camera = (eye - position).astype(np.float32)
-        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
-        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
-        numbers = own.astype(np.int64)
-        found[which] = lobe_radiance(lit, points, phi[which], psi[which], rays, seed, numbers)
+        own = texel[which].astype(np.int64)
+        points = points_of_texels(texels, own, eye)
+        found[which] = lobe_radiance(lit, points, phi[which], psi[which], rays, seed, own)
     return _shared(texels, phi, texel, eye, found)
 
 

@@ -209,8 +209,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     Names and classes of objects tell nothing here.
     """
     if lobe is None:
-        errors = float(NOTHING_KNOWN), UNASKED
-        return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
+        return _not_asked(seen)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
     phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)
@@ -265,5 +264,9 @@ def verdict_on_frame(
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
         return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
+    return _not_asked(seen)
+
+
+def _not_asked(seen: bool) -> Verdict:
     errors = float(NOTHING_KNOWN), UNASKED
     return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)

@@ -4,8 +4,10 @@ know of its lit radiance.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -123,6 +125,13 @@ class Texels:
         row = np.clip(row + down, 0, height - 1)
         texel = self.nearest_texel[self.first_pixel[owner] + row * width + column]
         return np.where(texel >= 0, texel, index).astype(np.int32)
+
+    def around(self, index: Long, apart: int) -> Iterator[Long]:
+        """The texels, (N,) each, that lie ``apart`` pixels of an atlas from texels ``index`` (N,),
+        in all eight directions."""
+        for right, down in product((-apart, 0, apart), repeat=2):
+            if right or down:
+                yield self.beside(index, right, down).astype(np.int64)
 
     def tile(self, index: Long, side: int) -> Long:
         """(N,) int64, equal for texels ``index`` (N,) in one tile of side^2 pixels of an atlas."""

@@ -219,7 +219,7 @@ def normal_equations(
 
 
 MAX_ERROR = calibration.number("lamps.max_error")
-_LEAST_ERROR = calibration.number("lamps.least_error")
+LEAST_ERROR = calibration.number("lamps.least_error")
 _FEW_OBJECTS = calibration.count("lamps.few_objects")
 _STUDENT_FREEDOM = calibration.number("lamps.student_freedom")
 _ROUNDS = 6
@@ -372,5 +372,5 @@ def _standard_error(evidence: Evidence, weighed: list[Weighed], log_g: Double) -
         for item, weight in weighed
     )
     ambient = np.einsum("ckl,cl->kc", inverse, pull)
-    whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + _LEAST_ERROR**2
+    whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + LEAST_ERROR**2
     return np.asarray(np.sqrt(whole_error))

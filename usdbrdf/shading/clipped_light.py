@@ -2,6 +2,8 @@
 
 Clipped texels that hang together are one group, which looks like a lamp or like a bright wall; what
 each of the groups sends to a few thousand measured texels is traced, and their radiances follow.
+Texels of every kind tell whether a lamp is determined; how bright it is, those that lie evenly in
+its light tell better (``lamp_light``).
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -20,21 +21,21 @@ from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
+from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.options import Sampling
+from usdbrdf.shading.asked import Shining, asked_texels, first_of_segments, irradiance_of_texels
 from usdbrdf.shading.clipped_emitters import (
     LAMP_PRIOR,
+    LEAST_ERROR,
+    MAX_ERROR,
     EstimatedRadiance,
     Evidence,
     estimate_clipped_emitters,
     nothing_known,
 )
+from usdbrdf.shading.lamp_light import Lamps, looked_at_closely
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
-from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
-from usdbrdf.transport.sunlight import sunlight
-from usdbrdf.transport.surface_texture import SurfaceTexture
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
 # More lamps are not told apart; the faintest keep their bounds.
@@ -46,7 +47,8 @@ _UNIT = np.float32(calibration.number("lamps.errors.unit"))
 # Texels that are asked, in all, and at least and at most on one facing of one object (a segment);
 # and how many segments, those that the lamps should light most.
 _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
-_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
+# Lamps that are looked at closely, at most: those with the most light.
+_CLOSELY = 8
 _WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
@@ -153,6 +155,7 @@ def estimate_clipped_light(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
+    frames: Frames,
     environment: Environment,
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
@@ -171,13 +174,70 @@ def estimate_clipped_light(
         if not len(chosen):
             return dict(vars(nothing_known(len(groups))))
         evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
-        return dict(vars(estimate_clipped_emitters(evidence)))
+        first = estimate_clipped_emitters(evidence)
+        return dict(
+            vars(
+                _told_by_even_light(
+                    surface, lit, coverage, frames, environment, groups, first, seed
+                )
+            )
+        )
 
     estimate = EstimatedRadiance(**run.checkpoint("clipped", compute))
+    return ClippedLight(
+        lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
+    )
+
+
+def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
     lit = lit.copy()
     for k in np.flatnonzero(estimate.determined):
         lit[groups.group == k] = groups.bound[k] * estimate.multiplier[k]
-    return ClippedLight(lit=lit, groups=groups, estimate=estimate)
+    return lit
+
+
+def _told_by_even_light(
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    frames: Frames,
+    environment: Environment,
+    groups: ClippedGroups,
+    first: EstimatedRadiance,
+    seed: int,
+) -> EstimatedRadiance:
+    """The estimate with those of its lamps that are determined looked at closely; where these say
+    too little of a lamp, or that it is darker than its bound, the ``first`` one."""
+    lamps = np.flatnonzero(groups.lamp & first.determined)[:_CLOSELY]
+    asked = asked_texels(surface.texels, lit, coverage, seed)
+    if not len(lamps) or asked is None:
+        return first
+    asked = asked.of(groups.group[asked.texel] < 0)
+    number = np.full(len(groups) + 1, -1, np.int32)
+    number[lamps] = np.arange(len(lamps))
+    bound = groups.bound[lamps].astype(np.float64)
+    before = np.tile(np.log(bound)[:, None] + LAMP_PRIOR[0], (1, 3))
+    found = looked_at_closely(
+        surface,
+        _with_estimates(lit, groups, first),
+        environment,
+        frames,
+        asked,
+        Lamps(number[groups.group], before, np.full(len(lamps), LAMP_PRIOR[1])),
+        bound * first.multiplier[lamps].mean(axis=1),
+        seed,
+    )
+    error = np.hypot(found.error, LEAST_ERROR)
+    multiplier = found.radiance / bound[:, None]
+    brightest = multiplier.max(axis=1)
+    better = (error <= MAX_ERROR) & (np.log(brightest) > -2 * error)
+    estimate = replace(
+        first, multiplier=first.multiplier.copy(), standard_error=first.standard_error.copy()
+    )
+    held = multiplier / np.minimum(brightest, 1)[:, None]
+    estimate.multiplier[lamps[better]] = held[better]
+    estimate.standard_error[lamps[better]] = error[better, None]
+    return estimate
 
 
 def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
@@ -200,44 +260,6 @@ def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) ->
     each = int(np.clip(_TEXELS // max(len(numbers), 1), _LEAST_OF_SEGMENT, _PER_SEGMENT))
     kept = np.sort(first_of_segments(rank, segment, numbers, each))
     return usable[kept], segment[kept]
-
-
-def first_of_segments(rank: Long, segment: Int, numbers: Long, most: int) -> Long:
-    """Of those in ``rank`` (R,), indices into ``segment`` (N,), the first of each of the segments
-    ``numbers``, ``most`` at most; by segment."""
-    rank = rank[np.isin(segment[rank], numbers)]
-    rank = rank[np.argsort(segment[rank], kind="stable")]
-    place = np.arange(len(rank)) - np.searchsorted(segment[rank], segment[rank])
-    return rank[place < most]
-
-
-class Shining(NamedTuple):
-    """The radiance of all surfaces as rays meet it, and where that is bright."""
-
-    texture: SurfaceTexture
-    lights: Lights
-
-    @classmethod
-    def of(cls, surface: TexturedScene, light: Float) -> Shining:
-        """light (T, 3), W/(m^2 sr)."""
-        lights = lights_from_radiance(surface.scene, surface.texels, light)
-        return cls(surface.texture(light), lights)
-
-
-def irradiance_of_texels(
-    surface: TexturedScene,
-    shining: Shining,
-    outside: Environment,
-    index: Long,
-    seed: int,
-    sampling: Sampling = _SAMPLING,
-) -> Float:
-    """S (N, 3), W/m^2, of a few texels in the light of the surfaces and what is outside."""
-    texels = surface.texels
-    return sunlight(surface, index, outside.sun, seed) + irradiance_at(
-        surface.rays, *shining, outside, texels.position[index], texels.normal[index],
-        independent_tiles(len(index)), replace(sampling, seed=seed), surface.diagonal_m,
-    ).mean  # fmt: skip
 
 
 def _evidence(

@@ -14,11 +14,10 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.texturing.agreement import SurfacePoints as PointsOfFaces
-from usdbrdf.texturing.agreement import seen_points
+from usdbrdf.texturing.agreement import MeshPoints, seen_points
 from usdbrdf.transport.brdf import DIELECTRIC
-from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, TexturedScene, lit_scene
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene, points_of_texels
 from usdbrdf.transport.lobe_radiance import lobe_radiance, specular_irradiance
 from usdbrdf.transport.warps import shifts_of
 
@@ -30,20 +29,23 @@ _RAYS, _RAYS_OF_LOBE = 64, 4
 
 
 def mirrored_to_frames(
-    surface: TexturedScene, light: Float, frames: Frames, index: Long, seed: int
+    surface: TexturedScene,
+    light: Float,
+    outside: Environment,
+    frames: Frames,
+    index: Long,
+    seed: int,
 ) -> Double:
     """(N, 3) W/(m^2 sr): what texels ``index`` (N,) would mirror of the radiance ``light`` (T, 3)
-    to the frames that see them, the median of some of these; 0 where none does."""
-    lit, texels = _of_dielectrics(surface, light), surface.texels
+    and of what is outside to the frames that see them, the median of some of these; 0 where none
+    does."""
+    lit, texels = _of_dielectrics(surface, light, outside), surface.texels
     eyes = np.stack([frames.camera(i).eye for i in range(len(frames))])
     shown = np.full((_VIEWS, len(index), 3), np.nan, np.float32)
     for row, frame in zip(shown, _some_that_see(surface, frames, index, seed).T, strict=True):
         which = np.flatnonzero(frame >= 0)
         own = index[which]
-        position, (_, u, v) = texels.position[own], texels.barycentric[own].T
-        to_camera = (eyes[frame[which]] - position).astype(np.float32)
-        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        points = SurfacePoints(texels.face[own], u, v, position, texels.normal[own], to_camera)
+        points = points_of_texels(texels, own, eyes[frame[which]])
         phi, psi = (np.full(len(own), value, np.float32) for value in (_PHI, _PSI))
         row[which] = lobe_radiance(lit, points, phi, psi, _RAYS_OF_VIEW, seed, own)
         seed += 1
@@ -57,17 +59,18 @@ def mirrored_irradiance(surface: TexturedScene, light: Float, index: Long, seed:
     """(N, 3) W/m^2: what texels ``index`` (N,) would receive of the radiance ``light`` (T, 3) by
     way of one mirroring surface."""
     texels, count = surface.texels, len(surface.scene.objects)
+    lit = _of_dielectrics(surface, light, black_environment())
     found = specular_irradiance(
-        _of_dielectrics(surface, light), texels.position[index], texels.normal[index], index,
+        lit, texels.position[index], texels.normal[index], index,
         np.full(count, _PHI, np.float32), np.full((count, 3), _PSI, np.float32),
         rays=_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=seed,
     )  # fmt: skip
     return found.astype(np.float64)
 
 
-def _of_dielectrics(surface: TexturedScene, light: Float) -> LitScene:
+def _of_dielectrics(surface: TexturedScene, light: Float, outside: Environment) -> LitScene:
     shines = np.zeros(len(surface.texels), np.bool_)
-    return replace(lit_scene(surface, light, shines, black_environment()), lobe=DIELECTRIC)
+    return replace(lit_scene(surface, light, shines, outside), lobe=DIELECTRIC)
 
 
 def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: int) -> Int:
@@ -75,7 +78,7 @@ def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: in
     a texel gets depends on nothing but its number."""
     texels, count = surface.texels, len(index)
     position, normal = texels.position[index], texels.geometric_normal[index]
-    points = PointsOfFaces(position.astype(np.float64), normal.astype(np.float64))
+    points = MeshPoints(position.astype(np.float64), normal.astype(np.float64))
     # The lowest numbers win; one that does not see the texel has none.
     best, frame = np.full((count, _VIEWS), np.inf), np.full((count, _VIEWS), -1, np.int32)
     for i in range(len(frames)):

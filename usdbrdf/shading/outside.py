@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -20,8 +19,16 @@ from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.clipped_light import Shining, first_of_segments, irradiance_of_texels
+from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading.asked import (
+    LEAST_OF_SEGMENT,
+    PER_SEGMENT,
+    Shining,
+    asked_texels,
+    first_of_segments,
+    irradiance_of_texels,
+    looked_around,
+)
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -33,13 +40,9 @@ from usdbrdf.transport.environment import (
     pixels_of_directions,
 )
 from usdbrdf.transport.lit_scene import TexturedScene
-from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.sunlight import sunlit
-from usdbrdf.transport.warps import cosine_rays
 
-# Texels that are asked, at most and at least on one side of one object (a segment), segments, and
-# the rays by which each of them meets the sky: at first, and where it does.
-_PER_SEGMENT, LEAST_OF_SEGMENT, _SEGMENTS = 240, 30, 80
+# Rays by which each of the texels asked meets the sky: at first, and where it does.
 _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
@@ -206,39 +209,6 @@ def light_from_outside(
     )
 
 
-def asked_texels(
-    texels: Texels, lit: Float, coverage: CoverageMap, seed: int, most: int = _PER_SEGMENT
-) -> Asked | None:
-    """Texels of the largest segments that were measured, with some of them that clip, ``most`` of
-    each, and no light yet; None where there are too few."""
-    usable = np.flatnonzero(coverage.observed & texels.interior & (lit > 0).all(axis=1))
-    segment = texels.segments(usable)
-    measured = coverage.measured[usable]
-    area = np.bincount(segment, texels.area[usable] * measured)
-    enough = np.bincount(segment, measured) >= np.maximum(
-        LEAST_OF_SEGMENT, np.bincount(segment) / 2
-    )
-    largest = np.argsort(-area * enough, kind="stable")[:_SEGMENTS]
-    largest = largest[enough[largest]]
-    if not len(largest):
-        return None
-    rank = np.random.default_rng(seed ^ _SEED).permutation(len(usable))
-    kept = first_of_segments(rank, segment, largest, most)
-    many = np.bincount(segment[kept], measured[kept])[segment[kept]] >= LEAST_OF_SEGMENT / 2
-    kept = kept[many]
-    if not len(kept):
-        return None
-    return Asked(
-        texel=usable[kept],
-        segment=np.unique(segment[kept], return_inverse=True)[1].astype(np.int32),
-        owner=texels.object_index()[usable[kept]],
-        reflected=np.pi * lit[usable[kept]].astype(np.float64),
-        clipped=~measured[kept],
-        irradiance=np.zeros((len(kept), 3)),
-        mirrored=np.zeros((len(kept), 3)),
-    )
-
-
 def _under_what_was_seen(
     surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
 ) -> Asked:
@@ -259,21 +229,18 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
     Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
     shadows passes for light from all around the sun."""
     share, clear = sunlit(surface, asked.texel, sun, seed), np.ones(len(asked.texel), np.bool_)
-    for down, right in product((-_AROUND, 0, _AROUND), repeat=2):
-        beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
+    for beside in surface.texels.around(asked.texel, _AROUND):
         clear &= np.abs(sunlit(surface, beside, sun, seed) - share) < _AS_SUNLIT
     if clear[share > 0].mean() > _MOSTLY_CLEAR:
         return None
     every = np.arange(int(asked.segment.max()) + 1)
     halves = [
-        first_of_segments(np.flatnonzero(clear & part), asked.segment, every, _PER_SEGMENT // 2)
+        first_of_segments(np.flatnonzero(clear & part), asked.segment, every, PER_SEGMENT // 2)
         for part in (share > 0, share <= 0)
     ]
     if len(halves[0]) < LEAST_OF_SEGMENT:
         return None
-    chosen = asked.of(np.sort(np.concatenate(halves)))
-    segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
-    return chosen._replace(segment=segment)
+    return asked.of(np.sort(np.concatenate(halves)))
 
 
 def _patches(clipped: Bool, z_up: bool) -> Int:
@@ -292,16 +259,6 @@ def _patches(clipped: Bool, z_up: bool) -> Int:
 
 
 _PATCHES = sum(count for _, _, count in _BANDS)
-
-
-def looked_around(surface: TexturedScene, index: Long, seed: int, rays: int) -> tuple[Float, Int]:
-    """Cosine-distributed directions (rays N, 3) from texels (N,), one of each after the other, and
-    the face that each meets, -1 for none."""
-    texels = surface.texels
-    normal = texels.normal[index]
-    origin = lift_from_surface(texels.position[index], normal, surface.diagonal_m)
-    towards = cosine_rays(normal, index, seed, rays)
-    return towards, surface.rays.closest(origin, towards).face
 
 
 def _shares(
@@ -376,9 +333,7 @@ def _with_sun(
         pairs=sky.pairs,
         apart=sky.apart,
     )
-    chosen = asked.of(kept)
-    segment = np.unique(chosen.segment, return_inverse=True)[1].astype(np.int32)
-    return chosen._replace(segment=segment), sources
+    return asked.of(kept), sources
 
 
 def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double, z_up: bool) -> Float:

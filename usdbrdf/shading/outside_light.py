@@ -38,7 +38,10 @@ class Asked(NamedTuple):
     mirrored: Double
 
     def of(self, which: Array) -> Asked:
-        return Asked._make(values[which] for values in self)
+        """Some of them, with their segments counted anew."""
+        some = Asked._make(values[which] for values in self)
+        segment = np.unique(some.segment, return_inverse=True)[1]
+        return some._replace(segment=segment.astype(np.int32))
 
 
 class Sources(NamedTuple):
@@ -300,9 +303,7 @@ def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
         return np.full_like(found.log_radiance, np.inf)
     for number in blocks:
         kept = block != number
-        some = asked.of(kept)
-        numbers, segment = np.unique(some.segment, return_inverse=True)
-        some = some._replace(segment=segment.astype(np.int32))
+        some, numbers = asked.of(kept), np.unique(asked.segment[kept])
         start = found._replace(log_albedo=found.log_albedo[numbers], gloss=found.gloss[numbers])
         part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
         moved += (part.log_radiance - found.log_radiance) ** 2

@@ -339,7 +339,9 @@ def shade_surface(
         else estimate_unseen_lamps(run, surface, lit, coverage, frames, sampling.seed, dark)
     )
     lit = unseen.with_light(surface.texels, lit)
-    light = estimate_clipped_light(run, surface, lit, coverage, environment, sampling.seed, said)
+    light = estimate_clipped_light(
+        run, surface, lit, coverage, frames, environment, sampling.seed, said
+    )
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)

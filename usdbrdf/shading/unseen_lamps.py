@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -20,11 +19,9 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import Shining, irradiance_of_texels
-from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
-from usdbrdf.shading.outside import LEAST_OF_SEGMENT, asked_texels, looked_around
-from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, jackknife, solved
+from usdbrdf.shading.asked import asked_texels, looked_around
+from usdbrdf.shading.lamp_light import Lamps, beside_lamps, looked_at_closely, sources_of, strengths
+from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -38,14 +35,6 @@ _MOST_ERROR = calibration.number("unseen.most_error")
 # Rays from each texel that is asked, objects that may shine, and those whose light is traced.
 _RAYS, _CANDIDATES, _TRACED = 256, 32, 8
 _SEED = 0x1A3
-# How closely what a lamp brings is known, and how roughly it tells even light from shadows' edges.
-_SAMPLING = Sampling(standard_error=0.01, max_rays=1024)
-_ROUGHLY = Sampling(standard_error=0, max_rays=32)
-# Texels from one to those beside it; by what share of the lamps' light and of all other light these
-# may differ.
-_AROUND = 2
-_UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
-_LEAST_EVEN = calibration.number("unseen.least_even")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,15 +120,18 @@ def lamps_that_explain(
         return UnseenLamps.none()
     # Few rays meet a lamp, and errors of what it brings draw its strength to nothing: they only
     # say which of the objects may be one.
-    asked = _beside_candidates(surface, lit, asked, candidates, seed)
-    found, _, near, part = _strengths(asked, _unknown(asked, share[candidates]))
+    dark_outside, lamps = black_environment(), _unknown(surface.texels, asked, candidates)
+    asked = beside_lamps(surface, lit, dark_outside, asked, lamps, seed)
+    found, _, near, part = strengths(asked, sources_of(lamps, share[candidates]))
     likely = np.where(np.pi * found.mean(axis=1) > near, part, 0)
     likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
     likeliest = likeliest[likely[likeliest] > _LEAST_PART / 4]
     candidates, strength = candidates[likeliest], found[likeliest].mean(axis=1)
     while len(candidates):
-        even, sources = _looked_at_closely(surface, lit, frames, asked, candidates, strength, seed)
-        found, error, near, part = _strengths(even, sources)
+        lamps = _unknown(surface.texels, asked, candidates)
+        found, error, near, part = looked_at_closely(
+            surface, lit, dark_outside, frames, asked, lamps, strength, seed
+        )
         # Clearly brighter than what only reflects: even with as much light as the texels that see
         # it receive.
         brightness = np.log(np.pi * found.mean(axis=1) / near)
@@ -170,116 +162,11 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tu
     return brought, float((face < 0).mean())
 
 
-def _beside_candidates(
-    surface: TexturedScene, lit: Float, asked: Asked, candidates: Long, seed: int
-) -> Asked:
-    """The texels asked with S of all but the candidates."""
-    rest = Shining.of(surface, _without(surface, lit, candidates))
-    known = irradiance_of_texels(surface, rest, black_environment(), asked.texel, seed)
-    floor = 1e-4 * np.median(asked.reflected)
-    return asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
-
-
-def _without(surface: TexturedScene, lit: Float, objects: Long) -> Float:
-    of_objects = np.isin(surface.texels.object_index(), objects)
-    return np.where(of_objects[:, None], np.float32(0), lit)
-
-
-def _looked_at_closely(
-    surface: TexturedScene,
-    lit: Float,
-    frames: Frames,
-    asked: Asked,
-    candidates: Long,
-    strength: Double,
-    seed: int,
-) -> tuple[Asked, Sources]:
-    """What the candidates bring, by rays that are sent to them, to texels that lie evenly in their
-    light, and what surfaces mirror of it and of all other light. strength (K,): the candidates'
-    radiance so far."""
-    asked = _beside_candidates(surface, lit, asked, candidates, seed)
-    alone = [_alone(surface, int(k)) for k in candidates]
-    lights = [Shining.of(surface, light) for light in alone]
-    even = _evenly_lit(surface, asked, lights, strength, seed)
-    asked = asked.of(even)
-    asked = asked._replace(
-        segment=np.unique(asked.segment, return_inverse=True)[1].astype(np.int32)
+def _unknown(texels: Texels, asked: Asked, objects: Long) -> Lamps:
+    """Objects (K,) that may be lamps, of which nothing else is known."""
+    usual, count = np.log(np.median(asked.reflected, axis=0) / np.pi), len(objects)
+    number = np.full(len(texels.resolution), -1, np.int32)
+    number[objects] = np.arange(count)
+    return Lamps(
+        number[texels.object_index()], np.tile(usual, (count, 1)), np.full(count, _DEVIATION)
     )
-    texel, seed = asked.texel, seed ^ _SEED
-    share = [
-        _brought(surface, light, texel, seed + int(k))
-        for k, light in zip(candidates, lights, strict=True)
-    ]
-    rest = _without(surface, lit, candidates)
-    mirrored = np.pi * mirrored_to_frames(surface, rest, frames, texel, seed)
-    sent_on = [
-        mirrored_irradiance(surface, light, texel, seed + int(k))[:, 0]
-        for k, light in zip(candidates, alone, strict=True)
-    ]
-    asked = asked._replace(mirrored=mirrored)
-    return asked, gloss_of_scene(asked, _unknown(asked, np.stack(share)), np.stack(sent_on))
-
-
-def _alone(surface: TexturedScene, index: int) -> Float:
-    """(T, 3): an object of radiance 1 in the dark."""
-    alone = surface.texels.object_index() == index
-    return np.repeat(alone[:, None].astype(np.float32), 3, axis=1)
-
-
-def _brought(
-    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = _SAMPLING
-) -> Double:
-    """(N,) W/m^2: what grey ``light`` brings, by rays that are sent to it."""
-    found = irradiance_of_texels(surface, light, black_environment(), texel, seed, sampling)
-    return np.asarray(found[:, 0], np.float64)
-
-
-def _evenly_lit(
-    surface: TexturedScene, asked: Asked, lights: Sequence[Shining], strength: Double, seed: int
-) -> Bool:
-    """Which of the texels asked, (N,), lie among others that are as much lit: a pixel beside a
-    shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim.
-    Segments of which few are measured leave; if too few were left in all, all stay."""
-    total, most = np.zeros(len(asked.texel)), np.zeros(len(asked.texel))
-    for light, radiance in zip(lights, strength, strict=True):
-        # The same rays from each, so that their noise is the same.
-        own = _brought(surface, light, asked.texel, seed, _ROUGHLY)
-        total += radiance * own
-        uneven = np.zeros(len(own))
-        for right, down in product((-_AROUND, 0, _AROUND), repeat=2):
-            if right or down:
-                beside = surface.texels.beside(asked.texel, right, down).astype(np.int64)
-                other = _brought(surface, light, beside, seed, _ROUGHLY)
-                uneven = np.maximum(uneven, np.abs(other - own))
-        most += radiance * uneven
-    even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)
-    count = np.bincount(
-        asked.segment[even & ~asked.clipped], minlength=int(asked.segment.max()) + 1
-    )
-    even &= count[asked.segment] >= LEAST_OF_SEGMENT // 2
-    return even if even.mean() > _LEAST_EVEN else np.ones_like(even)
-
-
-def _unknown(asked: Asked, share: Double) -> Sources:
-    """Sources that bring ``share`` (K, N), of which nothing else is known."""
-    usual, count = np.log(np.median(asked.reflected, axis=0) / np.pi), len(share)
-    return Sources(
-        share=share,
-        mean=np.tile(usual, (count, 1)),
-        deviation=np.full(count, _DEVIATION),
-        bound=np.zeros(count, np.bool_),
-        pairs=np.zeros((0, 2), np.int64),
-        apart=np.zeros(0),
-    )
-
-
-def _strengths(asked: Asked, sources: Sources) -> tuple[Double, Double, Double, Double]:
-    """Radiance (K, 3) of the sources, its relative error (K,), S (K,) of the texels that they
-    light, each as much as it does, and what part of all light is theirs, (K,)."""
-    found = solved(asked, sources)
-    error = jackknife(asked, sources, found).max(axis=1)
-    light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
-    radiance = np.exp(found.log_radiance)
-    part = (sources.share * radiance.mean(axis=1)[:, None] / light).mean(axis=1)
-    near = (sources.share @ light) / np.maximum(sources.share.sum(axis=1), 1e-12)
-    return radiance, np.asarray(error), np.asarray(near), np.asarray(part)

@@ -11,7 +11,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.capture import Scan
-from usdbrdf.texturing.agreement import SurfacePoints
+from usdbrdf.texturing.agreement import MeshPoints
 from usdbrdf.texturing.optics import (
     Samples,
     balance_drift,
@@ -26,7 +26,7 @@ _ASKED, _LISTED = 32, 6
 
 
 def asked_of_its_optics(
-    scan: Scan, surface: SurfacePoints, rays: RayScene, read: Read, *, estimate: bool
+    scan: Scan, surface: MeshPoints, rays: RayScene, read: Read, *, estimate: bool
 ) -> tuple[Scan, dict[str, Any], list[str]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
     that corners are darker by, and that the balance of red or blue to green is off by in the worst

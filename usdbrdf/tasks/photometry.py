@@ -27,7 +27,7 @@ from usdbrdf.tasks.task import warned
 from usdbrdf.tasks.turned import refuse_turned
 from usdbrdf.texturing.agreement import (
     Agreement,
-    SurfacePoints,
+    MeshPoints,
     agreement,
     doubts_about_agreement,
     is_doubtful,
@@ -71,7 +71,7 @@ def asked_of_its_pixels(
 
 
 def agreement_of_frames(
-    surface: SurfacePoints, rays: RayScene, frames: Frames, read: Read, source: Path
+    surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
 ) -> Agreement | None:
     """How far some frames agree; None where they see too few points in common. Of much the user
     is to be told by ``doubts_about_agreement``.
@@ -108,7 +108,7 @@ def agreement_of_frames(
 
 
 def estimated_exposures(
-    scan: Scan, surface: SurfacePoints, rays: RayScene, read: Read
+    scan: Scan, surface: MeshPoints, rays: RayScene, read: Read
 ) -> tuple[Scan, dict[str, float]]:
     """The scan with its frames exposed as their pixels say; image and gain of those that
     contradicted the others by much."""

@@ -19,13 +19,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Array
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
-from usdbrdf.texturing.agreement import (
-    SurfacePoints,
-    agreement,
-    is_doubtful,
-    logarithms_in_frame,
-    other_convention,
-)
+from usdbrdf.texturing.agreement import MeshPoints, agreement, logarithms_in_frame, other_convention
 from usdbrdf.transport.rays import RayScene
 
 # So many of the images that EXIF data turn are compared, with so many others.
@@ -51,7 +45,7 @@ def frames_to_compare(frames: Frames, turned: Mapping[Path, int]) -> list[int]:
 
 
 def refuse_turned(
-    surface: SurfacePoints,
+    surface: MeshPoints,
     rays: RayScene,
     frames: Frames,
     turned: Mapping[Path, int],
@@ -80,7 +74,7 @@ def refuse_turned(
     judged = np.array(how) > 1
     as_stored = agreement(np.stack(stored, axis=1), judged)
     as_upright = agreement(np.stack(upright, axis=1), judged)
-    if not is_doubtful(as_stored) and other_convention(as_upright, {"stored": as_stored}):
+    if other_convention(as_upright, {"stored": as_stored}):
         return
     first = next(_photograph(frames, i) for i, o in zip(asked, how, strict=True) if o > 1)
     said = (
@@ -110,6 +104,13 @@ def _photograph(frames: Frames, i: int) -> Path:
 def _upright(camera: Camera, pixels: FramePixels, orientation: int) -> tuple[Camera, FramePixels]:
     """As if the image had been saved upright and the camera were that of such an image."""
     turn = _SAVED_UPRIGHT[orientation]
-    shown = replace(pixels, radiance=turn(pixels.radiance), valid=turn(pixels.valid))
+    shown = FramePixels(
+        radiance=turn(pixels.radiance),
+        valid=turn(pixels.valid),
+        clipped=turn(pixels.clipped),
+        dark=turn(pixels.dark),
+        unknown=turn(pixels.unknown),
+        num_clamped=pixels.num_clamped,
+    )
     height, width = shown.valid.shape
     return replace(camera, width=width, height=height), shown

@@ -30,14 +30,14 @@ _FEWEST = 500
 _SLACK = 5e-3
 
 
-class SurfacePoints(NamedTuple):
+class MeshPoints(NamedTuple):
     """P points of a mesh, even by area: point, normal (P, 3) float64, in the capture's unit."""
 
     point: Double
     normal: Double
 
 
-def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> SurfacePoints:
+def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> MeshPoints:
     """``count`` points, the same for equal meshes."""
     rng = np.random.default_rng(_SEED)
     across = across_triangles(mesh.points, mesh.triangles)
@@ -46,16 +46,16 @@ def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> SurfacePoints:
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     a, b, c = (mesh.points[mesh.triangles[face, k]].astype(np.float64) for k in range(3))
-    return SurfacePoints(a + u * (b - a) + v * (c - a), across[face] / area[face, None])
+    return MeshPoints(a + u * (b - a) + v * (c - a), across[face] / area[face, None])
 
 
-def surface_and_rays(mesh: ScanMesh) -> tuple[SurfacePoints, RayScene]:
+def surface_and_rays(mesh: ScanMesh) -> tuple[MeshPoints, RayScene]:
     """The points of a mesh that are looked up, and the rays that tell which frames see them."""
     return points_of_surface(mesh), RayScene(mesh.points, mesh.triangles)
 
 
 def logarithms_in_frame(
-    surface: SurfacePoints, rays: RayScene, camera: Camera, pixels: FramePixels
+    surface: MeshPoints, rays: RayScene, camera: Camera, pixels: FramePixels
 ) -> Float:
     """(P,) float32 logarithm of what a frame shows at each point, the mean of R, G and B over 3 x 3
     pixels; NaN where it shows nothing valid."""
@@ -68,7 +68,7 @@ def logarithms_in_frame(
     return found
 
 
-def seen_points(surface: SurfacePoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
+def seen_points(surface: MeshPoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
     """Which points (P,) a camera sees, from in front, and of these column and row."""
     way = surface.point - camera.eye
     distance = np.linalg.norm(way, axis=1)

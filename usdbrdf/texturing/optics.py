@@ -18,7 +18,7 @@ from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.texturing.agreement import SurfacePoints, seen_points
+from usdbrdf.texturing.agreement import MeshPoints, seen_points
 from usdbrdf.transport.rays import RayScene
 
 _OUTLYING = calibration.number("optics.outlying")
@@ -52,7 +52,7 @@ class Falloff(NamedTuple):
 
 
 def samples_in_frame(
-    surface: SurfacePoints, rays: RayScene, camera: Camera, pixels: FramePixels
+    surface: MeshPoints, rays: RayScene, camera: Camera, pixels: FramePixels
 ) -> tuple[Float, Float]:
     """A column of ``Samples``: (P, 3) and (P,), the mean over 3 x 3 pixels."""
     found = np.full((len(surface.point), 3), np.nan, np.float32)

@@ -11,7 +11,7 @@ from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.camera import Camera
-from usdbrdf.texturing.agreement import MIN_COSINE, SurfacePoints
+from usdbrdf.texturing.agreement import MIN_COSINE, MeshPoints
 from usdbrdf.texturing.samples import Projection
 from usdbrdf.transport.rays import RayScene
 
@@ -61,7 +61,7 @@ def halved(picture: Float) -> Float:
 
 
 def look_up(
-    surface: SurfacePoints, rays: RayScene, camera: Camera, picture: Float, patch: int
+    surface: MeshPoints, rays: RayScene, camera: Camera, picture: Float, patch: int
 ) -> LookedUp:
     """What a frame shows, whose logarithms are ``picture`` in any size; points beside an edge of
     what hides others are left out. Patches have ``patch`` pixels to a side."""

@@ -24,7 +24,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
-from usdbrdf.texturing.agreement import SurfacePoints
+from usdbrdf.texturing.agreement import MeshPoints
 from usdbrdf.texturing.pose_samples import LookedUp, halved, look_up
 from usdbrdf.transport.rays import RayScene
 
@@ -83,7 +83,7 @@ def refined_poses(
     return _where_better(surface, rays, cameras, captured, poses, pictures, reach)
 
 
-def _points_of_frames(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera]) -> SurfacePoints:
+def _points_of_frames(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera]) -> MeshPoints:
     """What some pixels of all frames show, the same for equal cameras."""
     rng = np.random.default_rng(_SEED)
     count = -(-min(_POINTS, _MOST_SAMPLES // len(cameras)) // len(cameras))
@@ -101,17 +101,17 @@ def _points_of_frames(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera])
         normal = np.where(behind[:, None], -normal, normal)
         points.append(point)
         normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    return SurfacePoints(np.concatenate(points), np.concatenate(normals))
+    return MeshPoints(np.concatenate(points), np.concatenate(normals))
 
 
-def _usual_distance(surface: SurfacePoints, cameras: Sequence[Camera]) -> float:
+def _usual_distance(surface: MeshPoints, cameras: Sequence[Camera]) -> float:
     return float(
         np.median([np.median(np.linalg.norm(surface.point - c.eye, axis=1)) for c in cameras])
     )
 
 
 def _shown(
-    surface: SurfacePoints, rays: RayScene, cameras: Sequence[Camera], poses: Double,
+    surface: MeshPoints, rays: RayScene, cameras: Sequence[Camera], poses: Double,
     pictures: Sequence[Float],
 ) -> list[LookedUp]:  # fmt: skip
     return [
@@ -213,7 +213,7 @@ def _step_between(before: Double, after: Double, reach: float) -> Double:
 
 
 def _where_better(
-    surface: SurfacePoints, rays: RayScene, cameras: Sequence[Camera], captured: Double,
+    surface: MeshPoints, rays: RayScene, cameras: Sequence[Camera], captured: Double,
     refined: Double, pictures: Sequence[Float], reach: float,
 ) -> PoseSteps:  # fmt: skip
     """The refined poses of the frames that agree clearly better with the others then, and were not

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
@@ -100,6 +100,14 @@ def points_of_rays(lit: LitScene, origins: Float, directions: Float) -> SurfaceP
     normal = np.where(towards[:, None], -normal, normal).astype(np.float32)
     position = position.astype(np.float32)
     return SurfacePoints(hits.face, hits.u, hits.v, position, normal, -directions)
+
+
+def points_of_texels(texels: Texels, index: Long, eye: Double) -> SurfacePoints:
+    """Those of texels ``index`` (N,) as seen from ``eye``, (3,) or (N, 3)."""
+    position, (_, u, v) = texels.position[index], texels.barycentric[index].T
+    to_camera = (eye - position).astype(np.float32)
+    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+    return SurfacePoints(texels.face[index], u, v, position, texels.normal[index], to_camera)
 
 
 def lit_scene(

@@ -1,0 +1,155 @@
+"""How strong lamps are that no frame measures, be it that all of them clip or that none shows them:
+from the light that they cast on texels that tell it well.
+
+These lie evenly in it, away from shadows' edges; what they mirror to the frames that see them is
+traced, since L_d holds it; and segments (facings of objects) count by how much they scatter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf import calibration
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
+from usdbrdf.model.capture import Frames
+from usdbrdf.options import Sampling
+from usdbrdf.shading.asked import CLOSELY, LEAST_OF_SEGMENT, Shining, irradiance_of_texels
+from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
+from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, jackknife, solved
+from usdbrdf.transport.environment import Environment, black_environment
+from usdbrdf.transport.lit_scene import TexturedScene
+
+_SEED = 0x1A3
+# How roughly what a lamp brings tells even light from shadows' edges.
+_ROUGHLY = Sampling(standard_error=0, max_rays=32)
+# Texels from one to those beside it; by what share of the lamps' light and of all other light these
+# may differ.
+_AROUND = 2
+_UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
+_LEAST_EVEN = calibration.number("unseen.least_even")
+
+
+class Lamps(NamedTuple):
+    """K lamps: of (T,) int32, the number of each texel's, -1 for none; and the logarithm of their
+    radiance before the evidence, mean (K, 3) and deviation (K,)."""
+
+    of: Int
+    mean: Double
+    deviation: Double
+
+
+class Strengths(NamedTuple):
+    """Radiance (K, 3) of the lamps, W/(m^2 sr), its relative error (K,), S (K,) of the texels that
+    they light, each as much as it does, and what part of all light is theirs, (K,)."""
+
+    radiance: Double
+    error: Double
+    near: Double
+    part: Double
+
+
+def looked_at_closely(
+    surface: TexturedScene,
+    lit: Float,
+    outside: Environment,
+    frames: Frames,
+    asked: Asked,
+    lamps: Lamps,
+    strength: Double,
+    seed: int,
+) -> Strengths:
+    """The lamps' strengths in the scene of radiance ``lit`` (T, 3), by what they bring by rays that
+    are sent to them, to texels that lie evenly in their light, and what surfaces mirror of it and
+    of all other light. strength (K,): the lamps' radiance so far."""
+    asked = beside_lamps(surface, lit, outside, asked, lamps, seed)
+    alone = [_alone(lamps.of == k) for k in range(len(lamps.mean))]
+    lights = [Shining.of(surface, light) for light in alone]
+    asked = asked.of(_evenly_lit(surface, asked, lights, strength, seed))
+    texel, seed = asked.texel, seed ^ _SEED
+    share = [_brought(surface, light, texel, seed + k) for k, light in enumerate(lights)]
+    rest = _without(lit, lamps)
+    asked = asked._replace(
+        mirrored=np.pi * mirrored_to_frames(surface, rest, outside, frames, texel, seed)
+    )
+    sent_on = [
+        mirrored_irradiance(surface, light, texel, seed + k)[:, 0] for k, light in enumerate(alone)
+    ]
+    sources = sources_of(lamps, np.stack(share))
+    return strengths(asked, gloss_of_scene(asked, sources, np.stack(sent_on)))
+
+
+def beside_lamps(
+    surface: TexturedScene, lit: Float, outside: Environment, asked: Asked, lamps: Lamps, seed: int
+) -> Asked:
+    """The texels asked with S of all but the lamps."""
+    rest = Shining.of(surface, _without(lit, lamps))
+    known = irradiance_of_texels(surface, rest, outside, asked.texel, seed)
+    floor = 1e-4 * np.median(asked.reflected)
+    return asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
+
+
+def sources_of(lamps: Lamps, share: Double) -> Sources:
+    """The lamps, which bring ``share`` (K, N) to the texels asked."""
+    return Sources(
+        share=share,
+        mean=lamps.mean,
+        deviation=lamps.deviation,
+        bound=np.zeros(len(share), np.bool_),
+        pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
+    )
+
+
+def strengths(asked: Asked, sources: Sources) -> Strengths:
+    """Those that explain best what the texels reflect."""
+    found = solved(asked, sources)
+    error = jackknife(asked, sources, found).max(axis=1)
+    light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
+    radiance = np.exp(found.log_radiance)
+    part = (sources.share * radiance.mean(axis=1)[:, None] / light).mean(axis=1)
+    near = (sources.share @ light) / np.maximum(sources.share.sum(axis=1), 1e-12)
+    return Strengths(radiance, np.asarray(error), np.asarray(near), np.asarray(part))
+
+
+def _without(lit: Float, lamps: Lamps) -> Float:
+    return np.where((lamps.of >= 0)[:, None], np.float32(0), lit)
+
+
+def _alone(own: Bool) -> Float:
+    """(T, 3): a lamp of radiance 1 in the dark."""
+    return np.repeat(own[:, None].astype(np.float32), 3, axis=1)
+
+
+def _brought(
+    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = CLOSELY
+) -> Double:
+    """(N,) W/m^2: what grey ``light`` brings, by rays that are sent to it."""
+    found = irradiance_of_texels(surface, light, black_environment(), texel, seed, sampling)
+    return np.asarray(found[:, 0], np.float64)
+
+
+def _evenly_lit(
+    surface: TexturedScene, asked: Asked, lights: Sequence[Shining], strength: Double, seed: int
+) -> Bool:
+    """Which of the texels asked, (N,), lie among others that are as much lit: a pixel beside a
+    shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim.
+    Segments of which few are measured leave; if too few were left in all, all stay."""
+    total, most = np.zeros(len(asked.texel)), np.zeros(len(asked.texel))
+    for light, radiance in zip(lights, strength, strict=True):
+        # The same rays from each, so that their noise is the same.
+        own = _brought(surface, light, asked.texel, seed, _ROUGHLY)
+        total += radiance * own
+        uneven = np.zeros(len(own))
+        for beside in surface.texels.around(asked.texel, _AROUND):
+            other = _brought(surface, light, beside, seed, _ROUGHLY)
+            uneven = np.maximum(uneven, np.abs(other - own))
+        most += radiance * uneven
+    even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)
+    count = np.bincount(
+        asked.segment[even & ~asked.clipped], minlength=int(asked.segment.max()) + 1
+    )
+    even &= count[asked.segment] >= LEAST_OF_SEGMENT // 2
+    return even if even.mean() > _LEAST_EVEN else np.ones_like(even)
