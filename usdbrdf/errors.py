@@ -5,6 +5,7 @@ Every message is one sentence or two: what was looked at, what was found, what t
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 
@@ -31,7 +32,12 @@ class InputRefused(UsdBrdfError):
 
 
 class ImageRefused(InputRefused):
-    """One image cannot be used; a capture with enough others goes on without it."""
+    """One image cannot be used; a capture with enough others goes on without it.
+
+    path  of its file, where the reader of pixels refused it
+    """
+
+    path: Path | None = None
 
 
 class CrashedChild(InputRefused):

@@ -15,6 +15,7 @@ import pytest
 from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.cluster.session import workers_of
 from usdbrdf.errors import EnvironmentFailure, ImageRefused
+from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.arrays import Array
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
@@ -132,14 +133,38 @@ def test_without_workers_a_run_ends_though_all_is_sent(
         ended.set()
 
 
-def test_a_photograph_that_a_worker_cannot_read_is_told_with_the_worker(
+def test_a_photograph_that_a_worker_alone_cannot_read_is_told_with_the_worker(
     client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
 ) -> None:
-    def unit(shared: None, piece: int) -> dict[str, Array]:
-        raise ImageRefused("/capture/1.exr: cannot be read. [image.unreadable]")
+    seen = tmp_path / "1.exr"
+    write_exr(seen, np.ones((4, 4, 3), np.float32))
+
+    def unit(shared: Path, piece: int) -> dict[str, Array]:
+        refused = ImageRefused(f"{shared}: cannot be read. [image.unreadable]")
+        refused.path = shared
+        raise refused
 
     with (
         workers_of(client=client) as workers,
         pytest.raises(EnvironmentFailure, match=r"inproc://\S+ cannot .*/1.exr.*image.unreadable"),
     ):
-        dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1))
+        dict(workers.results(as_ours(unit), seen, {"0": 0}, tmp_path / "shared", 1))
+
+
+def test_a_damaged_photograph_is_refused_in_the_words_of_one_process(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    damaged, tries = tmp_path / "1.exr", []
+    write_exr(damaged, np.random.default_rng(1).random((40, 40, 3), np.float32))
+    damaged.write_bytes(damaged.read_bytes()[:2000])
+    with pytest.raises(ImageRefused) as alone:
+        read_radiance(damaged)
+
+    def unit(shared: Path, piece: int) -> dict[str, Array]:
+        tries.append(piece)
+        return {"pixels": read_radiance(shared)}
+
+    with workers_of(client=client) as workers, pytest.raises(ImageRefused) as found:
+        dict(workers.results(as_ours(unit), damaged, {"0": 0}, tmp_path / "shared", 1))
+    assert str(found.value) == str(alone.value)
+    assert tries == [0]

@@ -20,8 +20,9 @@ from distributed import Client, Future, KilledWorker
 
 from usdbrdf.cluster.described import described
 from usdbrdf.cluster.store import Store
-from usdbrdf.cluster.unit import Stranger, arithmetic, done
+from usdbrdf.cluster.unit import Stranger, Unread, arithmetic, done
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.images import read_radiance
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import Unit
 from usdbrdf.model.arrays import Array
@@ -138,6 +139,9 @@ class DaskWorkers:
                 f"{self._address}: a worker cannot load its work ({error}). Install this version "
                 "of usdbrdf, with the extra cluster, for all workers. [cluster.stranger]"
             ) from error
+        if isinstance(error, Unread) and error.path is not None:
+            # The photograph itself, or what the worker sees of it? The former is refused here too.
+            read_radiance(error.path)
         if isinstance(error, OSError | MemoryError):
             raise EnvironmentFailure(
                 f"{self._address}: a worker failed ({error}). See whether its disk is full, and "

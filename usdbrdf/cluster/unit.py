@@ -47,6 +47,12 @@ class Stranger(EnvironmentFailure):
     """A worker whose results would be others than ours."""
 
 
+class Unread(EnvironmentFailure):
+    """A worker cannot read a photograph, whose ``path`` is that of its file."""
+
+    path: Path | None = None
+
+
 class _Kept:
     """The latest few of what is costly to make, each made once, whichever thread asks."""
 
@@ -97,8 +103,10 @@ def done(folder: str, work: str, piece: Document) -> str:
     with threadpool_limits(limits=1, user_api="blas"):
         try:
             return store.keep_result(dict(unit(shared, value(piece))))
-        except ImageRefused as error:  # which ingest could read, where this run was started
-            raise EnvironmentFailure(
+        except ImageRefused as error:
+            unread = Unread(
                 f"the worker {get_worker().address} cannot read a photograph of the capture. Let "
                 f"all workers see the capture's folder under the same name. {error}"
-            ) from error
+            )
+            unread.path = error.path
+            raise unread from error

@@ -111,12 +111,17 @@ def _although_unread_once(path: Path, read: Callable[[], T]) -> T:
     still fails."""
     try:
         return read()
-    except ImageRefused:
+    except ImageRefused as refused:
+        refused.path = path
         if not os.path.isfile(path) or not os.access(path, os.R_OK):
             raise
     with environment_failures(str(path)):
         sha256_of(path)
-    return read()
+    try:
+        return read()
+    except ImageRefused as refused:
+        refused.path = path
+        raise
 
 
 def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
