@@ -212,7 +212,10 @@ def _told_by_even_light(
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if not len(lamps) or asked is None:
         return first
-    asked = asked.of(groups.group[asked.texel] < 0)
+    plain = groups.group[asked.texel] < 0
+    # An object of which a part shines mirrors a lamp there, or glows: so may the rest of it.
+    without_glow = plain & ~np.isin(asked.owner, groups.object[groups.lamp])
+    asked = asked.of(without_glow if 2 * without_glow.sum() > plain.sum() else plain)
     number = np.full(len(groups) + 1, -1, np.int32)
     number[lamps] = np.arange(len(lamps))
     bound = groups.bound[lamps].astype(np.float64)
