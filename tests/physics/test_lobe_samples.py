@@ -190,7 +190,8 @@ def test_the_samples_of_a_point_depend_on_the_seed_alone():
     assert (_of_copies(0, 1) != _of_copies(1, 1)).mean() > 0.9
     # Copies of one point do not share their random numbers, but where they are told to.
     assert len(np.unique(_of_copies(0, 1)[:, 0])) == 64
-    shared = _of_copies(0, 4, np.repeat([3, 5], 8))[:, 0]
+    numbers = 4 * np.repeat([3, 5], 8)[:, None] + np.arange(4)
+    shared = _of_copies(0, 4, numbers.ravel())[:, 0]
     np.testing.assert_array_equal(shared, np.repeat(shared[[0, 8]], 8))
     assert shared[0] != shared[8]
 

@@ -12,6 +12,7 @@ from usdbrdf.transport import irradiance
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import GROUP, LightGroups, Lights, TilePicks, weighed_groups
+from usdbrdf.transport.openings import NO_OPENINGS
 from usdbrdf.transport.sampling_loops import Picked, PointDraws, Receivers, pick_triangles
 
 
@@ -29,6 +30,8 @@ def _soup(count: int) -> Lights:
         density=(share / area).astype(np.float32),
         corners=corners.astype(np.float32),
         normals=(normal / (2 * area[:, None])).astype(np.float32),
+        box=NO_OPENINGS.box,
+        first_opening=count,
     )
 
 

@@ -303,7 +303,8 @@ def predict_view(
         )
         pixels = np.stack([columns + right, rows + down], axis=-1).reshape(-1, 2)
         points = visible_points(seen.lit, camera, pixels)
-        values = _radiance_at(seen, points, max(1, options.rays // per_pixel), seed + top)
+        rays = max(1, options.rays // per_pixel)
+        values = _radiance_at(seen, points, rays, per_pixel, seed + top)
         bands.append(values.reshape(-1, width, per_pixel, values.shape[1]).mean(axis=2))
     picture = np.concatenate(bands).astype(np.float32)
     return PredictedView(
@@ -314,8 +315,10 @@ def predict_view(
     )
 
 
-def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int) -> Float:
-    """(R, 8): baseline, full, 1 on the surface, 1 on an emitter."""
+def _radiance_at(
+    seen: ViewedAsset, points: SurfacePoints, rays: int, per_pixel: int, seed: int
+) -> Float:
+    """(R, 8): baseline, full, 1 on the surface, 1 on an emitter; ``points`` pixel after pixel."""
     hit = points.face >= 0
     place = points.face, points.u, points.v
     lamp = hit & seen.lit.emits(points)
@@ -331,5 +334,7 @@ def _radiance_at(seen: ViewedAsset, points: SurfacePoints, rays: int, seed: int)
     if seen.lit.lobe == DIELECTRIC:
         cosine = (shown.normal * shown.to_camera).sum(axis=1)
         values[reflects, 3:6] *= share_let_through(phi, psi, cosine)[:, None]
-    values[reflects, 3:6] += lobe_radiance(seen.lit, shown, phi, psi, rays, seed)
+    values[reflects, 3:6] += lobe_radiance(
+        seen.lit, shown, phi, psi, rays, seed, reflects, per_pixel
+    )
     return values

@@ -169,7 +169,7 @@ def let_through_surfaces(
     given = _Scattering(
         lit,
         lit.radiance.showing(texels, light),
-        lights_from_radiance(lit.scene, texels, light),
+        lights_from_radiance(lit.scene, texels, light, outside=(lit.rays, lit.environment)),
         lobes,
         Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
         table_let_through(lobes.phi, lobes.psi) - 1,

@@ -183,7 +183,8 @@ def trace_irradiance(
 ) -> Irradiance:
     """S at all texels with the radiance ``lit`` (T, 3) as the light."""
     texels = surface.texels
-    radiance, lights = surface.texture(lit), lights_from_radiance(surface.scene, texels, lit)
+    radiance, outside = surface.texture(lit), (surface.rays, environment)
+    lights = lights_from_radiance(surface.scene, texels, lit, outside=outside)
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)

@@ -17,6 +17,6 @@ Its face, which is all that the rest of the package calls:
     denoise          the filters of light maps and pictures, and which of them is at hand
     warps            shifts_of: uniform numbers of numbered things
 
-Behind it are random numbers (tile_draws), the estimators' loops (sampling_loops) and quadratures
-(directional_albedo).
+Behind it are random numbers (tile_draws), the estimators' loops (sampling_loops), quadratures
+(directional_albedo), and where light comes in from outside (openings).
 """

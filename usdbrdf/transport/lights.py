@@ -26,9 +26,12 @@ import numpy as np
 
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Byte, Double, Float, Int, Long, Short
-from usdbrdf.model.mesh import across_triangles, doubled_areas
+from usdbrdf.model.mesh import doubled_areas
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
+from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.openings import NO_OPENINGS, openings_of
+from usdbrdf.transport.rays import RayScene
 from usdbrdf.transport.surface_texture import unsigned
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
@@ -54,6 +57,8 @@ class LightGroups(NamedTuple):
                 picked by power, group; what is read together lies together
     is_light    (ceil(F / 8),) uint8, a bit for each triangle of the scene, the lowest first: few
                 enough to stay in the cache
+    box         (3, 3) float64, of ``openings``, whose triangles are numbered from ``first_opening``
+                on, after the scene's
     """
 
     face: Int
@@ -64,6 +69,8 @@ class LightGroups(NamedTuple):
     bounds: Float
     triangles: Float
     is_light: Byte
+    box: Double
+    first_opening: int
 
 
 class TilePicks(NamedTuple):
@@ -80,11 +87,13 @@ class TilePicks(NamedTuple):
 class Lights:
     """K triangles and a density over their surface.
 
-    face         (K,) int32, indices into the scene's triangles
+    face         (K,) int32, indices into the scene's triangles, and those of ``openings`` after
+                 them
     cumulative   (K,) float64, ascending to 1: probability of picking one of the first k
-    density      (F,) float32, probability per m^2 of a point on any triangle of the scene (0 on
-                 those that are no light)
+    density      (F,) float32, probability per m^2 of a point on any triangle (0 on those that are
+                 no light)
     corners      (K, 3, 3) float32, metres, and normals (K, 3) float32, unit, of the lights
+    box          (3, 3) float64, of the openings, and the number of the first of them
     """
 
     face: Int
@@ -92,6 +101,8 @@ class Lights:
     density: Float
     corners: Float
     normals: Float
+    box: Double
+    first_opening: int
 
     @cached_property
     def groups(self) -> LightGroups:
@@ -126,18 +137,51 @@ class Lights:
             bounds=_bounds(parts, power, corners, normals),
             triangles=triangles,
             is_light=np.packbits(self.density > 0, bitorder="little"),
+            box=self.box,
+            first_opening=self.first_opening,
         )
 
 
 def lights_from_radiance(
-    scene: Scene, texels: Texels, radiance: Float, brighter_than: float = _BRIGHTER_THAN
+    scene: Scene,
+    texels: Texels,
+    radiance: Float,
+    brighter_than: float = _BRIGHTER_THAN,
+    outside: tuple[RayScene, Environment] | None = None,
 ) -> Lights:
     """Triangles whose mean L_d is ``brighter_than`` so many times the scene's area mean, picked in
-    proportion to area times radiance.
+    proportion to area times radiance; and openings so much brighter than what arrives inside.
 
     radiance (T, 3): L_d per texel. Triangles smaller than a texel take the texel under their
     centre through their neighbours' mean, so that no lit triangle is left out.
     """
+    mean = _brightness_of_faces(scene, texels, radiance)
+    area = doubled_areas(scene.points, scene.triangles) / 2
+    openings = openings_of(scene, texels, outside[0], mean, outside[1]) if outside else NO_OPENINGS
+    scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
+    bright = np.flatnonzero((mean > brighter_than * scene_mean) & (area > 0))
+    opened = np.flatnonzero(openings.weight > brighter_than * openings.arriving * openings.area)
+    share = np.concatenate([mean[bright] * area[bright], openings.weight[opened]])
+    total = share.sum()
+    areas = np.concatenate([area[bright], openings.area[opened]])
+    corners = np.concatenate([scene.points[scene.triangles[bright]], openings.corners[opened]])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face = np.concatenate([bright, len(mean) + opened]).astype(np.int32)
+    density = np.zeros(len(mean) + len(openings.weight), np.float32)
+    density[face] = share / total / areas
+    return Lights(
+        face=face,
+        cumulative=np.cumsum(share) / total if len(face) else np.zeros(0),
+        density=density,
+        corners=corners.astype(np.float32),
+        normals=(normals / (2 * areas[:, None])).astype(np.float32),
+        box=openings.box,
+        first_opening=len(mean),
+    )
+
+
+def _brightness_of_faces(scene: Scene, texels: Texels, radiance: Float) -> Double:
+    """(F,) mean of the largest channel of L_d, (T, 3)."""
     brightness = radiance.max(axis=1)
     weight = np.where(texels.interior, texels.area, 0)
     num_faces = len(scene.triangles)
@@ -153,24 +197,7 @@ def lights_from_radiance(
         mean[bare] = brightness[
             texels.nearest_texel[texels.first_pixel[owner] + y * size[:, 0] + x]
         ]
-    doubled = doubled_areas(scene.points, scene.triangles)
-    area = doubled / 2
-    scene_mean = float((mean * area).sum() / max(area.sum(), 1e-30))
-    bright = (mean > brighter_than * scene_mean) & (area > 0)
-    share = np.where(bright, mean * area, 0)
-    total = share.sum()
-    face = np.flatnonzero(bright).astype(np.int32)
-    density = np.zeros(len(area), np.float32)
-    density[face] = share[face] / total / area[face]
-    triangles = scene.triangles[face]
-    normals = across_triangles(scene.points, triangles) / doubled[face, None]
-    return Lights(
-        face=face,
-        cumulative=np.cumsum(share[face]) / total if len(face) else np.zeros(0),
-        density=density,
-        corners=scene.points[triangles].astype(np.float32),
-        normals=normals.astype(np.float32),
-    )
+    return mean
 
 
 def _split(features: Double, power: Double) -> list[Long]:

@@ -122,7 +122,9 @@ def lit_scene(
         texels=surface.texels,
         rays=surface.rays,
         radiance=radiance,
-        lights=lights_from_radiance(surface.scene, surface.texels, light, _BRIGHTER_THAN),
+        lights=lights_from_radiance(
+            surface.scene, surface.texels, light, _BRIGHTER_THAN, (surface.rays, environment)
+        ),
         emission=radiance.showing(surface.texels, shines),
         environment=environment,
     )

@@ -37,6 +37,7 @@ from usdbrdf.transport.brdf import (
 from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.lights import DENSITY, LightGroups, facing, picked, way_to
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, points_of_rays
+from usdbrdf.transport.openings import opening_at
 from usdbrdf.transport.rays import Hits, lift_from_surface
 from usdbrdf.transport.sunlight import towards_sun
 from usdbrdf.transport.warps import (
@@ -74,11 +75,13 @@ MIXTURE = Mixture()
 
 
 class GroupDraws(NamedTuple):
-    """Sobol points (N, 2), numbers of the groups (G,) of equally many points, and the seed. With
-    each technique a group's points use one after the other's part of the same Sobol points."""
+    """Sobol points (N, 2), numbers of the points (R,), those of how many after each other are a
+    ``group``, and the seed. With each technique a group's points use one after the other's part of
+    the same Sobol points."""
 
     sobol: Bits
     number: Long
+    group: int
     seed: int
 
 
@@ -120,8 +123,8 @@ def draw_directions(
     for to hand all this to a function takes as long as what that does for a point."""
     for r in range(first, last):
         n, to_camera, directions = aimed.normal[r], aimed.to_camera[r], aimed.direction[r]
-        sobol, seed, group = draws.sobol, draws.seed, len(aimed.normal) // len(draws.number)
-        number, place = draws.number[r // group], r % group
+        sobol, seed, group = draws.sobol, draws.seed, draws.group
+        number, place = draws.number[r] // group, draws.number[r] % group
         frame, widths, k = tangent_frame(n), aimed.alphas.shape[1], 0
         for a in range(widths):
             flips = _flips(seed, number, a)
@@ -205,6 +208,7 @@ def weigh(
     first: int,
     last: int,
     aimed: Aimed,
+    origin: Float,
     hits: Hits,
     mixture: Mixture,
     groups: LightGroups,
@@ -212,21 +216,25 @@ def weigh(
     samples: LobeSamples,
 ) -> None:
     """Turn incident radiance ``weighted``, in place, into L cos / (sum of all densities). hits:
-    first surfaces along the (R, K) directions."""
+    first surfaces along the (R, K) directions from ``origin`` (R, 3)."""
     for r in range(first, last):
-        n, alphas, weighted = aimed.normal[r], aimed.alphas[r], samples.weighted[r]
+        n, alphas, weighted, x = aimed.normal[r], aimed.alphas[r], samples.weighted[r], origin[r]
         for k in range(len(weighted)):
             w = aimed.direction[r, k]
-            f = hits.face[r, k]
+            f, distance = int(hits.face[r, k]), float(hits.distance[r, k])
             cosine = n[0] * w[0] + n[1] * w[1] + n[2] * w[2]
             light, of_sun = 0.0, k >= len(weighted) - mixture.sun
-            if f >= 0 and mixture.lights > 0 and groups.is_light[f >> 3] >> (f & 7) & 1:
-                triangle = groups.triangles[groups.of_face[f]]
+            met = f
+            if f < 0 and cosine > 0 and groups.box[2, 0] > 0:
+                opening, distance = opening_at(groups.box, x[0], x[1], x[2], w[0], w[1], w[2])
+                met = groups.first_opening + opening
+            if met >= 0 and mixture.lights > 0 and groups.is_light[met >> 3] >> (met & 7) & 1:
+                triangle = groups.triangles[groups.of_face[met]]
                 sent = facing(triangle, w[0], w[1], w[2])
                 if sent > 0:
-                    light = triangle[DENSITY] * hits.distance[r, k] * hits.distance[r, k] / sent
+                    light = triangle[DENSITY] * distance * distance / sent
             # A ray sent to a point on a light counts only if that is what it meets.
-            missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != f)
+            missed = aimed.chosen[r, k] >= 0 and (light <= 0 or aimed.chosen[r, k] != met)
             if cosine <= 0 or missed or (of_sun and f >= 0):
                 weighted[k] = 0
                 continue
@@ -325,9 +333,9 @@ def trace_lobe_samples(
 ) -> LobeSamples:
     """Trace the mixture at R surface points; all of ``points`` must lie on the surface.
 
-    group          this many consecutive points divide each technique's Sobol points among them, so
-                   that their mean has a smaller error
-    stream (G,)    groups of the same number share their random numbers; default: none do
+    stream (R,)    each point's number, of which its random numbers follow; default: its place
+    group          points of so many numbers after each other divide each technique's Sobol points
+                   among them, so that their mean has a smaller error
     alphas (R, A)  the lobes' widths; default: LOBE_ALPHAS at every point, for any roughness
     """
     groups, sun = lit.lights.groups, lit.environment.sun
@@ -341,7 +349,8 @@ def trace_lobe_samples(
     origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
     draws = GroupDraws(
         sobol_bits(int(np.ceil(np.log2(group * max(mixture))))),
-        np.arange(count // group) if stream is None else stream,
+        np.arange(count) if stream is None else stream,
+        group,
         seed,
     )
     directions = np.zeros((count * total, 3), np.float32)
@@ -351,15 +360,14 @@ def trace_lobe_samples(
     )  # fmt: skip
     draw_directions(count, aimed, origin, draws, mixture, groups)
     if mixture.sun:
-        numbers = np.repeat(draws.number, group) * group + np.arange(count) % group
-        aimed.direction[:, -1] = towards_sun(sun, shifts_of(numbers, 2, seed ^ _SUN_SEED))
+        aimed.direction[:, -1] = towards_sun(sun, shifts_of(draws.number, 2, seed ^ _SUN_SEED))
     hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
     cos_in, sin2_half, cos_half = np.zeros((3, count, total), np.float32)
     arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
     cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)
     samples = LobeSamples(cos_in, sin2_half, cos_half, arriving, cos_out)
     hits = Hits._make(values.reshape(count, total) for values in hits)
-    weigh(count, aimed, hits, mixture, groups, lit.environment, samples)
+    weigh(count, aimed, origin, hits, mixture, groups, lit.environment, samples)
     return samples
 
 
@@ -373,12 +381,15 @@ def lobe_basis(
 ) -> Basis:
     """Kind of lobe, roughnesses (Q,) -> (base, slope) of I_nd = base + psi * slope,
     (num_groups, 3, Q) each: the mean over equally many consecutive ``points`` per group. Rays are
-    traced once, when they are first needed."""
+    traced once, when they are first needed. stream (num_groups,): groups of the same number share
+    their random numbers; default: none do."""
 
     @cache
     def samples() -> LobeSamples:
         group = len(points.face) // max(num_groups, 1)
-        return trace_lobe_samples(lit, points, mixture, seed, stream, group=group)
+        number = np.arange(num_groups) if stream is None else stream
+        each = (group * number[:, None] + np.arange(group)).ravel()
+        return trace_lobe_samples(lit, points, mixture, seed, each, group=group)
 
     def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
         # As many as vector instructions take at once.
@@ -407,6 +418,7 @@ def lobe_radiance(
     rays: int,
     seed: int,
     stream: Long | None = None,
+    group: int = 1,
 ) -> Float:
     """I_nd (R, 3) at surface points with lobes phi (R,) and psi (R,), or (R, 3) where channels
     differ, from ``rays`` rays each.
@@ -414,7 +426,8 @@ def lobe_radiance(
     A psi above 1 is a metal's. Of the rays, 5/8 follow the point's own lobe and the rest go to the
     lights, both weighted by the balance heuristic. All ``points`` must lie on the surface. Every
     point draws its own random numbers, from ``seed`` and its number in ``stream`` (R,), else its
-    place in the array.
+    place in the array; points of ``group`` numbers after each other, as those of a pixel, divide
+    what one point would draw, so that their mean has a smaller error.
     """
     mixture = Mixture(per_lobe=rays - 3 * rays // 8, lights=3 * rays // 8, cosine=0)
     alphas = np.maximum(phi, MIN_ALPHA).astype(np.float64)[:, None]
@@ -427,14 +440,16 @@ def lobe_radiance(
             which = np.flatnonzero(own)
             result[which] = lobe_radiance(
                 replace(lit, lobe=kind), points.take(which), phi[which], psi[which], rays, seed,
-                stream[which],
+                stream[which], group,
             )  # fmt: skip
         return result
     step = max(1, _RAYS_AT_ONCE // rays)
     for start in range(0, len(phi), step):
         part = np.arange(start, min(start + step, len(phi)))
         numbers = stream[part]
-        samples = trace_lobe_samples(lit, points.take(part), mixture, seed, numbers, alphas[part])
+        samples = trace_lobe_samples(
+            lit, points.take(part), mixture, seed, numbers, alphas[part], group
+        )
         base, slope = non_diffuse(samples, phi[part, None].astype(np.float32), lit.lobe)
         share = share_of_base(F0_OF_PSI * psi[part], lit.lobe)
         result[part] = share * base[..., 0] + psi[part] * slope[..., 0]

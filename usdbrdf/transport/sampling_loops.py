@@ -19,9 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.kernel import loop
-from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
+from usdbrdf.model.arrays import Bits, Bool, Double, Float, Int, Long
 from usdbrdf.transport.environment import Environment, environment_at
 from usdbrdf.transport.lights import DENSITY, GROUP, LightGroups, TilePicks, facing, picked, way_to
+from usdbrdf.transport.openings import opening_at
 from usdbrdf.transport.rays import Hits, closest_hits, closest_hits_of_groups, empty_hits, occlusion
 from usdbrdf.transport.surface_texture import (
     AHEAD,
@@ -118,6 +119,8 @@ def add_light_samples(
         occlusion(
             met.scene, receivers.origin, segments.point[:part], segments.direction, _NEARLY, blocked
         )
+        if receivers.groups.box[2, 0] > 0:
+            add_from_outside(met.environment, receivers.groups, segments, part, blocked, total)
         count = 0
         for i in range(part):
             free[count] = i
@@ -130,6 +133,28 @@ def add_light_samples(
             add_looked_at(
                 met.radiance, looks, j, segments.weight[i], total, unsigned(segments.point[i])
             )
+
+
+@loop
+def add_from_outside(
+    environment: Environment,
+    groups: LightGroups,
+    segments: Segments,
+    part: int,
+    blocked: Bool,
+    total: Double,
+) -> None:
+    """total += what the rays through openings bring, of the first ``part``; they are then as good
+    as ``blocked``."""
+    for i in range(part):
+        if segments.face[i] < groups.first_opening or blocked[i]:
+            continue
+        blocked[i] = True
+        x, y, z = segments.direction[i, 0], segments.direction[i, 1], segments.direction[i, 2]
+        scale, k = 1 / math.sqrt(x * x + y * y + z * z), unsigned(segments.point[i])
+        for c in range(3):
+            far = environment_at(environment, x * scale, y * scale, z * scale, c)
+            total[k, c] += segments.weight[i] * far
 
 
 @loop
@@ -297,12 +322,14 @@ def add_cosine_samples(
             else:
                 weight[i], k = 0, unsigned(first + i)
                 escaped[k] += 1
-                share = 1.0
+                share = math.pi
+                if use_lights and receivers.groups.box[2, 0] > 0:
+                    share = weight_of_opening(receivers, k, d, i)
                 if len(receivers.angle):
-                    share = counted(receivers, k, d, i)
+                    share *= counted(receivers, k, d, i)
                 for c in range(3):
                     far = environment_at(met.environment, d[i, 0], d[i, 1], d[i, 2], c)
-                    total[k, c] += np.pi * far * share
+                    total[k, c] += far * share
         if use_lights:
             weigh_lamps(receivers, first, d, hits, lamps[:count], light, weight)
         if len(receivers.angle):
@@ -313,6 +340,24 @@ def add_cosine_samples(
             look_at(radiance, looks, i, max(hits.face[i], 0), hits.u[i], hits.v[i])
         for i in range(part):
             add_looked_at(radiance, looks, i, weight[i], total, unsigned(first + i))
+
+
+@loop
+def weight_of_opening(receivers: Receivers, k: int, directions: Float, i: int) -> float:
+    """Of the ray from point k in direction i that leaves the scene, and might have been sent to
+    where it does."""
+    groups, x, normal = receivers.groups, receivers.origin[k], receivers.normal[k]
+    dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+    opening, distance = opening_at(groups.box, x[0], x[1], x[2], dx, dy, dz)
+    light = groups.of_face[groups.first_opening + opening]
+    if light < 0:
+        return math.pi
+    triangle = groups.triangles[light]
+    sent, cosine = facing(triangle, dx, dy, dz), dx * normal[0] + dy * normal[1] + dz * normal[2]
+    if sent <= 0 or cosine <= 0:
+        return math.pi
+    density = triangle[DENSITY] * receivers.picks.ratio[receivers.row[k], np.int32(triangle[GROUP])]
+    return float(cosine / (cosine / math.pi + density * distance * distance / sent))
 
 
 @loop
