@@ -176,9 +176,11 @@ class _Fit:
         rest = self._model.reduced(self._radiance - np.concatenate(lobes, axis=2))
         noisy = least + (float(self._model.product(rest, rest).mean()) - least) / repeats
         freedom = self._model.degrees_of_freedom
-        found = lobe_from_costs(phis, terms, without, noisy, freedom, self._candidate.blur)
         neighbours = phis[near].tolist()
         of_rays = error_of_rays(self._model, self._radiance[..., 0], bases, neighbours, psi)
+        of_mean = of_rays[0] / math.sqrt(repeats), of_rays[1] / math.sqrt(repeats)
+        blur = self._candidate.blur
+        found = lobe_from_costs(phis, terms, without, noisy, freedom, blur, of_mean)
         return found._replace(of_rays=of_rays)
 
     def _terms(self, first: Pair, second: Pair) -> Double:

@@ -47,7 +47,13 @@ class LobeEstimate(NamedTuple):
 
 
 def lobe_from_costs(
-    phis: Double, terms: Double, without: float, noisy: float, freedom: int, blur: float
+    phis: Double,
+    terms: Double,
+    without: float,
+    noisy: float,
+    freedom: int,
+    blur: float,
+    of_rays: tuple[float, float] = (0.0, 0.0),
 ) -> LobeEstimate:
     """The best lobe and its errors.
 
@@ -58,6 +64,7 @@ def lobe_from_costs(
     freedom  degrees of freedom, for the unit of the cost
     blur     standard deviation, in radians, of the surface normal over the footprint of a sample: a
              lobe narrower than that is not seen as such
+    of_rays  what the rays' noise does to phi and psi
     """
     psi, profile, square = least_costs(terms, abs(without))
     phi = _vertex(phis, profile)
@@ -67,16 +74,23 @@ def lobe_from_costs(
     noise_ratio = max(1.0, noisy / max(least, 1e-12))
     temper = max(1.0, MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
     lowest = min(float(surface.min()), without)
-    density = np.exp(-0.5 * (surface - lowest) / temper)
-    density *= np.gradient(phis)[:, None]
-    # There may be no lobe at all, which was as likely before as that there is one.
-    none = math.exp(-0.5 * (without - lowest) / temper)
-    none /= none + float(density.sum()) / len(_PSI_GRID)
-    density /= density.sum()
+
+    def likely(temper: float) -> tuple[Double, float]:
+        """Of each lobe, and that there is none at all, which was as likely before as one."""
+        density = np.exp(-0.5 * (surface - lowest) / temper)
+        density *= np.gradient(phis)[:, None]
+        none = math.exp(-0.5 * (without - lowest) / temper)
+        none /= none + float(density.sum()) / len(_PSI_GRID)
+        return density / density.sum(), none
+
+    density, _ = likely(temper)
     phi_error = _deviation(density.sum(axis=1), phis, phi)
     best_psi = float(np.interp(phi, phis, psi))
     psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
+    # The errors leave out what the rays do to psi, which is added to them. Whether there is a lobe
+    # is told by psi, whose variance temper / c2 grows by that.
+    density, none = likely(temper + of_rays[1] ** 2 * float(square[profile.argmin()]))
     middle = (0.5 - none) / (1 - none) if none < 0.5 else 0.0
     psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (middle, 0.95))
     psi_median = psi_median if middle > 0 else 0.0

@@ -76,9 +76,12 @@ class Shining(NamedTuple):
     lights: Lights
 
     @classmethod
-    def of(cls, surface: TexturedScene, light: Float) -> Shining:
-        """light (T, 3), W/(m^2 sr)."""
-        lights = lights_from_radiance(surface.scene, surface.texels, light)
+    def of(
+        cls, surface: TexturedScene, light: Float, environment: Environment | None = None
+    ) -> Shining:
+        """light (T, 3), W/(m^2 sr); environment: what shines in from outside, if it counts."""
+        outside = (surface.rays, environment) if environment else None
+        lights = lights_from_radiance(surface.scene, surface.texels, light, outside=outside)
         return cls(surface.texture(light), lights)
 
 

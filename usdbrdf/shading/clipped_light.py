@@ -287,7 +287,7 @@ def _evidence(
     return Evidence(
         radiance=lit[chosen],
         irradiance=irradiance_of_texels(
-            surface, Shining.of(surface, dark), environment, chosen, seed
+            surface, Shining.of(surface, dark, environment), environment, chosen, seed
         ),
         lamp_irradiance=np.stack(lamps),
         position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),

@@ -85,7 +85,7 @@ def beside_lamps(
     surface: TexturedScene, lit: Float, outside: Environment, asked: Asked, lamps: Lamps, seed: int
 ) -> Asked:
     """The texels asked with S of all but the lamps."""
-    rest = Shining.of(surface, _without(lit, lamps))
+    rest = Shining.of(surface, _without(lit, lamps), outside)
     known = irradiance_of_texels(surface, rest, outside, asked.texel, seed)
     floor = 1e-4 * np.median(asked.reflected)
     return asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))

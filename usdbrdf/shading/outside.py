@@ -215,7 +215,7 @@ def _under_what_was_seen(
     """The texels asked with S, W/m^2, of all that frames measured."""
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
-    shining = Shining.of(surface, lit)
+    shining = Shining.of(surface, lit, environment)
     irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, seed)
     least = _DARK * np.median(asked.reflected)
     return asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
