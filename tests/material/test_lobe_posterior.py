@@ -84,3 +84,16 @@ def test_noise_of_the_rays_widens_the_errors():
     quiet, noisy = (lobe_from_costs(PHIS, terms, without, n, FREEDOM, 0.0) for n in (50.0, 200.0))
     assert noisy.phi_error == pytest.approx(2 * quiet.phi_error, rel=0.02)
     assert noisy.psi_error == pytest.approx(2 * quiet.psi_error, rel=0.02)
+
+
+def test_a_lobe_that_the_rays_noise_may_have_made_is_none():
+    terms, without = _normal(0.415, 0.4, 0.04, 0.05, 50)
+    clear, hazy = (
+        lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0, (0.0, of_rays))
+        for of_rays in (0.0, 1.0)
+    )
+    assert clear.psi_median == pytest.approx(0.4, abs=0.01)
+    assert hazy.psi_median == 0
+    assert hazy.psi_upper > clear.psi_upper + 0.3
+    # What the rays do to psi itself is added to its error by the mean of the repeats.
+    assert (hazy.psi, hazy.psi_error) == (clear.psi, clear.psi_error)
