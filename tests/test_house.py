@@ -119,7 +119,7 @@ IMPORTERS: dict[str, set[str]] = {
     "PyOpenColorIO": {"files/colour.py"},
     "pyoidn": {"transport/denoise.py"},
     "subprocess": {"job/child.py"},
-    "threadpoolctl": {"cluster/unit.py", "material/fit_objects.py"},
+    "threadpoolctl": {"cluster/unit.py", "job/task.py"},
     "tqdm": {"job/progress.py"},
     "trimesh": {"untrusted/", "delivery/glb.py", "shading/lamp_shapes.py"},
     "usd_validation_nvidia": {"validation/nvidia.py"},

@@ -7,6 +7,7 @@ import os
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.job import stamp as stamp_module
@@ -273,3 +274,20 @@ def test_outputs_that_take_long_are_made_once(tmp_path):
     run(3, seed=1)
     assert (asset / "frames/a.exr").read_text() == "a 1"
     assert list((asset / ".usdbrdf/work").iterdir()) == []
+
+
+def _threads_of_blas() -> set[int]:
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_blas_keeps_to_one_thread_in_the_work(tmp_path):
+    told = []
+
+    def work(_: object) -> dict[str, int]:
+        told.append(_threads_of_blas())
+        return {}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        run_task(tmp_path / "room", "toy", order=20, parameters={}, inputs={}, work=work)
+        assert told == [{1}]
+        assert _threads_of_blas() == {2}

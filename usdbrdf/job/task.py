@@ -24,6 +24,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
+from threadpoolctl import threadpool_limits
+
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import (
     environment_failures,
@@ -286,7 +288,10 @@ def run_task(
             _publish(asset, folder, noted, order)
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
         run = TaskRun(asset, name, folder, workers)
-        summary = json.loads(json_text(work(run)))
+        # Many small matrices: BLAS's threads would only wait for each other, and on a busy machine
+        # for long.
+        with threadpool_limits(limits=1, user_api="blas"):
+            summary = json.loads(json_text(work(run)))
         run.gather()
         for relative in (*run.outputs, *run.once):
             if not (run.staged / relative).is_file():

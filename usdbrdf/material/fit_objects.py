@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from usdbrdf import calibration
 from usdbrdf.ahead import ahead
@@ -290,12 +289,10 @@ def _of_each_object(
     """A unit of work for each object; the largest first, so that none is worked on alone at the
     end."""
     order = sorted(range(len(sizes)), key=lambda i: -sizes[i])
-    # With all cores for each object's small matrices BLAS's threads only wait for each other.
-    with threadpool_limits(limits=1, user_api="blas"):
-        found = run.units(
-            unit, given, {f"{name}-{i}": pieces[i] for i in order},
-            label=label, noun="objects", at_a_time=_AT_A_TIME,
-        )  # fmt: skip
+    found = run.units(
+        unit, given, {f"{name}-{i}": pieces[i] for i in order},
+        label=label, noun="objects", at_a_time=_AT_A_TIME,
+    )  # fmt: skip
     of_object = dict(zip(order, found, strict=True))
     return [of_object[i] for i in range(len(sizes))]
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
@@ -130,8 +131,9 @@ def _solved_channel(
     of_albedo = num_sources + np.arange(num_segments)
     of_gloss = of_albedo + num_segments
 
-    def by_segment(values: Double) -> Double:
-        return np.bincount(asked.segment, values, num_segments).astype(np.float64)
+    # (M, N): sums over the texels of each segment.
+    texels = np.arange(len(asked.segment))
+    gather = sparse.csr_matrix((np.ones(len(texels)), (asked.segment, texels)))
 
     for _ in range(iterations):
         brought = np.exp(g)[:, None] * sources.share
@@ -150,13 +152,15 @@ def _solved_channel(
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
         curvature[:num_sources, :num_sources] = by_source @ (by_source * weight).T
         gradient[:num_sources] = by_source @ (weight * residual)
-        for place, part in ((of_albedo, by_albedo), (of_gloss, by_gloss)):
-            for source, other in enumerate(by_source):
-                both = by_segment(part * other * weight)
-                curvature[source, place] = curvature[place, source] = both
-            curvature[place, place] = by_segment(part**2 * weight)
-            gradient[place] = by_segment(part * weight * residual)
-        both = by_segment(by_albedo * by_gloss * weight)
+        parts = by_albedo * weight, by_gloss * weight
+        for place, part in zip((of_albedo, of_gloss), parts, strict=True):
+            both = gather @ (by_source * part).T
+            curvature[place[:, None], np.arange(num_sources)] = both
+            curvature[np.arange(num_sources)[:, None], place] = both.T
+            gradient[place] = gather @ (part * residual)
+        curvature[of_albedo, of_albedo] = gather @ (by_albedo * parts[0])
+        curvature[of_gloss, of_gloss] = gather @ (by_gloss * parts[1])
+        both = gather @ (by_gloss * parts[0])
         curvature[of_albedo, of_gloss] = curvature[of_gloss, of_albedo] = both
         _add_priors(curvature, gradient, sources, channel, (g, albedo, gloss, mean))
         # What would be less glossy than not at all stays as it is.
