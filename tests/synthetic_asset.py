@@ -287,6 +287,7 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
             psi_upper=float("nan") if name == "wall" else 0.75,
             shown_phi=0.25 if name == "lamp" else float("nan"),
             shown_psi=0.5 if name == "lamp" else float("nan"),
+            contradiction=0.5 if name == "lamp" else float("nan"),
             phi_confidence="none" if name == "wall" else "high",
             psi_confidence="none" if name == "wall" else "low",
             aovs=aovs_of(asset, name, ("diffuse", "base_color")),

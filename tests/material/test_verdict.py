@@ -11,6 +11,7 @@ from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
+    MOST_CONTRADICTED,
     NEUTRAL,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
@@ -38,6 +39,18 @@ def test_a_measurement_is_published_as_found(evidence: float):
     assert found.phi_error == 0.02 if evidence == 1 else found.phi_error > 0.02
     assert (found.phi_confidence, found.psi_confidence) == ("high", "high")
     assert (found.status, found.psi_upper) == ("measured", 0.9)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_nothing_is_told_of_what_views_contradict(share: float):
+    found = verdict_on_views(_lobe(contradiction=share * MOST_CONTRADICTED), True)
+    assert found.status == ("measured" if share < 1 else "prior")
+    if share > 1:
+        assert (found.phi, found.psi, found.psi_upper) == (*NEUTRAL, 1.0)
+        assert (found.phi_error, found.psi_error) == (NOTHING_KNOWN, UNASKED)
+        assert found.contradiction == share * MOST_CONTRADICTED
+    else:
+        assert math.isnan(found.contradiction)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.1, 1.3])

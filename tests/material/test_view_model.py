@@ -203,3 +203,20 @@ def test_more_frames_than_shared_errors_are_wanted_come_to_an_end():
     few = _samples(np.random.default_rng(6), 3, 300)
     model = ViewModel(few)
     assert model.degrees_of_freedom > 0
+
+
+def test_what_no_lobe_explains_is_told_beside_what_one_does():
+    # Of something that is seen through, views differ alike over places of it.
+    rng = np.random.default_rng(2)
+    surface = {"frame": 0.01, "frame of channel": 0.01, "small": 0.02, "large": 0.02,
+               "large of channel": 0.01, "own": 0.01}  # fmt: skip
+    pane = surface | {"frame": 0.2, "small": 0.3, "large": 0.3}
+    for true, specular in ((surface, 0.0), (surface, 0.4), (pane, 0.0), (pane, 0.4)):
+        samples = _with_errors(_samples(rng, 100, 25, area=0.499), rng, true)
+        lobe = specular * samples.radiance.astype(float)
+        samples = replace(samples, radiance=(samples.radiance + lobe).astype(np.float32))
+        model = ViewModel(samples)
+        for _ in range(6):
+            model.update(lobe)
+        alike = np.linalg.norm([true[name] for name in ("frame", "small", "large")])
+        assert model.contradiction == pytest.approx(alike / (1 + specular), rel=0.25)

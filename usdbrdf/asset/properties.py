@@ -377,6 +377,10 @@ class FittedObject(MeasuredObject):
     evidence: Annotated[float, Fact(FIT, "evidence", "float", 0.0, """1 - loss(phi, psi) / loss(no
         specular lobe): what the highlights explain; 0 is nothing, 1 is everything; without
         unit.""", high=1)]
+    contradiction: Annotated[float, Fact(FIT, "contradiction", "float", 0.0, """Relative standard
+        deviation between views, alike over the object or places of it, that no lobe explains;
+        authored where it is too large for a surface, and things are seen through or in it; without
+        unit.""", low=0)] = math.nan
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
         the photographs, and their stated errors are small; prior: they do not determine both, whose
         values are the medians of what remains likely if all was equally likely before; unseen: no
@@ -417,6 +421,22 @@ class FittedObject(MeasuredObject):
     @property
     def is_glass(self) -> bool:
         return self.kind == "transparent"
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether its views are those of something that is seen through."""
+        return math.isfinite(self.contradiction)
+
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences about what a person should look at."""
+        if not self.is_contradicted:
+            return []
+        return [
+            f"{self.identifier}: between views its light differs by {self.contradiction:.0%}, as "
+            "no surface's does, so nothing is told of its lobe. If it is glass, say so by a "
+            "directive. [fit.contradicted]"
+        ]
 
     @property
     def psi_of_channels(self) -> Colour:

@@ -95,7 +95,7 @@ def mean_of_repeats(found: Sequence[LobeEstimate]) -> LobeEstimate:
         of_rays = np.maximum(of_rays, values.std(axis=0, ddof=1))
     of_rays /= np.sqrt(len(found))
     errors = np.minimum(np.hypot(stated.mean(axis=0), of_rays), NOTHING_KNOWN)
-    names = ("phi", "psi", "unresolved", "cost", "evidence", *POSTERIOR)
+    names = ("phi", "psi", "unresolved", "cost", "evidence", "contradiction", *POSTERIOR)
     return LobeEstimate(
         **{name: float(np.mean([getattr(one, name) for one in found])) for name in names},
         phi_error=float(errors[0]),
@@ -266,4 +266,5 @@ def fit_lobe(
     ]
     likely = [candidate.likely for candidate in candidates]
     lobe = averaged(estimates, model.degrees_of_freedom, likely)
+    lobe = lobe._replace(contradiction=model.contradiction)
     return FittedKind(lobe, (with_old + with_new) / 2, model, fits)

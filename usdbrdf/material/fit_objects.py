@@ -86,7 +86,8 @@ class ObjectFit(NamedTuple):
     phi, psi, phi_error, psi_error  parameters of the lobe and their standard deviations
     unresolved    share of the highlight that the pixels do not resolve
     cost          at the minimum; evidence: 1 - cost / cost without a lobe
-    phi_median, psi_median, psi_upper  of what remains likely, see ``LobeEstimate``
+    phi_median, psi_median, psi_upper  of what remains likely, and contradiction, of the samples by
+                  any lobe: see ``LobeEstimate``
     metal_phi, red, green, blue, metal_phi_error, f0_error, clearer  of the metal that explains the
                   samples better, see ``Conductor``
     num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
@@ -102,6 +103,7 @@ class ObjectFit(NamedTuple):
     phi_median: float = math.nan
     psi_median: float = math.nan
     psi_upper: float = math.nan
+    contradiction: float = math.nan
     metal_phi: float = math.nan
     red: float = math.nan
     green: float = math.nan
@@ -357,7 +359,7 @@ def fit_object(
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     found = ObjectFit(
         *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
-        num_samples=used, target=target,
+        fitted.contradiction, num_samples=used, target=target,
     )  # fmt: skip
     if not metal:
         return found
@@ -416,6 +418,7 @@ def judged(
         lobe = LobeEstimate(
             found.phi, found.psi, found.phi_error, found.psi_error, found.unresolved, found.cost,
             found.evidence, (0.0, 0.0), found.phi_median, found.psi_median, found.psi_upper,
+            found.contradiction,
         )  # fmt: skip
         verdict = verdict_on_views(lobe if math.isfinite(found.phi) else None, observed)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,8 @@ class LobeEstimate(NamedTuple):
     ``mean_of_repeats`` adds it to them. phi_median, psi_median, psi_upper: medians of either, and
     what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
     highlight shows, the frames still say that psi is small or phi large. For psi_median no lobe at
-    all was as likely before as one: it is 0 where the simpler model explains as much."""
+    all was as likely before as one: it is 0 where the simpler model explains as much.
+    contradiction: see ``ViewModel``; of a surface it is small, whatever its lobe."""
 
     phi: float
     psi: float
@@ -44,6 +45,7 @@ class LobeEstimate(NamedTuple):
     phi_median: float = 0.5
     psi_median: float = 0.5
     psi_upper: float = 1.0
+    contradiction: float = 0.0
 
 
 def lobe_from_costs(
@@ -181,6 +183,7 @@ def usual_lobe(class_name: str, label: str) -> tuple[float, float] | None:
 
 MIN_EVIDENCE = calibration.number("verdict.min_evidence")
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
+MOST_CONTRADICTED = calibration.number("verdict.most_contradicted")
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
@@ -196,7 +199,8 @@ class Verdict:
     "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper: what psi exceeds
     with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown instead of what
     was found (NaN: that itself); kind "dielectric", "conductor" with its f0 and the error of that,
-    or "transparent"."""
+    or "transparent"; contradiction: what the frames hold against its being a surface (NaN:
+    nothing)."""
 
     phi: float
     psi: float
@@ -211,6 +215,7 @@ class Verdict:
     kind: str = "dielectric"
     f0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     f0_error: float = math.nan
+    contradiction: float = math.nan
 
 
 def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
@@ -220,10 +225,13 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     samples' footprint they say something, but the stated error includes what the footprint may have
     done; phi's grows also by what the lobe leaves unexplained. Where they do not determine both
     numbers, the medians of what remains likely are published: no highlight is knowledge too.
-    Names and classes of objects tell nothing here.
+    What is seen through a thing, or in it, changes with the view as no lobe does: then the numbers
+    are none of a surface's, and nothing is known. Names and classes of objects tell nothing here.
     """
     if lobe is None:
         return _not_asked(seen)
+    if lobe.contradiction > MOST_CONTRADICTED:
+        return replace(_not_asked(seen), contradiction=lobe.contradiction)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
     phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)

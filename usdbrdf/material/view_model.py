@@ -233,6 +233,14 @@ class ViewModel:
     def degrees_of_freedom(self) -> int:
         return 3 * (len(self._texel) - self._num_texels)
 
+    @property
+    def contradiction(self) -> float:
+        """Relative standard deviation of what a frame's samples have in common, over the object or
+        places of it, that neither texels' diffuse light nor the best lobe so far explains."""
+        diffuse = self._level / (self._level + self._specular)
+        frame, small, large, *_ = self._deviation
+        return float(np.sqrt((frame**2 + small**2 + large**2) * (diffuse**2).mean()))
+
     def reduced(self, values: npt.NDArray[np.floating]) -> Reduced:
         """Prepare K sets of values at once, (P, 3, K), for ``product``."""
         rest = values - self._texel_means(self._weight @ values)[self._texel]

@@ -122,6 +122,11 @@ def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
         return "No photograph shows it: everything about it is a guess."
     if fit.is_metal:
         return "A metal explains the views better than any dielectric: F0 takes the place of psi."
+    if fit.is_contradicted:
+        return (
+            f"Its views differ by {fit.contradiction:.0%}, as those of no surface do: something is "
+            "seen through it or in it. If it is glass, say so by a directive."
+        )
     explained = f"A lobe explains {max(fit.evidence, 0):.0%} of what changes with the view."
     if math.isnan(fit.evidence):
         explained = "There were too few samples for a fit."

@@ -23,7 +23,7 @@ from usdbrdf.material.refine import frame_reader
 from usdbrdf.model.mesh import LEFT_OUT, OF_FIT
 from usdbrdf.options import FitOptions, kind_of_light
 from usdbrdf.tasks.refined import fitted_objects, refined_objects
-from usdbrdf.tasks.task import Task
+from usdbrdf.tasks.task import Task, warned
 from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
 
@@ -104,6 +104,9 @@ def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResul
         networks = run.output(f"layers/{asset.materialx_layer.name}") if options.materialx else None
         write_material_layer(layer, task.draft, objects, materialx=networks)
         write_interface(run.output(f"layers/{asset.interface('material').name}"), layer)
-        return {"objects": {item.identifier: item.summary for item in objects}}
+        return {
+            "objects": {item.identifier: item.summary for item in objects},
+            "warnings": warned(doubt for item in objects for doubt in item.doubts),
+        }
 
     return task.run(work, workers)
