@@ -22,6 +22,7 @@ SLOW = (
     "dcc",
     "delivery/test_acescg.py",
     "delivery/test_glb.py",
+    "delivery/test_low_poly.py",
     "delivery/test_package_refused.py",
     "delivery/test_package_usdz.py",
     "delivery/test_package_whole.py",

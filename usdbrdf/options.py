@@ -425,6 +425,9 @@ class PackageOptions(Options):
     profile: Literal["default", "arkit"] = option("--profile", "default")
     "arkit: y up, PNG, no cameras and lights, for AR Quick Look"
     texture_space: TextureSpace = _texture_space()
+    low_poly: float | None = option("--low-poly N", None, (1e-6, 2**31 - 1), unset="as measured")
+    """for viewers that need little geometry: meshes of about N triangles in all, or below 1 of that
+    share, with textures of their own, into which the scan's maps and normals are baked"""
     whole: bool = option("--whole", False)
     """.usdz of the layers as they are, all looks and lightings as variants, in the place of one
     look made flat"""

@@ -25,10 +25,13 @@ from usdbrdf.delivery.packaged_files import encoded_colour, encoded_data, size_w
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.images import resized
+from usdbrdf.geometry.normal_maps import corner_tangents
 from usdbrdf.model.arrays import Byte, Float
 from usdbrdf.model.material import Material, Surface
 
 PRIM = "usdPrim"  # of a node: the path of the prim that it was
+# trimesh writes other attributes of vertices under names that begin with a line.
+_TANGENT = "_TANGENT"
 IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
 _WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
 _LINEAR, _LINEAR_MIPMAP = 9729, 9987
@@ -116,6 +119,9 @@ def gltf_material(
     factors, packed = _roughness(material, max_size)
     if packed is not None:
         pictures["metallicRoughnessTexture"] = packed
+    if material.normal is not None:
+        stored = (_small(material.normal, max_size) + np.float32(1)) / np.float32(2)
+        pictures["normalTexture"], _, _ = encoded_data(np.clip(stored, 0, 1))
     numbers: dict[str, Any] = {
         "pbrMetallicRoughness": {
             **factors,
@@ -159,13 +165,18 @@ def _mesh(surface: Surface, material: PBRMaterial) -> Any:
     if uv is None:
         uv = np.zeros((*surface.triangles.shape, 2), np.float32)
     points = surface.points[surface.triangles].astype(np.float32)
-    corners = np.concatenate([points, surface.corner_normals, uv], axis=2).reshape(-1, 8)
+    parts = [points, surface.corner_normals, uv]
+    if surface.material.normal is not None:
+        parts.append(corner_tangents(surface.points, surface.triangles, surface.corner_normals, uv))
+    corners = np.concatenate(parts, axis=2).reshape(3 * len(points), -1)
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    more = {_TANGENT: vertices[:, 8:]} if surface.material.normal is not None else {}
     return trimesh.Trimesh(
         vertices=vertices[:, :3],
         faces=index.reshape(-1, 3),
         vertex_normals=vertices[:, 3:6],
-        visual=trimesh.visual.TextureVisuals(uv=vertices[:, 6:], material=material),
+        visual=trimesh.visual.TextureVisuals(uv=vertices[:, 6:8], material=material),
+        vertex_attributes=more,
         process=False,
     )
 
@@ -180,8 +191,12 @@ class _NamedMaterial(PBRMaterial):  # type: ignore[misc]
 def _finish(
     tree: dict[str, Any], *, materials: dict[str, GltfMaterial], paths: dict[str, str]
 ) -> None:
-    """Everything of the materials but the places of their textures, and samplers; and of the nodes
-    which prims they were."""
+    """Everything of the materials but the places of their textures, and samplers; of the nodes
+    which prims they were; and the tangents under glTF's name."""
+    for mesh in tree["meshes"]:
+        attributes = mesh["primitives"][0]["attributes"]
+        if _TANGENT in attributes:
+            attributes["TANGENT"] = attributes.pop(_TANGENT)
     for node in tree["nodes"]:
         if node.get("name") in paths:
             node["extras"] = {PRIM: paths[node["name"]]}

@@ -30,6 +30,7 @@ from usdbrdf.delivery.collection import OF_PHOTOGRAPHS, SCHEMAS_OF_PHOTOGRAPHS
 from usdbrdf.delivery.colours import ColourTextures, convert_layer, in_space
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.glb import write_glb
+from usdbrdf.delivery.low_poly import make_low_poly
 from usdbrdf.delivery.packaged_files import (
     EXR,
     IMAGES,
@@ -246,9 +247,14 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
-    with environment_failures(str(output)), _folder_of(output):
+    with environment_failures(str(output)), _folder_of(output), scratch_folder() as made:
+        reduced: dict[str, int] = {}
+        if options.low_poly is not None:
+            count = make_low_poly(flat, asset, made, options.low_poly, warn)
+            reduced = {"triangles": count}
+            _keep_bound_materials(flat)
         if glb:
-            texture_uses(flat, asset)  # refuses what lies outside
+            texture_uses(flat, asset, made)  # refuses what lies outside
             # Our own reader is to return what renderers are told, not the lobe that is meant by it.
             for prim in flat.TraverseAll():
                 if prim.HasAttribute(_MAPPING):
@@ -260,10 +266,10 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
             moved = [surface.moved(turn) for surface in surfaces]
             summary = write_glb(output, moved, options.max_size, warn)
         else:
-            count = _write_usdz(output, flat, asset, options)
+            count = _write_usdz(output, flat, asset, options, made)
             summary = {"textures": count, "format": options.textures, "profile": options.profile}
         size = output.stat().st_size
-    return {"output": str(output), "look": look_of(stage), "bytes": size, **summary}
+    return {"output": str(output), "look": look_of(stage), "bytes": size, **summary, **reduced}
 
 
 def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[str, Any]:
@@ -299,8 +305,10 @@ def _refuse_unpacked(file: Path) -> None:
         )
 
 
-def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOptions) -> int:
-    """Returns the number of textures."""
+def _write_usdz(
+    output: Path, flat: Usd.Stage, asset: Asset, options: PackageOptions, made: Path
+) -> int:
+    """Returns the number of textures; ``made`` holds those that the asset has not."""
     if options.profile == ARKIT:
         fit_for_arkit(flat, warn)
     space, colours = SPACES[options.texture_space], ColourTextures()
@@ -310,7 +318,7 @@ def _write_usdz(output: Path, flat: Usd.Stage, asset: Asset, options: PackageOpt
     with scratch_folder() as folder:
         textures: dict[tuple[Any, ...], NewTexture] = {}
         packed: set[str] = set()
-        for use in texture_uses(flat, asset):
+        for use in texture_uses(flat, asset, made):
             # Each once, however many nodes read it in the same way.
             key = (use.file, use.space, use.colour, use.reads_alpha)
             if key not in textures:
@@ -369,7 +377,7 @@ def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Lite
     of_one_look = {
         "--look": options.look, "--lighting": options.lighting, "--max-size": options.max_size,
         "--profile": options.profile == ARKIT, "--textures png": options.textures == "png",
-        ".glb": suffix == GLB,
+        "--low-poly": options.low_poly, ".glb": suffix == GLB,
     }  # fmt: skip
     if options.whole and (excluded := [name for name, given in of_one_look.items() if given]):
         raise UsageError(

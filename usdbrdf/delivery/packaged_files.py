@@ -42,6 +42,7 @@ class TextureUse:
     space         "raw", "sRGB" or "auto"
     colour        False for data: roughness, normals, what feeds no colour of a surface
     reads_alpha   something is connected to its alpha
+    feeds         the inputs of nodes that it is connected to
     """
 
     prim_path: str
@@ -49,6 +50,7 @@ class TextureUse:
     space: str
     colour: bool
     reads_alpha: bool
+    feeds: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +67,9 @@ class NewTexture:
     bias: float = 0.0
 
 
-def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
-    """All texture nodes that name a file; InputRefused where it is missing or lies outside."""
+def texture_uses(flat: Usd.Stage, asset: Asset, made: Path | None = None) -> list[TextureUse]:
+    """All texture nodes that name a file; InputRefused where it is missing or lies outside of the
+    asset and of the folder ``made``, which holds what the package has of its own."""
     uses = []
     for prim in flat.TraverseAll():
         shader = UsdShade.Shader(prim)
@@ -78,10 +81,11 @@ def texture_uses(flat: Usd.Stage, asset: Asset) -> list[TextureUse]:
             uses.append(
                 TextureUse(
                     prim_path=str(prim.GetPath()),
-                    file=file_in_asset(value.path, asset),
+                    file=file_in_asset(value.path, asset, made),
                     space=str(produced(shader, "sourceColorSpace") or "auto"),
                     colour=any(name in COLOURS for name, _ in fed),
                     reads_alpha=any(output == "a" for _, output in fed),
+                    feeds=frozenset(name for name, _ in fed),
                 )
             )
     return uses
@@ -212,22 +216,23 @@ def use_texture(flat: Usd.Stage, use: TextureUse, new: NewTexture) -> None:
     shader = UsdShade.Shader(flat.GetPrimAtPath(use.prim_path))
     old_scale = Gf.Vec4f(produced(shader, "scale") or Gf.Vec4f(1))
     old_bias = Gf.Vec4f(produced(shader, "bias") or Gf.Vec4f(0))
-    _set(shader, "file", Types.Asset, Sdf.AssetPath(f"./{new.path}"))
-    _set(shader, "sourceColorSpace", Types.Token, new.space)
+    set_input(shader, "file", Types.Asset, Sdf.AssetPath(f"./{new.path}"))
+    set_input(shader, "sourceColorSpace", Types.Token, new.space)
     if new.scale != 1 or new.bias != 0:
         scale = [old_scale[i] * new.scale for i in range(3)]
         bias = [old_bias[i] + old_scale[i] * new.bias for i in range(3)]
-        _set(shader, "scale", Types.Float4, Gf.Vec4f(*scale, old_scale[3]))
+        set_input(shader, "scale", Types.Float4, Gf.Vec4f(*scale, old_scale[3]))
         if any(bias) or any(old_bias):
-            _set(shader, "bias", Types.Float4, Gf.Vec4f(*bias, old_bias[3]))
+            set_input(shader, "bias", Types.Float4, Gf.Vec4f(*bias, old_bias[3]))
         fallback = produced(shader, "fallback")
         if fallback is not None:
             stored = [(fallback[i] - new.bias) / new.scale for i in range(3)]
-            _set(shader, "fallback", Types.Float4, Gf.Vec4f(*stored, fallback[3]))
+            set_input(shader, "fallback", Types.Float4, Gf.Vec4f(*stored, fallback[3]))
 
 
-def file_in_asset(path: str, asset: Asset) -> Path:
-    """The file at an absolute path, links followed; InputRefused unless it is in the asset."""
+def file_in_asset(path: str, asset: Asset, made: Path | None = None) -> Path:
+    """The file at an absolute path, links followed; InputRefused unless it is in the asset, or in
+    the folder ``made``."""
     if ADDRESS.match(path):
         raise InputRefused(
             f"{path}: files from the network are not packaged. Save it in the asset's folder and "
@@ -236,7 +241,8 @@ def file_in_asset(path: str, asset: Asset) -> Path:
     place = Path(os.path.realpath(asset.folder / path))
     if "<UDIM>" in place.name:
         raise InputRefused(f"{path}: tiled (UDIM) textures are not packaged. [package.udim]")
-    if not place.is_relative_to(os.path.realpath(asset.folder)):
+    homes = [os.path.realpath(folder) for folder in (asset.folder, made) if folder]
+    if not any(place.is_relative_to(home) for home in homes):
         raise InputRefused(
             f"{path}: this file lies outside of the asset {asset.folder} and is not packaged. Copy "
             "it into the folder, or take it out of edits.usda. [package.outside]"
@@ -256,7 +262,10 @@ def produced(shader: UsdShade.Shader, name: str) -> Any:
     return producers[0].Get() if producers else None
 
 
-def _set(shader: UsdShade.Shader, name: str, type_name: Sdf.ValueTypeName, value: object) -> None:
+def set_input(
+    shader: UsdShade.Shader, name: str, type_name: Sdf.ValueTypeName, value: object
+) -> None:
+    """Give an input a plain value of its own."""
     own = shader.CreateInput(name, type_name)
     own.ClearSources()  # a material's interface may serve nodes that read other files
     own.Set(value)

@@ -79,6 +79,7 @@ def decimated(
     *,
     label: str,
     joined: Int | None = None,
+    keep_borders: bool = True,
 ) -> tuple[Float, Int, Int]:
     """Points, triangles and their objects (see ``decimate_objects``) of about ``target`` triangles
     in all, made in a child; ``label`` as messages call the mesh."""
@@ -87,7 +88,7 @@ def decimated(
     reduced = run_child(
         function="usdbrdf.geometry.mesh_filters:decimate_objects",
         arrays={**given, "joined": none if joined is None else joined},
-        parameters={"target": target},
+        parameters={"target": target, "keep_borders": keep_borders},
         timeout_s=60 + len(triangles) / 2000,
         label=f"{label}: reduction to {target} triangles",
     )

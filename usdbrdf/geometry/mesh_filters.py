@@ -76,8 +76,9 @@ def _repaired(points: Array, triangles: Array) -> tuple[Array, Array, Array]:
 def decimate_objects(
     arrays: Mapping[str, Array], parameters: Mapping[str, Any]
 ) -> dict[str, Array]:
-    """Quadric edge collapse, object by object, to ``target`` triangles in all. Borders are kept,
-    so that objects do not come apart where they touch.
+    """Quadric edge collapse, object by object, to ``target`` triangles in all. With
+    ``keep_borders`` borders stay as they are, so that objects do not come apart where they touch;
+    without they are reduced too, so that few triangles need not all go to them.
 
     points (V, 3) float32; triangles (F, 3) int32; face_object (F,) int32; joined (J,) int32:
     objects whose neighbouring faces share vertices already. Returns the first three anew.
@@ -85,7 +86,7 @@ def decimate_objects(
     import pymeshlab
 
     points, triangles, face_object = (arrays[k] for k in ("points", "triangles", "face_object"))
-    share = parameters["target"] / len(triangles)
+    share, keep = parameters["target"] / len(triangles), bool(parameters["keep_borders"])
     objects = np.unique(face_object)
     parts: list[tuple[Array, Array]] = []
     for index in objects:
@@ -99,7 +100,7 @@ def decimate_objects(
             meshes = pymeshlab.MeshSet()
             meshes.add_mesh(pymeshlab.Mesh(own.astype(np.float64), corners))
             meshes.meshing_decimation_quadric_edge_collapse(
-                targetfacenum=target, preserveboundary=True, boundaryweight=2.0,
+                targetfacenum=target, preserveboundary=keep, boundaryweight=2.0 if keep else 100.0,
                 preservenormal=True, planarquadric=True, autoclean=True,
             )  # fmt: skip
             mesh = meshes.current_mesh()

@@ -27,6 +27,8 @@ class Material:
                None where there is no metal
     lobe       the kind of specular lobe (``transport.brdf``): 0 the paper's, 1 a dielectric's
     clear      light passes as if nothing was there, as through a pane
+    normal     (H, W, 3) float32, normals in tangent space, x along u, y along v; None where there
+               is no such map
     """
 
     diffuse: Float
@@ -38,6 +40,7 @@ class Material:
     metallic: Float | None = None
     lobe: int = 0
     clear: bool = False
+    normal: Float | None = None
 
     @property
     def emits(self) -> bool:

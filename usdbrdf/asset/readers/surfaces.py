@@ -41,6 +41,7 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
     "ior": (1.5,),
     "useSpecularWorkflow": (0.0,),
     "opacity": (1.0,),
+    "normal": (0.0, 0.0, 1.0),
 }
 # "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
 _WRAP = {"repeat": "repeat", "mirror": "mirror"}
@@ -107,7 +108,8 @@ class _MaterialReader:
         kind = DIELECTRIC if MICROFACET in (mapping, lobe) else PAPER
         if kind == DIELECTRIC and known["useSpecularWorkflow"].any():
             kind = CONDUCTOR  # any reflectance, which Fresnel's equations of a dielectric have not
-        return replace(material, wrap=self.wrap or "clamp", lobe=kind, clear=clear)
+        normal = known["normal"] if known["normal"].shape[:2] != (1, 1) else None
+        return replace(material, wrap=self.wrap or "clamp", lobe=kind, clear=clear, normal=normal)
 
     def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""
