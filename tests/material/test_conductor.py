@@ -108,8 +108,8 @@ def _object() -> SceneObject:
 
 def test_a_metal_is_published_as_one():
     found = ObjectFit(
-        0.1, 1.0, 0.01, 0.05, 0.0, 1.0, 0.9, 0.1, 1.0, 1.0, 0.12, 0.9, 0.7, 0.3, 0.01, 0.02, 0.4,
-        500, 3,
+        0.1, 1.0, 0.01, 0.05, 0.0, 1.0, 0.9, 0.1, 1.0, 1.0, 0.05, 0.12, 0.9, 0.7, 0.3, 0.01, 0.02,
+        0.4, 500, 3,
     )  # fmt: skip
     verdict = judged(found, _object(), FitOptions(), True)
     assert (verdict.kind, verdict.status, verdict.phi) == ("conductor", "measured", 0.12)

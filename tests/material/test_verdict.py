@@ -41,6 +41,15 @@ def test_a_measurement_is_published_as_found(evidence: float):
     assert (found.status, found.psi_upper) == ("measured", 0.9)
 
 
+@pytest.mark.parametrize("psi", [0.98, 1.0])
+def test_psi_at_the_end_of_its_range_is_a_bound_and_no_measurement(psi: float):
+    found = verdict_on_views(_lobe(psi=psi, psi_median=0.95), True)
+    assert found.psi == (psi if psi < 1 else 0.95)
+    assert (found.phi, found.phi_confidence) == (0.1, "high")
+    assert found.psi_confidence == ("high" if psi < 1 else "low")
+    assert found.status == ("measured" if psi < 1 else "prior")
+
+
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_nothing_is_told_of_what_views_contradict(share: float):
     found = verdict_on_views(_lobe(contradiction=share * MOST_CONTRADICTED), True)

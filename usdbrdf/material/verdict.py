@@ -247,6 +247,9 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
         return "low" if lobe.evidence >= SOME_EVIDENCE else "none"
 
     sure = confidence(phi_error, MAX_PHI_ERROR), confidence(psi_error, MAX_PSI_ERROR)
+    if lobe.psi >= _PSI_GRID[-2] and sure[1] == "high":
+        # At the end of its range it is only known to be no less.
+        sure = sure[0], "low"
     phi = lobe.phi if sure[0] == "high" else lobe.phi_median
     psi = lobe.psi if sure[1] == "high" else lobe.psi_median
     status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
