@@ -203,3 +203,10 @@ def test_nobody_is_shut_out(opened, page_file, width, scheme):
     found = axe.Axe().run(shown).response["violations"]
     serious = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
     assert serious == [], [node["html"][:200] for v in found for node in v["nodes"]]
+
+
+@pytest.mark.parametrize("width", [1440, 390])
+def test_figures_can_be_read_on_a_screen_of_any_width(opened, page_file, width):
+    shown = opened(page_file.as_uri(), viewport={"width": width, "height": 900})
+    texts = shown.locator("figure svg text").all()
+    assert min(text.bounding_box()["height"] for text in texts) >= 10

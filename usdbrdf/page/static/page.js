@@ -102,7 +102,9 @@
   /* --- Charts -------------------------------------------------------------------------------- */
 
   function chart(title, unit, series, { logarithmic = false, dots = false } = {}) {
-    const [width, height, left, top, bottom] = [520, 200, 54, 10, 34];
+    // On a narrow screen as wide as it is, so that its text keeps its size.
+    const width = matchMedia('(max-width: 600px)').matches ? 340 : 520;
+    const [height, left, top, bottom] = [200, 54, 10, 34];
     const all = series.flatMap((one) => one.points).filter(([, y]) => Number.isFinite(y));
     const figure = el('figure');
     figure.append(el('h3', {}, title));
@@ -120,7 +122,7 @@
       const raw = low + share * (high - low), y = logarithmic ? 10 ** raw : raw;
       drawing.append(
         el('line', { class: 'grid', x1: left, x2: width - 8, y1: py(y), y2: py(y) }),
-        el('text', { x: left - 6, y: py(y) + 4, 'text-anchor': 'end' }, digits(y)));
+        el('text', { x: left - 10, y: py(y) + 4, 'text-anchor': 'end' }, digits(y)));
     }
     drawing.append(
       el('text', { x: left, y: height - 6 }, 'frame 0'),
