@@ -133,10 +133,12 @@ def test_ours_cannot_be_replaced(announce):
     assert [a.origin for a in list_adapters()] == list(adapters.MODULES.values())
 
 
-def test_nothing_recognised_lists_what_would_be(tmp_path):
-    known = r"transforms: .*scanner-app: .*colmap: .*\[adapter.none\]"
-    with pytest.raises(InputRefused, match=known):
+def test_nothing_recognised_says_so_in_a_sentence(tmp_path):
+    (tmp_path / "notes.txt").write_text("of no capture")
+    known = r"it holds neither pictures nor cameras.*`usdbrdf adapters`.*\[adapter.none\]$"
+    with pytest.raises(InputRefused, match=known) as refusal:
         read_scan(tmp_path, IngestOptions())
+    assert len(str(refusal.value).replace(str(tmp_path), "")) < 250
     with pytest.raises(InputRefused, match=r"no such file.*\[capture.missing\]"):
         read_scan(tmp_path / "nowhere", IngestOptions())
     with pytest.raises(UsageError, match=r"'opensfm' is not installed. Use one of eyeful-tower"):

@@ -17,7 +17,7 @@ from usdbrdf.capture.brackets import merge, response_from_brackets
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
-from usdbrdf.files.images import read_exr, write_preview_png
+from usdbrdf.files.images import exif_exposure, read_exr, write_preview_png
 from usdbrdf.options import IngestOptions
 
 EXPOSURES = 16 * 4.0 ** -np.arange(9.0)
@@ -163,12 +163,16 @@ def _bracketed(folder: Path, *, same_poses: bool) -> MadeCapture:
     return capture
 
 
-def _write_photograph(path: Path, codes: np.ndarray, *, time: float) -> None:
+def _write_photograph(
+    path: Path, codes: np.ndarray, *, time: float, stops: float | None = None
+) -> None:
     """With its exposure in its EXIF data alone: at f/2 and ISO 400 it has the given time."""
     spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
     spec.attribute("ExposureTime", float(time))
     spec.attribute("FNumber", 2.0)
     spec.attribute("Exif:PhotographicSensitivity", 400)
+    if stops is not None:
+        spec.attribute("Exif:ShutterSpeedValue", float(stops))
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec)
     assert output.write_image(codes)
@@ -252,3 +256,24 @@ def test_photographs_of_several_exposures_get_one_scale_by_their_exif_data(tmp_p
         pixels = read_frame(scan.frames, i)
         ratios.append(np.median((pixels.radiance / radiance[i])[pixels.valid]))
     np.testing.assert_allclose(ratios, ratios[0], rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("time", "stops", "open_for"),
+    [
+        (1 / 30, 5.0, 1 / 32),
+        (1 / 125, 7.0, 1 / 128),
+        (1 / 1000, 10.0, 1 / 1024),
+        (1 / 80, 6.38, 2 ** -(19 / 3)),  # in eighths of a stop, as some cameras have it
+        (1 / 45, 5.5, 2**-5.5),
+        (1 / 33, float(np.log2(33)), 1 / 33),  # a telephone's, exact
+        (1 / 30, 7.0, 1 / 30),  # which contradict each other
+        (1 / 30, None, 1 / 30),
+    ],
+)
+def test_the_name_of_an_exposure_time_gives_way_to_the_shutters_speed(
+    tmp_path, time, stops, open_for
+):
+    path = tmp_path / "photograph.jpg"
+    _write_photograph(path, np.zeros((4, 4, 3), np.uint8), time=time, stops=stops)
+    assert exif_exposure(path) == pytest.approx(open_for, rel=1e-4)

@@ -8,6 +8,7 @@ USD.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -16,6 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
+from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
 
@@ -60,6 +62,8 @@ DESCRIPTIONS = {
 
 
 GROUP = "usdbrdf.adapters"
+# Folders in a folder that are asked, where it is no capture itself.
+_MOST_BELOW = 100
 
 
 class AdapterModule(Protocol):
@@ -152,11 +156,30 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
             if adapter.name in MODULES:
                 raise
             say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
-    known = "; ".join(f"{adapter.name}: {adapter.description}" for adapter in sound)
+    from usdbrdf.capture.unrecognised import what_lies_there
+
+    with environment_failures(str(path)):
+        below = next(_recognised_below(path, sound), None)
+        said = (
+            f"but {below[0].as_posix()}/ in it is ({below[1].name}). Name that folder"
+            if below
+            else what_lies_there(path)
+        )
     raise InputRefused(
-        f"{path}: not a capture that any adapter recognises ({known}). Name the folder that holds "
-        "the capture, or choose with --adapter. [adapter.none]"
+        f"{path}: not a capture that any adapter recognises: {said}, or choose with --adapter "
+        "(`usdbrdf adapters` says what each of them asks for). [adapter.none]"
     )
+
+
+def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, Adapter]]:
+    """Folders in a folder that one of our adapters recognises, and in these."""
+    if not path.is_dir():
+        return
+    for pattern in ("*/", "*/*/"):
+        for folder in sorted(path.glob(pattern))[:_MOST_BELOW]:
+            for adapter in sound:
+                if adapter.module and adapter.name in MODULES and adapter.module.matches(folder):
+                    yield folder.relative_to(path), adapter
 
 
 def refuse_missing(path: Path) -> None:

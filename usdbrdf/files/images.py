@@ -47,6 +47,10 @@ RAW_SUFFIXES = frozenset((
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
+# Stops between a stated time and a stated shutter's speed: below the first both are exact, as of
+# telephones; beyond the second, which the names on dials do not reach, one of them is wrong.
+_EXACT_STOPS, _ROUNDED_STOPS = 0.005, 0.15
+
 _FOR_A_HEADER = 16 << 20  # bytes
 # As OpenImageIO and the libraries below it put it.
 _WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
@@ -158,14 +162,30 @@ def holds_whole_numbers(path: Path) -> bool:
 def exif_exposure(path: Path) -> float | None:
     """How much light a photograph was given, from its EXIF data: exposure time in seconds times
     ISO / 100, over the square of the f-number; what is not told counts as ISO 100 and f/1. None
-    without an exposure time."""
+    without an exposure time.
+
+    A dial's 1/30 or 1/125 is a name: the shutter opens for 1/32 and 1/128. Where the shutter's
+    speed in stops says so, that is taken, as a whole, half or third stop."""
     spec = open_image(path).spec()
     time = spec.getattribute("ExposureTime")
     number, speed = spec.getattribute("FNumber"), spec.getattribute("Exif:PhotographicSensitivity")
     given = [v if isinstance(v, int | float) and v > 0 else None for v in (time, number, speed)]
     if given[0] is None:
         return None
-    return float(given[0] * (given[2] or 100) / 100 / (given[1] or 1) ** 2)
+    time = _shutter_time(float(given[0]), spec.getattribute("Exif:ShutterSpeedValue"))
+    return float(time * (given[2] or 100) / 100 / (given[1] or 1) ** 2)
+
+
+def _shutter_time(time: float, stops: object) -> float:
+    """For how long a shutter was open whose exposure time is stated, and perhaps its speed: the
+    latter, set to the nearest stop of a dial, where they differ by no more than names do."""
+    if not isinstance(stops, int | float) or not math.isfinite(time):
+        return time
+    if not _EXACT_STOPS < abs(stops + math.log2(time)) < _ROUNDED_STOPS:
+        return time
+    return float(
+        2 ** -min(round(3 * stops) / 3, round(2 * stops) / 2, key=lambda v: abs(v - stops))
+    )
 
 
 def write_exr(

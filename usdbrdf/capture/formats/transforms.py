@@ -16,6 +16,7 @@ from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.named_pictures import Pictured, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
+from usdbrdf.capture.unrecognised import other_program
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
@@ -162,6 +163,8 @@ def _captured(
     document = read_json(source, nonfinite_below=("transform_matrix",))
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        if said := other_program(source):
+            raise InputRefused(f"{source}: {said}. [capture.format]")
         raise InputRefused(
             f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
             "capture's own document. [capture.format]"
