@@ -126,6 +126,28 @@ def test_what_moved_between_the_exposures_is_unknown(bracket):
     assert np.isnan(merged.radiance[outside]).mean() < 0.03
 
 
+def test_blacks_that_a_camera_lifts_contradict_nothing():
+    scene = _scene()
+    codes = _shoot(scene, EXPOSURES)
+    rng = np.random.default_rng(2)
+    for channel, black in ((0, 5), (2, 9)):
+        lifted = black + rng.integers(-1, 2, codes.shape[:3])
+        codes[..., channel] = np.maximum(codes[..., channel], lifted)
+    response = response_from_brackets([codes], [EXPOSURES])
+    darkest, brightest = response.clear()
+    assert (darkest[0] > 5, darkest[2] > 9) == (True, True)
+    assert darkest.max() < 20
+    assert brightest.min() > 230
+    merged = merge(codes, EXPOSURES, response)
+    assert merged.ghost < 0.03
+    known = np.isfinite(merged.radiance) & (merged.radiance < merged.saturation)
+    known &= merged.radiance >= merged.noise_floor
+    assert known.mean() > 0.95
+    ratio = np.where(known, merged.radiance / scene, np.nan)
+    ratio /= np.nanmedian(ratio, axis=(0, 1))
+    assert np.nanmedian(np.abs(ratio - 1)) < 0.02
+
+
 def test_one_exposure_tells_no_response():
     codes = _shoot(_scene(), EXPOSURES[:1])
     with pytest.raises(InputRefused, match=r"\[brackets\.response\]$"):

@@ -26,8 +26,9 @@ _MIDDLE = 128
 _SMOOTH = calibration.number("brackets.smooth")
 _GHOST = calibration.number("brackets.ghost")
 _SPREAD = calibration.number("brackets.spread")
+_VAGUE = calibration.number("brackets.vague")
 # Pixels of each code that one bracket gives to the fit, and rounds of its reweighting.
-_PER_CODE, _ROUNDS = 12, 3
+_PER_CODE, _ROUNDS = 24, 3
 # Share of a pixel and its eight neighbours that noise alone reaches.
 _ALONE = 2.5 / 9
 # Codes over which errors are taken together.
@@ -44,6 +45,16 @@ class Response(NamedTuple):
 
     logarithm: Double
     error: Double
+
+    def clear(self) -> Int:
+        """(2, 3), of each channel the darkest and the brightest code that tells how much. Cameras
+        lift their blacks, and bend what is nearly white, differently in each channel: such codes
+        stand for anything."""
+        ends = []
+        for error in self.error:
+            told = np.flatnonzero(error[DARK_CODE : BRIGHT_CODE + 1] <= _VAGUE) + DARK_CODE
+            ends.append((told.min(initial=_MIDDLE), told.max(initial=_MIDDLE)))
+        return np.array(ends, np.int32).T
 
 
 class Merged(NamedTuple):
@@ -91,19 +102,22 @@ def _tells(codes: Byte) -> Bool:
 
 
 def _samples(stack: Byte) -> Byte:
-    """(K, P) codes of some pixels of (K, H, W): of each exposure's codes the same number, those in
-    the evenest places, which a shift by a part of a pixel does not change."""
+    """(K, P) codes of some pixels of (K, H, W): of each exposure's codes the same number, spread
+    over the evener half of its places, which a shift by a part of a pixel does not change. The
+    evenest alone may all be one thing, as a screen, whose colour no channel tells by itself."""
     edge = np.zeros(stack.shape[1:])
     for picture in stack.astype(np.float64):
         across, down = np.gradient(picture)
         edge += np.hypot(across, down)
     order = np.argsort(edge.ravel(), kind="stable")
     flat = stack.reshape(len(stack), -1)[:, order]
-    chosen = [
-        np.flatnonzero(exposure == code)[:_PER_CODE]
-        for exposure in flat
-        for code in range(DARK_CODE, BRIGHT_CODE + 1)
-    ]
+    chosen = []
+    for exposure in flat:
+        for code in range(DARK_CODE, BRIGHT_CODE + 1):
+            places = np.flatnonzero(exposure == code)
+            even = places[: max(_PER_CODE, len(places) // 2)]
+            few = np.linspace(0, len(even) - 1, min(_PER_CODE, len(even))).astype(np.int32)
+            chosen.append(even[few])
     return flat[:, np.unique(np.concatenate(chosen))]
 
 
@@ -192,15 +206,18 @@ def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | Non
     channel = np.arange(3)
     logs = response.logarithm[channel, stack] - np.log(exposures)[:, None, None, None]
     error = response.error[channel, stack]
-    tells, over, under = _tells(stack) & ~silent, stack > BRIGHT_CODE, stack < DARK_CODE
+    darkest, brightest = response.clear()
+    over, under = stack > brightest, stack < darkest
+    tells = ~over & ~under & ~silent
     weight = tells / error**2
     total = weight.sum(axis=0)
     known = total > 0
     mean = (weight * logs).sum(axis=0) / np.where(known, total, 1)
     against = (tells & (np.abs(logs - mean) > _GHOST * error)).any(axis=0)
-    ends = response.logarithm[:, [DARK_CODE, BRIGHT_CODE]]
+    limits = np.array([darkest, brightest]).T
+    ends = np.take_along_axis(response.logarithm, limits, axis=1)
     # What clips in an exposure, or is dark in it, is a bound on what the others say.
-    reach = _GHOST * response.error[:, [DARK_CODE, BRIGHT_CODE]]
+    reach = _GHOST * np.take_along_axis(response.error, limits, axis=1)
     exposed = mean + np.log(exposures)[:, None, None, None]
     against |= known & (over & ~silent & (exposed < (ends - reach)[:, 1])).any(axis=0)
     against |= known & (under & ~silent & (exposed > (ends + reach)[:, 0])).any(axis=0)
