@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.surfaces import metres_from_units, read_texture, surfaces_from_stage
@@ -372,7 +372,9 @@ def _author_mesh(prim: Usd.Prim, own: Scene) -> None:
     mesh.CreateNormalsAttr(_unit(normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     st = primvars.CreatePrimvar("st", Types.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    st.Set(own.corner_uv[:, order].reshape(-1, 2).astype(np.float32))
+    values, index = np.unique(own.corner_uv[:, order].reshape(-1, 2), axis=0, return_inverse=True)
+    st.Set(values.astype(np.float32))
+    st.SetIndices(Vt.IntArray.FromNumpy(index.reshape(-1).astype(np.int32)))
 
 
 def _measure_boxes(flat: Usd.Stage) -> None:
