@@ -434,7 +434,7 @@ class FittedObject(MeasuredObject):
             return []
         return [
             f"{self.identifier}: between views its light differs by {self.contradiction:.0%}, as "
-            "no surface's does, so nothing is told of its lobe. If it is glass, say so by a "
+            "no surface's does, so its lobe is not measured. If it is glass, say so by a "
             "directive. [fit.contradicted]"
         ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -226,12 +226,11 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     done; phi's grows also by what the lobe leaves unexplained. Where they do not determine both
     numbers, the medians of what remains likely are published: no highlight is knowledge too.
     What is seen through a thing, or in it, changes with the view as no lobe does: then the numbers
-    are none of a surface's, and nothing is known. Names and classes of objects tell nothing here.
+    are none of a surface's and not measured; they stay, for what shows resembles the views more
+    than what has no lobe. Names and classes of objects tell nothing here.
     """
     if lobe is None:
         return _not_asked(seen)
-    if lobe.contradiction > MOST_CONTRADICTED:
-        return replace(_not_asked(seen), contradiction=lobe.contradiction)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
     unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
     phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)
@@ -254,7 +253,14 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     psi = lobe.psi if sure[1] == "high" else lobe.psi_median
     status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
     upper = max(lobe.psi_upper, psi)
-    return Verdict(phi, psi, float(phi_error), float(psi_error), status, *sure, psi_upper=upper)
+    contradiction = math.nan
+    if lobe.contradiction > MOST_CONTRADICTED:
+        contradiction, status = lobe.contradiction, "prior" if seen else "unseen"
+        sure = "none", "none"
+    return Verdict(
+        phi, psi, float(phi_error), float(psi_error), status, *sure,
+        psi_upper=upper, contradiction=contradiction,
+    )  # fmt: skip
 
 
 def verdict_on_metal(
