@@ -1,13 +1,13 @@
 """Sound assets have no findings; unsound ones say what is wrong."""
 
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Usd
 
 from tests.validation.faults import edited, opinion
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.cli import main
 from usdbrdf.validation.rule import Severity
-from usdbrdf.validation.validate import has_errors, listed_rules, validate
+from usdbrdf.validation.validate import has_errors, listed_rules, own_findings, validate
 
 
 @pytest.mark.parametrize("upto", ROLES)
@@ -132,3 +132,26 @@ def test_nodes_of_materialx_count_as_known(built, identifier, known):
     found = [f.rule for f in validate(built.asset.root_layer)]
     name = "usdShadeValidators:ShaderSdrCompliance.MissingShaderIdInRegistry"
     assert found == ([] if known else [name])
+
+
+def test_what_a_package_names_is_looked_for_in_it(tmp_path):
+    """Its thumbnail too, which only metadata name."""
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "one.usda"))
+    prim = Sdf.CreatePrimInLayer(layer, "/one")
+    layer.defaultPrim, prim.specifier = "one", Sdf.SpecifierDef
+    inside = Sdf.AssetPath("./shown.png")
+    prim.SetInfo("assetInfo", {"previews": {"thumbnails": {"default": {"defaultImage": inside}}}})
+    layer.Save()
+    (tmp_path / "shown.png").write_bytes(b"a picture")
+    for name, members in (("whole", ["one.usda", "shown.png"]), ("lacking", ["one.usda"])):
+        writer = Sdf.ZipFileWriter.CreateNew(str(tmp_path / f"{name}.usdz"))
+        for member in members:
+            writer.AddFile(str(tmp_path / member), member)
+        writer.Save()
+    (tmp_path / "shown.png").unlink()
+    rules = {
+        name: [f.rule for f in own_findings(Usd.Stage.Open(str(tmp_path / f"{name}.usdz")))]
+        for name in ("whole", "lacking")
+    }
+    assert "usdbrdf.MissingTexture" not in rules["whole"]
+    assert "usdbrdf.MissingTexture" in rules["lacking"]

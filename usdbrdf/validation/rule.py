@@ -172,7 +172,10 @@ def record_of(layer: Sdf.Layer) -> dict[str, Any]:
 
 
 def located(layer: Sdf.Layer, asset_path: str) -> Path:
-    """Where a path that a layer names leads, whether or not there is a file."""
+    """Where a path that a layer names leads, whether or not there is a file; of one in a package
+    into that."""
+    if layer.GetFileFormat().IsPackage() or Ar.IsPackageRelativePath(layer.realPath):
+        return Path(layer.ComputeAbsolutePath(asset_path))
     return Path(os.path.normpath(Path(layer.realPath).parent / asset_path))
 
 
