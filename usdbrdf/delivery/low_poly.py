@@ -17,7 +17,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.surfaces import metres_from_units, read_texture, surfaces_from_stage
-from usdbrdf.delivery.packaged_files import TextureUse, set_input, texture_uses
+from usdbrdf.delivery.packaged_files import TextureUse, produced, set_input, texture_uses
 from usdbrdf.files.images import image_size, needs_float, write_exr
 from usdbrdf.geometry.mesh_clean import decimated
 from usdbrdf.geometry.normal_maps import (
@@ -146,6 +146,10 @@ def _material(
     others = [binding.ComputeBoundMaterial(purpose)[0] for purpose in _PURPOSES]
     shader = material.ComputeSurfaceSource()[0] if material else None
     points = UsdGeom.Mesh(prim).GetPointsAttr()
+    below = (
+        [UsdShade.Shader(each) for each in Usd.PrimRange(material.GetPrim())] if material else []
+    )
+    coordinates = {_where(node) for node in below if node.GetShaderId() == "UsdUVTexture"}
     problems = {
         "has several materials": divided,
         "has no UsdPreviewSurface": not shader or shader.GetShaderId() != "UsdPreviewSurface",
@@ -153,6 +157,13 @@ def _material(
             other and other.GetPath() != material.GetPath() for other in others
         ),
         "shows colours of its vertices": surface.corner_colour is not None,
+        "reads values of its vertices": any(
+            str(node.GetShaderId()).startswith("UsdPrimvarReader_")
+            and node.GetShaderId() != "UsdPrimvarReader_float2"
+            for node in below
+        ),
+        "has textures at several coordinates": len(coordinates) > 1,
+        "has textures and no coordinates": bool(coordinates) and surface.corner_uv is None,
         "has a texture whose alpha is used": bool(material)
         and any(path.HasPrefix(material.GetPath()) for path in alpha),
         "is animated": points.GetNumTimeSamples() > 1,
@@ -161,6 +172,17 @@ def _material(
     }
     why = next((said for said, found in problems.items() if found), "")
     return (None, why) if why else (material, "")
+
+
+def _where(node: UsdShade.Shader, name: str = "st") -> tuple[object, ...]:
+    """What a texture's coordinates are made of."""
+    wanted = node.GetInput(name)
+    sources = wanted.GetConnectedSources()[0] if wanted else []
+    if not sources:
+        return ()
+    source = UsdShade.Shader(sources[0].source.GetPrim())
+    told = [str(produced(source, n)) for n in ("varname", "rotation", "scale", "translation")]
+    return (source.GetShaderId(), *told, *_where(source, "in"))
 
 
 def _copied(flat: Usd.Stage, mesh: str, material: UsdShade.Material) -> UsdShade.Material | None:
@@ -267,12 +289,12 @@ def _replace(
     st.CreateIdAttr("UsdPrimvarReader_float2")
     set_input(st, "varname", Types.String, "st")
     wrap = part.surface.material.wrap
-    for use in _of_material(part.material, uses):
+    for number, use in enumerate(_of_material(part.material, uses)):
         if baked.uv is None or "normal" in use.feeds:
             continue
         channels = 3 if len(image_size(use.file)[2]) >= 3 else 1
         pixels = sampled(read_texture(use.file, use.space)[..., :channels], baked.uv, wrap)
-        file = folder / f"{use.file.stem}.exr"
+        file = folder / f"{number:02d}.{use.file.stem}.exr"
         encoding = "lin_rec709_scene" if use.colour else "data"
         picture = baked.texels.image(0, pixels)
         write_exr(file, picture, half=not needs_float(picture), encoding=encoding)

@@ -41,7 +41,6 @@ _FALLBACKS: dict[str, tuple[float, ...]] = {
     "ior": (1.5,),
     "useSpecularWorkflow": (0.0,),
     "opacity": (1.0,),
-    "normal": (0.0, 0.0, 1.0),
 }
 # "black" and its synonym "useMetadata" are the same as "clamp" but beyond uv of 0 to 1.
 _WRAP = {"repeat": "repeat", "mirror": "mirror"}
@@ -108,8 +107,26 @@ class _MaterialReader:
         kind = DIELECTRIC if MICROFACET in (mapping, lobe) else PAPER
         if kind == DIELECTRIC and known["useSpecularWorkflow"].any():
             kind = CONDUCTOR  # any reflectance, which Fresnel's equations of a dielectric have not
-        normal = known["normal"] if known["normal"].shape[:2] != (1, 1) else None
+        normal = self._normal(shader.GetInput("normal") if shader else None)
         return replace(material, wrap=self.wrap or "clamp", lobe=kind, clear=clear, normal=normal)
+
+    def _normal(self, wanted: UsdShade.Input | None) -> Float | None:
+        """(H, W, 3): a map of normals that lies as the other maps do; None without one."""
+        own = _MaterialReader(time=self.time, warn=self.warn)
+        found = own._read(wanted, (0.0, 0.0, 1.0))
+        if found.shape[:2] == (1, 1):
+            return None
+        if not self.uv_primvar:
+            self.uv_primvar, self.uv_from_st, self.wrap = own.uv_primvar, own.uv_from_st, own.wrap
+        here, there = (np.eye(3) if m is None else m for m in (self.uv_from_st, own.uv_from_st))
+        if own.uv_primvar == self.uv_primvar and np.array_equal(here, there):
+            return found
+        assert wanted is not None
+        self.warn(
+            f"<{wanted.GetAttr().GetPath()}>: the map of normals has other coordinates than the "
+            "material's other maps, and is not shown."
+        )
+        return None
 
     def _read(self, wanted: UsdShade.Input | None, fallback: tuple[float, ...]) -> Float:
         """(H, W, 1 or 3) float32: a texture's texels, or 1 x 1 of a constant."""
