@@ -202,6 +202,60 @@ def test_meshes_whose_maps_cannot_be_carried_over_stay(with_ball, tmp_path, caps
     assert re.search(r"stay as they are: </room/ball> has a texture whose alpha is used\.", told)
 
 
+def _with_roughness(room, file, *, scale=None, kind="UsdUVTexture"):
+    """A roughness that a node of its own reads, at coordinates scaled by ``scale``."""
+    layer = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    stage = Usd.Stage.Open(layer)
+    node = UsdShade.Shader.Define(stage, "/room/varnish/Rough")
+    node.CreateIdAttr(kind)
+    if kind == "UsdUVTexture":
+        node.CreateInput("file", Types.Asset).Set(f"./{file}")
+        node.CreateInput("sourceColorSpace", Types.Token).Set("raw")
+        node.CreateInput("wrapS", Types.Token).Set("repeat")
+        node.CreateInput("wrapT", Types.Token).Set("repeat")
+    source = UsdShade.Shader(stage.GetPrimAtPath("/room/varnish/Reader"))
+    if scale:
+        turned = UsdShade.Shader.Define(stage, "/room/varnish/Turned")
+        turned.CreateIdAttr("UsdTransform2d")
+        turned.CreateInput("scale", Types.Float2).Set(Gf.Vec2f(scale))
+        turned.CreateInput("in", Types.Float2).ConnectToSource(source.ConnectableAPI(), "result")
+        source = turned
+    node.CreateInput("st", Types.Float2).ConnectToSource(source.ConnectableAPI(), "result")
+    shader = UsdShade.Shader(stage.GetPrimAtPath("/room/varnish/Surface"))
+    rough = shader.CreateInput("roughness", Types.Float)
+    rough.ConnectToSource(node.ConnectableAPI(), "r" if kind == "UsdUVTexture" else "result")
+    layer.Save()
+
+
+def test_textures_of_one_name_stay_apart(with_ball, tmp_path):
+    (with_ball.asset.folder / "textures/rough").mkdir()
+    picture = np.full((8, 8, 3), 0.9, np.float32)
+    write_exr(with_ball.asset.folder / "textures/rough/ball.exr", picture)
+    _with_roughness(with_ball, "textures/rough/ball.exr")
+    package(with_ball.asset.folder, tmp_path / "low.glb", PackageOptions(low_poly=1000))
+    package(with_ball.asset.folder, tmp_path / "low.usdz", PackageOptions(low_poly=1000))
+    stage = Usd.Stage.Open(str(tmp_path / "low.usdz"))
+    files = {
+        str(UsdShade.Shader(prim).GetInput("file").Get().path)
+        for prim in Usd.PrimRange(stage.GetPrimAtPath("/room/varnish"))
+        if UsdShade.Shader(prim).GetShaderId() == "UsdUVTexture"
+    }
+    assert len(files) == 3  # colour, roughness, normals
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"scale": 4.0}, "has textures at several coordinates"),
+        ({"kind": "UsdPrimvarReader_float"}, "reads values of its vertices"),
+    ],
+)
+def test_what_has_no_one_place_on_the_coarse_mesh_stays(with_ball, tmp_path, capsys, change, told):
+    _with_roughness(with_ball, "textures/ball.exr", **change)
+    package(with_ball.asset.folder, tmp_path / "low.usdz", PackageOptions(low_poly=1000))
+    assert f"stay as they are: </room/ball> {told}." in capsys.readouterr().err
+
+
 def test_an_asset_of_few_triangles_stays(room, tmp_path, capsys):
     found = package(room.asset.folder, tmp_path / "low.usdz", PackageOptions(low_poly=1000))
     assert found["triangles"] == 36
