@@ -13,7 +13,7 @@ from tests.json_schemas import checked
 from tests.scenes import MadeCapture, edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.alignment import aligned
-from usdbrdf.capture.brackets import merge, response_from_brackets
+from usdbrdf.capture.brackets import Merged, merge, response_from_brackets
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
@@ -82,15 +82,21 @@ def test_the_response_is_the_cameras(bracket):
         assert np.median(np.abs(off)) < 0.01
 
 
+def _against(merged: Merged, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of what was merged, which is known, and its ratio to the truth, NaN elsewhere, up to one
+    scale per channel."""
+    known = np.isfinite(merged.radiance) & (merged.radiance < merged.saturation)
+    known &= merged.radiance >= merged.noise_floor
+    ratio = np.where(known, merged.radiance / true, np.nan)
+    return known, ratio / np.nanmedian(ratio, axis=(0, 1))
+
+
 def test_radiance_over_five_decades_is_true_to_two_per_cent(bracket):
     scene, codes, response = bracket
     merged = merge(codes, EXPOSURES, response)
-    known = np.isfinite(merged.radiance) & (merged.radiance < merged.saturation)
-    known &= merged.radiance >= merged.noise_floor
+    known, ratio = _against(merged, scene)
     assert known.mean() > 0.97
     assert merged.ghost < 0.03
-    ratio = np.where(known, merged.radiance / scene, np.nan)
-    ratio /= np.nanmedian(ratio, axis=(0, 1))
     for decade in range(5):
         own = (scene >= 10.0**decade) & (scene < 10.0 ** (decade + 1))
         assert np.nanmedian(np.abs(ratio[own] - 1)) < 0.02, decade
@@ -140,11 +146,8 @@ def test_blacks_that_a_camera_lifts_contradict_nothing():
     assert brightest.min() > 230
     merged = merge(codes, EXPOSURES, response)
     assert merged.ghost < 0.03
-    known = np.isfinite(merged.radiance) & (merged.radiance < merged.saturation)
-    known &= merged.radiance >= merged.noise_floor
+    known, ratio = _against(merged, scene)
     assert known.mean() > 0.95
-    ratio = np.where(known, merged.radiance / scene, np.nan)
-    ratio /= np.nanmedian(ratio, axis=(0, 1))
     assert np.nanmedian(np.abs(ratio - 1)) < 0.02
 
 

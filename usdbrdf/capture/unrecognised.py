@@ -41,20 +41,20 @@ _PROGRAMS = (
         "Read them with the example of an adapter, plugins/example_adapter of our sources",
     ),
     _Program("VisualSFM", (".nvm",), (), b"NVM_V3", _ANEW),
-    _Program("Bundler", (".out",), (), b"# Bundle file", _ANEW),
+    # What says nothing but .out, its suffix, may be a text of any kind.
+    _Program("Bundler", (), (), b"# Bundle file", _ANEW),
 )  # fmt: skip
 
 
 def other_program(document: Path) -> str:
     """Whose cameras a file holds that are not read, and how to have them read; else ""."""
-    from usdbrdf.files.documents import first_bytes
+    from usdbrdf.files.tables import beginning_of
 
-    head = first_bytes(document, _HEAD)
+    head = beginning_of(document, _HEAD)
     name, suffix = document.name.lower(), document.suffix.lower()
     for one in _PROGRAMS:
-        own = suffix in one.suffixes or (suffix == ".json" and name.startswith(one.names or "/"))
-        # What says nothing but its suffix may be a text of any kind.
-        if one.says in head or (own and suffix != ".out"):
+        own = suffix in one.suffixes or (suffix == ".json" and name.startswith(one.names))
+        if own or one.says in head:
             return f"{document.name} holds the cameras of {one.name}, which are not read. {one.how}"
     return ""
 

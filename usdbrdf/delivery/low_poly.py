@@ -29,6 +29,7 @@ from usdbrdf.geometry.normal_maps import (
     nearest_of,
     sampled,
     seen_along_normals,
+    unit,
 )
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.texels import texels_from_atlas
@@ -335,7 +336,7 @@ def _baked(surface: Surface, own: Scene, resolution: Int) -> _Baked | None:
     if not met.any():
         return None
     hits = at(hits, nearest_of(texels.position, met))
-    normals = _unit(interpolated(surface.corner_normals, hits))
+    normals = unit(interpolated(surface.corner_normals, hits))
     uv = None if surface.corner_uv is None else interpolated(surface.corner_uv, hits)
     bumps = surface.material.normal
     if bumps is not None and surface.corner_uv is not None and uv is not None:
@@ -349,11 +350,6 @@ def _baked(surface: Surface, own: Scene, resolution: Int) -> _Baked | None:
     local = in_tangent_space(normals, texels.normal, at_texels)
     local[~met] = (0, 0, 1)
     return _Baked(texels, uv, local)
-
-
-def _unit(vectors: Float) -> Float:
-    size = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(size, 1e-30), np.float32)
 
 
 def _world_from_local(prim: Usd.Prim) -> Double:
@@ -391,7 +387,7 @@ def _author_mesh(prim: Usd.Prim, own: Scene) -> None:
     mesh.CreateExtentAttr(np.stack([points.min(axis=0), points.max(axis=0)]))
     mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateNormalsAttr(_unit(normals.astype(np.float32)))
+    mesh.CreateNormalsAttr(unit(normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     st = primvars.CreatePrimvar("st", Types.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     values, index = np.unique(own.corner_uv[:, order].reshape(-1, 2), axis=0, return_inverse=True)

@@ -127,12 +127,6 @@ def read_text(path: Path) -> str:
         ) from error
 
 
-def first_bytes(path: Path, number: int) -> bytes:
-    """What a file begins with."""
-    with path.open("rb") as stored:
-        return stored.read(number)
-
-
 def _parsed(text: str, number: Callable[[str], float]) -> Any:
     return json.loads(
         text,

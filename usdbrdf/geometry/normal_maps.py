@@ -123,7 +123,11 @@ def from_tangent_space(local: Float, normals: Float, tangents: Float) -> Float:
     """The inverse of ``in_tangent_space``, as a renderer does it: (R, 3) float32, unit."""
     t, b = _frame(normals, tangents)
     x, y, z = (local[:, k, None] for k in range(3))
-    vectors = x * t + y * b + z * normals
+    return unit(x * t + y * b + z * normals)
+
+
+def unit(vectors: Float | Double) -> Float:
+    """(R, 3) float32: vectors at length 1; zero stays."""
     size = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(size, 1e-30), np.float32)
 

@@ -251,15 +251,13 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
         sure = sure[0], "low"
     phi = lobe.phi if sure[0] == "high" else lobe.phi_median
     psi = lobe.psi if sure[1] == "high" else lobe.psi_median
-    status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
-    upper = max(lobe.psi_upper, psi)
     contradiction = math.nan
     if lobe.contradiction > MOST_CONTRADICTED:
-        contradiction, status = lobe.contradiction, "prior" if seen else "unseen"
-        sure = "none", "none"
+        contradiction, sure = lobe.contradiction, ("none", "none")
+    status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
     return Verdict(
         phi, psi, float(phi_error), float(psi_error), status, *sure,
-        psi_upper=upper, contradiction=contradiction,
+        psi_upper=max(lobe.psi_upper, psi), contradiction=contradiction,
     )  # fmt: skip
 
 

@@ -133,7 +133,9 @@ def _solved_channel(
 
     # (M, N): sums over the texels of each segment.
     texels = np.arange(len(asked.segment))
-    gather = sparse.csr_matrix((np.ones(len(texels)), (asked.segment, texels)))
+    gather = sparse.csr_matrix(
+        (np.ones(len(texels)), (asked.segment, texels)), shape=(num_segments, len(texels))
+    )
 
     for _ in range(iterations):
         brought = np.exp(g)[:, None] * sources.share
@@ -155,8 +157,7 @@ def _solved_channel(
         parts = by_albedo * weight, by_gloss * weight
         for place, part in zip((of_albedo, of_gloss), parts, strict=True):
             both = gather @ (by_source * part).T
-            curvature[place[:, None], np.arange(num_sources)] = both
-            curvature[np.arange(num_sources)[:, None], place] = both.T
+            curvature[place, :num_sources], curvature[:num_sources, place] = both, both.T
             gradient[place] = gather @ (part * residual)
         curvature[of_albedo, of_albedo] = gather @ (by_albedo * parts[0])
         curvature[of_gloss, of_gloss] = gather @ (by_gloss * parts[1])
