@@ -227,13 +227,14 @@ def _with_roughness(room, file, *, scale=None, kind="UsdUVTexture"):
     layer.Save()
 
 
-def test_textures_of_one_name_stay_apart(with_ball, tmp_path):
+def test_textures_of_one_name_stay_apart(with_ball, tmp_path, capfd):
     (with_ball.asset.folder / "textures/rough").mkdir()
     picture = np.full((8, 8, 3), 0.9, np.float32)
     write_exr(with_ball.asset.folder / "textures/rough/ball.exr", picture)
     _with_roughness(with_ball, "textures/rough/ball.exr")
     package(with_ball.asset.folder, tmp_path / "low.glb", PackageOptions(low_poly=1000))
     package(with_ball.asset.folder, tmp_path / "low.usdz", PackageOptions(low_poly=1000))
+    assert "Warning: in" not in capfd.readouterr().err  # USD has nothing to say
     stage = Usd.Stage.Open(str(tmp_path / "low.usdz"))
     files = {
         str(UsdShade.Shader(prim).GetInput("file").Get().path)

@@ -147,9 +147,8 @@ def _material(
     others = [binding.ComputeBoundMaterial(purpose)[0] for purpose in _PURPOSES]
     shader = material.ComputeSurfaceSource()[0] if material else None
     points = UsdGeom.Mesh(prim).GetPointsAttr()
-    below = (
-        [UsdShade.Shader(each) for each in Usd.PrimRange(material.GetPrim())] if material else []
-    )
+    inside = Usd.PrimRange(material.GetPrim()) if material else []
+    below = [UsdShade.Shader(each) for each in inside if each.IsA(UsdShade.Shader)]
     coordinates = {_where(node) for node in below if node.GetShaderId() == "UsdUVTexture"}
     problems = {
         "has several materials": divided,
