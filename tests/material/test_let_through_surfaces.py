@@ -10,7 +10,7 @@ import pytest
 
 from tests.physics.surfaces import quad, room, world_of
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material.refine import Lobes, let_through_surfaces
+from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.environment import Environment, Sun
 from usdbrdf.transport.let_through import share_let_through

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import box, quad, world_of
-from usdbrdf.material.sample_specular import specular_of_samples, with_whole_tiles
+from usdbrdf.material.sample_specular import TILE_SIDE, specular_of_samples
+from usdbrdf.texturing.passes import with_rows_beside
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.lit_scene import SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance
@@ -71,7 +72,7 @@ def test_what_a_texel_gets_does_not_depend_on_its_group(room, stop: int):
     lit = _lit(room)
     whole = _found(lit, every, 0.5)
     for part in (slice(0, stop), slice(stop, len(every))):
-        widened = with_whole_tiles(room.texels, part)
+        widened = with_rows_beside(room.texels, part, TILE_SIDE)
         assert widened.start <= part.start
         assert widened.stop >= part.stop
         assert widened.stop - widened.start <= part.stop - part.start + 2 * SIDE * 42

@@ -3,16 +3,11 @@
 The median of the frames keeps the specular reflection that is seen from everywhere: by 2 to 130 %
 it made albedos too large. With the lobes known it can be taken off every single sample, by ray
 tracing. What is left are samples of one number with known errors: so their robust mean takes the
-place of the median, and what the pixels blurred is restored where it stands above the noise.
-
-The lit texture as a light has three faults: it holds the specular light that most views have in
-common, as if it went everywhere; it lacks the light that lobes send elsewhere; and where nobody
-looked it is as bright as the nearest surface that was seen, though such places are mostly dark.
-What their cure changes is small against S, so few rays do."""
+place of the median, and what the pixels blurred is restored where it stands above the noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -20,18 +15,18 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from usdbrdf import calibration
+from usdbrdf.ahead import ahead
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material.sample_specular import specular_of_samples, with_whole_tiles
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces, refined_irradiance
+from usdbrdf.material.sample_specular import TILE_SIDE, specular_of_samples
+from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.options import Sampling
 from usdbrdf.shading.base_color import Reflection, base_color_of
-from usdbrdf.shading.shaded import by_tiles, denoised_irradiance
-from usdbrdf.texturing.footprints import footprints, restored, widest
+from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import samples_from_frames, spread_order
 from usdbrdf.texturing.passes import (
@@ -40,144 +35,22 @@ from usdbrdf.texturing.passes import (
     groups_of_texels,
     in_passes,
     smallest_groups,
+    with_rows_beside,
+)
+from usdbrdf.texturing.patterns import (
+    BYTES_OF_EQUATIONS,
+    Covering,
+    PatternedSurface,
+    pixels_of_frame,
+    with_patterns,
 )
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
-from usdbrdf.texturing.samples import MIN_COSINE
+from usdbrdf.texturing.samples import MIN_COSINE, Picture
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
-from usdbrdf.transport.environment import black_environment
-from usdbrdf.transport.irradiance import ByAngle, irradiance_at
-from usdbrdf.transport.let_through import share_let_through, share_seen, table_let_through
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.let_through import share_let_through, share_seen
 from usdbrdf.transport.lit_scene import LitScene
-from usdbrdf.transport.lobe_radiance import specular_irradiance
-from usdbrdf.transport.sunlight import sunlight
-from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
-
-# Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
-# the specular light, with so many again from where each of them ends.
-_DIFFUSE_RAYS = 64
-_SPECULAR_RAYS, _RAYS_OF_LOBE = 8, 4
-# Not the seed of the irradiance as traced: their errors must not add up.
-_SEED = 0x5EED
-
-
-@dataclass(frozen=True)
-class Lobes:
-    """One lobe per object: phi (num_objects,), psi (num_objects, 3) float32; conducts
-    (num_objects,): it is a metal's, and there is no diffuse part."""
-
-    phi: Float
-    psi: Float
-    conducts: Bool
-
-    def take(self, index: Int) -> Lobes:
-        return Lobes(self.phi[index], self.psi[index], self.conducts[index])
-
-
-class _Change(NamedTuple):
-    """What of the light is other than traced before: ``radiance`` by its texture, ``lights`` where
-    that shows, and the specular light of ``lobes``."""
-
-    lit: LitScene
-    radiance: SurfaceTexture
-    lights: Lights
-    lobes: Lobes
-    sampling: Sampling
-
-
-def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Array]:
-    """By how much S of some texels is other."""
-    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
-    position, normal = texels.position[index], texels.normal[index]
-    diffuse = irradiance_at(
-        lit.rays, given.radiance, given.lights, black_environment(), position, normal, patch,
-        given.sampling, lit.diagonal_m,
-    )  # fmt: skip
-    specular = specular_irradiance(
-        lit, position, normal, index, lobes.phi, lobes.psi,
-        rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=given.sampling.seed,
-    )  # fmt: skip
-    return {"change": diffuse.mean + specular}
-
-
-def refined_irradiance(
-    run: TaskRun,
-    lit: LitScene,
-    traced: Float,
-    change: Float,
-    lobes: Lobes,
-    lightmap_filter: str,
-    seed: int,
-) -> Float:
-    """S (T, 3), W/m^2: as ``traced`` (T, 3) from the lit texture, with what changes if the light is
-    other by ``change`` (T, 3), W/(m^2 sr), and the lobes are light as well."""
-    texels, seed = lit.texels, seed ^ _SEED
-    texture = lit.radiance.showing(texels, change)
-    lights = lights_from_radiance(lit.scene, texels, np.abs(change))
-    sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
-
-    given = _Change(lit, texture, lights, lobes, sampling)
-    found = by_tiles(run, texels, "refined", "fit: shade", _changed_irradiance, given)["change"]
-    refined = np.maximum(traced + np.asarray(found, np.float32), 0)
-    return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
-
-
-class _Scattering(NamedTuple):
-    """What light goes in by: ``radiance`` of all surfaces by its texture, ``lights`` where that is
-    bright, and by how much it ``differs`` from S at each angle (num_objects, C) of the objects that
-    are ``passing`` (num_objects,) some of it; owner (T,): the object of each texel."""
-
-    lit: LitScene
-    radiance: SurfaceTexture
-    lights: Lights
-    lobes: Lobes
-    sampling: Sampling
-    differs: Float
-    passing: Bool
-    owner: Int
-
-
-def _scattered(given: _Scattering, index: Long, patch: Int) -> dict[str, Array]:
-    """By how much the light that some texels scatter differs from S."""
-    lit, lobes, texels = given.lit, given.lobes, given.lit.texels
-    owner = given.owner[index]
-    found, own = np.zeros((len(index), 3), np.float32), given.passing[owner]
-    inner, surface = index[own], owner[own]
-    if len(inner):
-        normal, sun = texels.normal[inner], lit.environment.sun
-        found[own] = irradiance_at(
-            lit.rays, given.radiance, given.lights, lit.environment, texels.position[inner], normal,
-            patch[own], given.sampling, lit.diagonal_m, by_angle=ByAngle(given.differs, surface),
-        ).mean  # fmt: skip
-        of_sun = share_let_through(lobes.phi[surface], lobes.psi[surface], normal @ sun.direction)
-        found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, given.sampling.seed)
-    return {"differs": found}
-
-
-def let_through_surfaces(
-    run: TaskRun, lit: LitScene, light: Float, lobes: Lobes, seed: int
-) -> Float:
-    """By how much (T, 3), W/m^2, the light that dielectrics scatter below their surface differs
-    from S: they let through what comes from the front, and mostly reflect what grazes them; see
-    ``let_through``. light (T, 3): what all surfaces send out, W/(m^2 sr)."""
-    texels = lit.texels
-    passing = ~lobes.conducts & (lobes.psi.mean(axis=1) > 0) & (lit.lobe == DIELECTRIC)
-    if not passing.any():
-        return np.zeros((len(texels), 3), np.float32)
-    given = _Scattering(
-        lit,
-        lit.radiance.showing(texels, light),
-        lights_from_radiance(lit.scene, texels, light, outside=(lit.rays, lit.environment)),
-        lobes,
-        Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
-        table_let_through(lobes.phi, lobes.psi) - 1,
-        passing,
-        texels.object_index(),
-    )
-    return by_tiles(run, texels, "let-through", "fit: surfaces", _scattered, given)["differs"]
-
 
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
 # is left of their noise is far below the other errors.
@@ -186,6 +59,7 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
+_OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=40)
 # Texels around what was seen that are no more than so many times as bright as their fill.
 _RIM, _LEAK = 3, 2.0
 RELATIVE_ERROR = calibration.number("refine.relative_error")
@@ -265,13 +139,16 @@ def refined_light(
     """
     need = _need([one.lit for one in lightings])
     texels, found = lightings[0].lit.texels, []
+    owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
     for one in lightings:
         means = _means_without_lobes(run.part(one.name), one, reader, lobes, need, memory, seed)
         diffuse, error = _diffuse_of_means(one, means, lobes)
+        diffuse = _with_patterns(
+            run.part(one.name), one, reader, metal, diffuse, means, memory, seed
+        )
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
-    owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
     beside_seen = [_beside_seen(texels, one.before) for one in lightings]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
@@ -382,9 +259,8 @@ def _means_without_lobes(
             start, observed = saved[0] + 1, MeanState(**saved[1])
         # The mean starts from its first samples, which must not all show one highlight.
         order = [own.start + i for i in spread_order(len(own))[start:]]
-        sampled = samples_from_frames(
-            lit, frames, reader.read, order, with_whole_tiles(texels, part)
-        )
+        whole = with_rows_beside(texels, part, TILE_SIDE)
+        sampled = samples_from_frames(lit, frames, reader.read, order, whole)
         bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
         for done, some in enumerate(bar, start):
             taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
@@ -409,12 +285,55 @@ def _means_without_lobes(
             run.save_latest_in_time(name, done, observed._asdict)
         return robust_mean(observed)._asdict()
 
-    try:
-        groups = groups_of_texels(texels, lit.scene, frames.at(own), memory, need)
-    except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
-        warn(str(short))
-        groups = smallest_groups(texels)
+    groups = _groups(lit, frames.at(own), memory, need)
     return RobustMean(**in_passes(run, "means", groups, means))
+
+
+def _groups(
+    lit: LitScene, frames: Frames, memory: float | None, need: BytesPerTexel, *, warns: bool = True
+) -> list[slice]:
+    try:
+        return groups_of_texels(lit.texels, lit.scene, frames, memory, need)
+    except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
+        if warns:
+            warn(str(short))
+        return smallest_groups(lit.texels)
+
+
+def _with_patterns(
+    run: TaskRun,
+    lighting: Lighting,
+    reader: FrameReader,
+    metal: Bool,
+    diffuse: Float,
+    means: RobustMean,
+    memory: float | None,
+    seed: int,
+) -> Float:
+    """``diffuse`` (T, 3) of a lighting, with what the frames' pixels together tell beside it."""
+    _, lit, before, own = lighting
+    frames, texels, level2 = reader.frames, lit.texels, _level(before.lit) ** 2
+    known = np.isfinite(means.mean[:, 0]) & ~before.emissive & ~metal
+    # Of a single sample, what it differs from the others by.
+    variance = means.variance * level2 * np.minimum(before.samples, _MOST_SAMPLES)
+    variance = around(texels, np.where(known, variance, 0)[:, None], means.footprint)[:, 0]
+    texel_of = np.full(len(texels.nearest_texel), -1, np.int32)
+    texel_of[texels.pixel[known]] = np.flatnonzero(known)
+    surface = PatternedSurface(lit.scene, lit.rays, texels, diffuse, texel_of, variance)
+
+    def of_frame(i: int) -> Covering:
+        shown = reader.read(i)
+        picture = Picture(shown.radiance, shown.valid, shown.clipped, shown.dark)
+        noise = OF_NOISE_FLOOR * float(frames.noise_floor_radiance[i])
+        found = pixels_of_frame(surface, picture, frames.camera(i), noise, RELATIVE_ERROR)
+        return found.take(_subsample(found.texel, before.samples[found.texel], i, seed))
+
+    def pixels() -> Iterator[Covering]:
+        bar = progress(ahead(of_frame, own), total=len(own), label="fit: patterns", unit="frames")
+        yield from bar
+
+    groups = _groups(lit, frames.at(own), memory, _OF_PATTERNS, warns=False)
+    return with_patterns(run, surface, pixels, means.footprint, groups, seed)
 
 
 def frame_reader(

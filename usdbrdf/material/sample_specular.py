@@ -15,7 +15,7 @@ from usdbrdf.transport.lobe_radiance import lobe_radiance
 _RAYS, _MANY_FRAMES, _RAYS_OF_MANY = 8, 16, 4
 # Texels to a side of a tile, over which a frame's specular light is averaged, and to what share of
 # a lobe's width this may spread the mirrored directions.
-_SIDE = 4
+TILE_SIDE = 4
 _BLUNT = calibration.number("refine.turn_of_tile")
 
 
@@ -34,30 +34,13 @@ def specular_of_samples(
     return _shared(texels, phi, texel, eye, found)
 
 
-def with_whole_tiles(texels: Texels, part: slice) -> slice:
-    """The ``part`` with what its first and last tiles, of which texels are averaged, hold beside:
-    what becomes of a texel does not depend on its group."""
-    ends = np.array([part.start, part.stop - 1])
-    owner = texels.object_index()[ends]
-    width = texels.resolution[owner, 0]
-    row = (texels.pixel[ends] - texels.first_pixel[owner]) // width // _SIDE * _SIDE
-    rows = texels.first_pixel[owner] + (row + np.array([0, _SIDE])) * width
-    rows = np.minimum(rows, texels.first_pixel[owner + 1])
-    own = [texels.pixel[texels.of_object(i)] for i in owner]
-    start, stop = (
-        int(texels.first_texel[i]) + int(np.searchsorted(pixel, first))
-        for i, pixel, first in zip(owner, own, rows, strict=True)
-    )
-    return slice(start, stop)
-
-
 def _shared(texels: Texels, phi: Float, texel: Int, eye: Double, specular: Float) -> Float:
     """Of ``specular`` (M, 3), which texels (M,) reflect to ``eye``, the means over tiles of the
     atlas, where these turn the mirrored direction by little of the lobe's width.
 
     A few rays meet something bright now and then, and a robust mean takes that for outliers: what
     was taken off all samples would be less than what the lobe reflects."""
-    tile = np.unique(texels.tile(texel.astype(np.int64), _SIDE), return_inverse=True)[1]
+    tile = np.unique(texels.tile(texel.astype(np.int64), TILE_SIDE), return_inverse=True)[1]
     count = np.bincount(tile)
 
     def mean(values: Float) -> Double:
@@ -70,6 +53,8 @@ def _shared(texels: Texels, phi: Float, texel: Int, eye: Double, specular: Float
     turn = np.linalg.norm(position - mean(position), axis=1) / np.maximum(away, 1e-12)
     turn += 2 * np.linalg.norm(normal - mean(normal), axis=1)
     # Other charts may lie in the same tile.
-    apart = np.linalg.norm(position - mean(position), axis=1) > _SIDE * np.sqrt(texels.area[texel])
+    apart = np.linalg.norm(position - mean(position), axis=1) > TILE_SIDE * np.sqrt(
+        texels.area[texel]
+    )
     narrow = mean(((turn > _BLUNT * phi) | apart)[:, None])
     return np.where(narrow > 0, specular, mean(specular)).astype(np.float32)

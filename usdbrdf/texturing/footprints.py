@@ -135,8 +135,17 @@ def _blur(
                 out[t, c] += ((1 - fy) * upper + fy * lower) / len(offsets)
 
 
-SAMPLE_BLUR = calibration.number("refine.sample_blur")
 _NEIGHBOURHOOD = calibration.number("refine.neighbourhood")
+
+
+def around(texels: Texels, values: Float, footprint: Float) -> Float:
+    """Means of ``values`` (T, C) over so many texels that these tell detail from noise."""
+    for _ in range(3):
+        values = blurred(texels, values, np.float32(_NEIGHBOURHOOD**2) * footprint)
+    return values
+
+
+SAMPLE_BLUR = calibration.number("refine.sample_blur")
 # More of them bring the noise back.
 _STEPS = 2
 
@@ -159,9 +168,7 @@ def restored(
     detail = values - smooth
     energy = np.stack([(detail**2).mean(axis=1), variance], axis=-1)
     energy = np.where(measured[:, None], energy, 0).astype(np.float32)
-    for _ in range(3):
-        energy = blurred(texels, energy, np.float32(_NEIGHBOURHOOD**2) * footprint)
-    seen, noise = energy.T
+    seen, noise = around(texels, energy, footprint).T
     share = np.clip(1 - noise / np.maximum(seen, 1e-30), 0, 1)
     # At the rim of what was measured the fill would pass for detail, and the last samples before a
     # lamp hold some of its light.

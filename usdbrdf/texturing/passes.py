@@ -74,6 +74,17 @@ def by_parts(
     return {name: np.concatenate([some.pop(name) for some in found]) for name in list(found[0])}
 
 
+def with_rows_beside(texels: Texels, part: slice, rows: int) -> slice:
+    """The ``part`` and so many rows of its objects' atlases before and after it: what a texel's
+    neighbours say of it does not depend on its group."""
+    owner = texels.object_index()[[part.start, part.stop - 1]]
+    reach = rows * texels.resolution[owner, 0].astype(np.int64)
+    low = max(texels.pixel[part.start] - reach[0], texels.first_pixel[owner[0]])
+    high = min(texels.pixel[part.stop - 1] + reach[1] + 1, texels.first_pixel[owner[1] + 1])
+    start, stop = np.searchsorted(texels.pixel, [low, high])
+    return slice(int(start), int(stop))
+
+
 def groups_of_texels(
     texels: Texels,
     scene: Scene,

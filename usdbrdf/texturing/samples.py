@@ -108,6 +108,13 @@ class Picture(NamedTuple):
     dark: Bool
 
 
+def glares(picture: Picture) -> Bool:
+    """(H, W): pixels beside something so bright that its light lies on them too."""
+    radiance, valid, clipped, _ = picture
+    glare = brightest_glare(radiance, valid, clipped)
+    return np.asarray(glare > _GLARE_CONTRAST * radiance.max(axis=2), np.bool_)
+
+
 class Projection(NamedTuple):
     """The camera as kernels take it: eye (3,), camera_from_world (4, 4), intrinsics (4,)."""
 
@@ -239,7 +246,7 @@ def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, val
     wide = off_x * abs(ux - u) + off_y * abs(uy - u)
     high = off_x * abs(vx - v) + off_y * abs(vy - v)
     reach = max(1, int(np.ceil(max(wide, high) + 0.5)))
-    if not _shows_surface(
+    if not shows_surface(
         row, column, reach, p, n, surface.object[t], depth / camera.intrinsics[0], image
     ):
         return NOTHING
@@ -276,19 +283,19 @@ def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, val
 
 
 @kernel
-def _shows_surface(
+def shows_surface(
     row: int, column: int, reach: int, p: Float, n: Float, own: int, pixel_size: float,
-    image: _Image,
+    surfaces: FirstSurfaces | _Image,
 ) -> bool:  # fmt: skip
     """Do all pixels within ``reach`` show object ``own``, a pixel's size off its plane at most?"""
-    height, width = image.object.shape
+    height, width = surfaces.object.shape
     if row < reach or column < reach or row + reach >= height or column + reach >= width:
         return False
     for j in range(row - reach, row + reach + 1):
         for i in range(column - reach, column + reach + 1):
-            if image.object[j, i] != own:
+            if surfaces.object[j, i] != own:
                 return False
-            s = image.point[j, i]
+            s = surfaces.point[j, i]
             off = (s[0] - p[0]) * n[0] + (s[1] - p[1]) * n[1] + (s[2] - p[2]) * n[2]
             if abs(off) > pixel_size:
                 return False

@@ -1,0 +1,269 @@
+"""Patterns as fine as pixels, from pictures whose pixels cover them differently."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.ndimage import map_coordinates
+
+from tests.physics.surfaces import World, quad, world_of
+from tests.scenes import camera_at, look_at
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.camera import Camera
+from usdbrdf.texturing.footprints import SAMPLE_BLUR, blurred
+from usdbrdf.texturing.patterns import (
+    Covering,
+    Equations,
+    PatternedSurface,
+    add,
+    pixels_of_frame,
+    share_that_is_no_noise,
+    steps,
+    with_patterns,
+)
+from usdbrdf.texturing.samples import Picture
+
+Float = npt.NDArray[np.float32]
+SIDE, TEXEL, ERROR = 48, 0.02, 0.03
+# 60 x 60 pixels, each about 1.5 texels wide from 1.2 m away.
+LENS = (40.0, 40.0, 30.0, 30.0)
+
+
+@pytest.fixture(scope="module")
+def floor() -> World:
+    """48 x 48 texels of 2 cm in the plane z = 0, around the origin."""
+    side = SIDE * TEXEL
+    return world_of([quad((-side / 2, -side / 2, 0), (side, 0, 0), (0, side, 0), (SIDE, SIDE))])
+
+
+def _cameras(count: int) -> list[Camera]:
+    """From all sides above the floor, none like another."""
+    random = np.random.default_rng(4)
+    found = []
+    for turn in 2 * np.pi * np.arange(count) / count:
+        eye = np.array([0.35 * np.cos(turn), 0.35 * np.sin(turn), 1.15 + 0.1 * random.random()])
+        found.append(
+            camera_at(look_at(eye, random.uniform(-0.1, 0.1, 3) * [1, 1, 0]), LENS, 60, 60)
+        )
+    return found
+
+
+def _picture(camera: Camera, pattern: Float, noise: float, seed: int) -> Picture:
+    """Means over 6 x 6 points of each pixel of a ``pattern`` (48, 48, 3) on the floor; its surface
+    goes on beyond its border."""
+    row, column = np.mgrid[: camera.height, : camera.width]
+    sums = np.zeros((camera.height, camera.width, 3))
+    for down, right in np.ndindex(6, 6):
+        at = np.stack([column + (right + 0.5) / 6, row + (down + 0.5) / 6], axis=-1)
+        origin, direction = (np.asarray(v, np.float64) for v in camera.rays(at.reshape(-1, 2)))
+        point = origin - direction * (origin[:, 2:] / direction[:, 2:])
+        x, y = point[:, 0] / TEXEL + SIDE / 2 - 0.5, SIDE / 2 - point[:, 1] / TEXEL - 0.5
+        for c in range(3):
+            read = map_coordinates(pattern[..., c], [y, x], order=1, mode="nearest")
+            sums[..., c] += read.reshape(sums.shape[:2])
+    shown = sums / 36 * (1 + noise * np.random.default_rng(seed).normal(size=sums.shape))
+    valid = np.ones(sums.shape[:2], np.bool_)
+    return Picture(shown.astype(np.float32), valid, ~valid, ~valid)
+
+
+def _stripes(period: float = 3.4) -> Float:
+    """Oblique ones, of half the floor's radiance, in three colours."""
+    y, x = np.mgrid[:SIDE, :SIDE]
+    wave = np.sin(2 * np.pi * (0.8 * x + 0.6 * y) / period)
+    return np.asarray(1 + 0.5 * wave[..., None] * [1.0, 0.8, -0.6], np.float32)
+
+
+def _surface(floor: World, values: Float) -> PatternedSurface:
+    own = np.arange(SIDE * SIDE, dtype=np.int32)
+    scatter = np.full(len(own), 0.2**2, np.float32) * values.mean() ** 2
+    return PatternedSurface(floor.scene, floor.rays, floor.texels, values, own, scatter)
+
+
+def _found(
+    floor: World,
+    surface: PatternedSurface,
+    pictures: Sequence[tuple[Camera, Picture]],
+    folder: Path,
+    groups: Sequence[slice] = (slice(0, SIDE * SIDE),),
+) -> Float:
+    def pixels() -> list[Covering]:
+        return [pixels_of_frame(surface, shown, camera, 1e-4, ERROR) for camera, shown in pictures]
+
+    run = TaskRun(folder, "fit", folder / "work")
+    return with_patterns(run, surface, lambda: iter(pixels()), _footprint(floor), groups, 1)
+
+
+def _footprint(floor: World) -> Float:
+    return np.tile(np.float32([2.2, 0, 2.2]), (len(floor.texels), 1))
+
+
+def _inner() -> npt.NDArray[np.bool_]:
+    y, x = np.mgrid[:SIDE, :SIDE]
+    return np.asarray((np.maximum(abs(x - SIDE / 2), abs(y - SIDE / 2)) < SIDE / 3).ravel())
+
+
+def _off(values: Float, truth: Float) -> float:
+    return float(np.sqrt(((values - truth)[_inner()] ** 2).mean()))
+
+
+def _seen(pattern: Float, noise: float = 0.01, count: int = 8) -> list[tuple[Camera, Picture]]:
+    cameras = _cameras(count)
+    return [(camera, _picture(camera, pattern, noise, k)) for k, camera in enumerate(cameras)]
+
+
+def test_stripes_that_pixels_blur_come_back(floor: World, tmp_path: Path):
+    truth = _stripes().reshape(-1, 3)
+    mean = blurred(floor.texels, truth, SAMPLE_BLUR**2 * _footprint(floor))
+    found = _found(floor, _surface(floor, mean), _seen(_stripes()), tmp_path)
+    assert _off(mean, truth) > 0.15
+    assert _off(found, truth) < 0.35 * _off(mean, truth)
+
+
+def test_a_plain_floor_stays_plain(floor: World, tmp_path: Path):
+    plain = np.ones((SIDE, SIDE, 3), np.float32)
+    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), _seen(plain, 0.03), tmp_path)
+    assert _off(found, plain.reshape(-1, 3)) < 0.3 * 0.03
+
+
+def test_what_is_there_already_is_not_exaggerated(floor: World, tmp_path: Path):
+    truth = _stripes().reshape(-1, 3)
+    found = _found(floor, _surface(floor, truth), _seen(_stripes()), tmp_path)
+    assert _off(found, truth) < 0.02
+
+
+def test_highlights_of_single_frames_are_no_pattern(floor: World, tmp_path: Path):
+    plain = np.ones((SIDE, SIDE, 3), np.float32)
+    pictures = []
+    for k, (camera, shown) in enumerate(_seen(plain, 0.01)):
+        row, column = np.mgrid[:60, :60]
+        middle = np.random.default_rng(k).uniform(15, 45, 2)
+        for size, strength in ((8, 0.5), (1.5, 20.0)):  # a wide one, and a lamp in a mirror
+            away2 = (row - middle[0]) ** 2 + (column - middle[1]) ** 2
+            shown.radiance[...] += (strength * np.exp(-away2 / (2 * size**2)))[..., None]
+        pictures.append((camera, shown))
+    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures, tmp_path)
+    assert _off(found, plain.reshape(-1, 3)) < 0.02
+
+
+def test_contradicting_frames_change_little(floor: World, tmp_path: Path):
+    # The poses are off: every frame shows the stripes elsewhere.
+    shifted = [np.roll(_stripes(), 2 * k, axis=1) for k in range(8)]
+    pictures = [_seen(own)[k] for k, own in enumerate(shifted)]
+    mean = np.mean(shifted, axis=0).reshape(-1, 3).astype(np.float32)
+    found = _found(floor, _surface(floor, mean), pictures, tmp_path)
+    assert _off(found, mean) < 0.5 * _off(_stripes().reshape(-1, 3), mean)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_unit_of_radiance_makes_no_difference(floor: World, tmp_path: Path, scale: float):
+    truth = _stripes().reshape(-1, 3)
+    mean = blurred(floor.texels, truth, SAMPLE_BLUR**2 * _footprint(floor))
+    pictures = _seen(_stripes())
+    once = _found(floor, _surface(floor, mean), pictures, tmp_path)
+    scaled = [
+        (camera, shown._replace(radiance=shown.radiance * np.float32(scale)))
+        for camera, shown in pictures
+    ]
+    surface = _surface(floor, mean * np.float32(scale))
+    found = [
+        pixels_of_frame(surface, shown, camera, 1e-4 * scale, ERROR) for camera, shown in scaled
+    ]
+    run = TaskRun(tmp_path, "fit", tmp_path / "work")
+    whole = [slice(0, SIDE * SIDE)]
+    again = with_patterns(run, surface, lambda: iter(found), _footprint(floor), whole, 1)
+    np.testing.assert_allclose(again / np.float32(scale), once, rtol=2e-3, atol=2e-3)
+
+
+def test_what_a_texel_gets_does_not_depend_on_its_group(tmp_path: Path):
+    # Longer than what two groups share.
+    long = 320
+    floor = world_of([quad((0, 0, 0), (0.4, 0, 0), (0, long * TEXEL, 0), (20, long))])
+    texels = floor.texels
+    random = np.random.default_rng(3)
+    values = random.uniform(0.5, 1.5, (len(texels), 3)).astype(np.float32)
+    own = np.arange(len(texels), dtype=np.int32)
+    surface = PatternedSurface(
+        floor.scene, floor.rays, texels, values, own, np.full(len(own), 0.04, np.float32)
+    )
+    count = 30_000
+    pixels = Covering(
+        texel=random.integers(0, len(texels), count).astype(np.int32),
+        where=np.empty((count, 2), np.float32),
+        step=np.tile(np.float32([[1.1, 0.3], [-0.2, 0.9]]), (count, 1, 1)),
+        rest=random.normal(0, 0.2, (count, 3)).astype(np.float32),
+        weight=np.full(count, 1 / ERROR**2, np.float32),
+    )
+    flat = texels.pixel[pixels.texel]
+    pixels.where[...] = np.stack([flat % 20, flat // 20], axis=-1) + random.random((count, 2))
+    footprint = np.tile(np.float32([1, 0, 1]), (len(texels), 1))
+
+    def found(folder: str, ends: list[int]) -> Float:
+        groups = [slice(a, b) for a, b in pairwise(ends)]
+        run = TaskRun(tmp_path, "fit", tmp_path / folder)
+        return with_patterns(run, surface, lambda: iter([pixels]), footprint, groups, 1)
+
+    whole = found("one", [0, len(texels)])
+    assert (whole != values).any()
+    np.testing.assert_array_equal(found("three", [0, 2000, 2007, len(texels)]), whole)
+
+
+def test_equations_are_those_of_least_squares(floor: World):
+    values = np.ones((SIDE * SIDE, 3), np.float32)
+    surface = _surface(floor, values)
+    [(camera, shown)] = _seen(_stripes(), 0.0, count=1)
+    pixels = pixels_of_frame(surface, shown, camera, 1e-4, ERROR)
+    equations = Equations.empty(len(values))
+    add(equations, 0, surface, pixels)
+    # What pixels cover adds up to one, and all of it lies on the floor.
+    assert equations.pixels.sum() == pytest.approx(len(pixels.texel), rel=1e-5)
+    squares = (pixels.weight[:, None] * pixels.rest**2).sum() / 3
+    assert equations.squares.sum() == pytest.approx(squares, rel=1e-4)
+    pull = (pixels.weight[:, None] * pixels.rest).sum(axis=0)
+    np.testing.assert_allclose(
+        equations.pull.sum(axis=0), pull, rtol=1e-3, atol=abs(pull).max() * 1e-3
+    )
+    # 1^T B^T W B 1 = sum of the weights; half of the couplings are kept.
+    total = 2 * equations.coupling.sum(dtype=np.float64) - equations.coupling[:, 0].sum()
+    assert total == pytest.approx(pixels.weight.sum(dtype=np.float64), rel=1e-4)
+
+
+def test_steps_solve_their_equations(floor: World):
+    truth = _stripes().reshape(-1, 3)
+    values = np.ones_like(truth)
+    surface = _surface(floor, values)
+    equations = Equations.empty(len(values))
+    for camera, shown in _seen(_stripes()):
+        add(equations, 0, surface, pixels_of_frame(surface, shown, camera, 1e-4, ERROR))
+    part = slice(0, len(values))
+    level = np.ones(len(values), np.float32)
+    found = steps(equations, part, surface, level, 1)
+    assert _off(values + found["step"], truth) < 0.3 * _off(values, truth)
+    share = share_that_is_no_noise(floor.texels, found["told"], _footprint(floor))
+    assert share[_inner()].min() > 0.8
+
+
+def test_pixels_over_an_edge_are_left_out():
+    # A floor in two colours and objects: pixels of the border show both.
+    half = SIDE * TEXEL / 2
+    parts = [
+        quad((-half, -half, 0), (half, 0, 0), (0, 2 * half, 0), (SIDE // 2, SIDE)),
+        quad((0, -half, 0), (half, 0, 0), (0, 2 * half, 0), (SIDE // 2, SIDE)),
+    ]
+    world = world_of(parts)
+    pattern = np.ones((SIDE, SIDE, 3), np.float32)
+    pattern[:, SIDE // 2 :] = 5
+    values = np.where(world.texels.position[:, :1] < 0, 1, 5) * np.ones(3, np.float32)
+    own = np.arange(len(world.texels), dtype=np.int32)
+    scatter = np.full(len(own), 1, np.float32)
+    surface = PatternedSurface(
+        world.scene, world.rays, world.texels, values.astype(np.float32), own, scatter
+    )
+    for camera, shown in _seen(pattern, 0.0):
+        pixels = pixels_of_frame(surface, shown, camera, 1e-4, ERROR)
+        assert len(pixels.texel) > 500
+        assert np.abs(pixels.rest).max() < 0.02
