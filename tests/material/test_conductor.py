@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,7 @@ from usdbrdf.material.fit_objects import (
     judged,
 )
 from usdbrdf.material.fit_views import SampledObject
-from usdbrdf.material.verdict import LobeEstimate
+from usdbrdf.material.verdict import LobeEstimate, usual_lobe
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI, PAPER
@@ -117,6 +118,21 @@ def test_a_metal_is_published_as_one():
     assert judged(found._replace(f0_error=0.2), _object(), FitOptions(), True).status == "prior"
     plain = judged(found._replace(clearer=math.nan), _object(), FitOptions(), True)
     assert plain.kind == "dielectric"
+
+
+def test_what_is_usual_is_shown_only_where_frames_tell_nothing():
+    options = FitOptions(unmeasured="class")
+    table = replace(_object(), class_name="table")
+    usual = usual_lobe("table", "")
+    assert usual is not None
+    nothing = ObjectFit(0.4, 0.5, 0.28, 0.28, evidence=0.05, psi_upper=0.9, num_samples=500)
+    shown = judged(nothing, table, options, True)
+    assert (shown.status, shown.shown_phi, shown.shown_psi) == ("prior", *usual)
+    # All that is known of this psi is that it is no less than 1.
+    bounded = ObjectFit(0.1, 1.0, 0.01, 0.02, evidence=0.9, psi_upper=1.0, num_samples=500)
+    verdict = judged(bounded, table, options, True)
+    assert verdict.status == "prior"
+    assert math.isnan(verdict.shown_psi)
 
 
 EVIDENCE = {PAPER: 0.7, DIELECTRIC: 0.6}

@@ -425,6 +425,7 @@ def judged(
         keep, phi = options.method == "paper", (found.phi, found.phi_error)
         verdict = verdict_on_frame(phi, found.psi, found.evidence, observed, keep)
     usual = usual_lobe(obj.class_name, obj.label) if options.unmeasured == "class" else None
-    if usual is None or verdict.status != "prior":
+    # What frames tell of a lobe without measuring it is more than what is usual.
+    if usual is None or verdict.status != "prior" or verdict.psi_confidence != "none":
         return verdict
     return replace(verdict, shown_phi=usual[0], shown_psi=min(usual[1], verdict.psi_upper))
