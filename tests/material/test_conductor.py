@@ -27,7 +27,7 @@ from usdbrdf.material.fit_views import SampledObject
 from usdbrdf.material.verdict import LobeEstimate, usual_lobe
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
-from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI, PAPER
+from usdbrdf.transport.brdf import BECKMANN, DIELECTRIC, F0_OF_PSI, PAPER
 from usdbrdf.transport.lit_scene import LitScene
 
 TEXELS, VIEWS, PHI = 60, 10, 0.1
@@ -135,13 +135,13 @@ def test_what_is_usual_is_shown_only_where_frames_tell_nothing():
     assert math.isnan(verdict.shown_psi)
 
 
-EVIDENCE = {PAPER: 0.7, DIELECTRIC: 0.6}
+EVIDENCE = {PAPER: 0.7, DIELECTRIC: 0.6, BECKMANN: 0.65}
 
 
 class _Run(TaskRun):
     """One object that shows a lobe, and one with too few samples."""
 
-    def __init__(self, clearer: float) -> None:
+    def __init__(self, *clearer: float) -> None:
         self._workers, self._for_workers = HERE, Path()
         self.clearer = clearer
 
@@ -151,7 +151,7 @@ class _Run(TaskRun):
         if not name.endswith("0"):
             return FirstLook({}, 40).arrays()
         shows = {kind: _lobe(evidence) for kind, evidence in EVIDENCE.items()}
-        return FirstLook(shows, 40, self.clearer).arrays()
+        return FirstLook(shows, 40, *self.clearer).arrays()
 
     def save(self, name: str, found: dict[str, np.ndarray], index: int | None = None) -> None:
         assert name.startswith("object")
@@ -161,12 +161,16 @@ def _lobe(evidence: float) -> LobeEstimate:
     return LobeEstimate(0.1, 0.5, 0.02, 0.06, 0.01, 1.0, evidence, (0.001, 0.002), 0.12, 0.45, 0.6)
 
 
-@pytest.mark.parametrize(("clearer", "chosen"), [
-    (0.9, PAPER),
-    (-0.9, DIELECTRIC),
-    (0.1, DIELECTRIC),  # hardly clearer: the lobe of renderers
+@pytest.mark.parametrize(("clearer", "of_beckmann", "chosen", "of_object"), [
+    (0.9, 0.0, PAPER, PAPER),
+    (0.9, -0.9, PAPER, PAPER),  # which has facets of its own
+    (-0.9, 0.1, DIELECTRIC, DIELECTRIC),
+    (0.1, -0.1, DIELECTRIC, DIELECTRIC),  # hardly clearer: the lobe of renderers
+    (-0.9, -0.4, DIELECTRIC, BECKMANN),
 ])  # fmt: skip
-def test_the_scene_has_the_lobe_that_explains_its_views(clearer: float, chosen: int):
+def test_the_scene_has_the_lobe_that_explains_its_views(
+    clearer: float, of_beckmann: float, chosen: int, of_object: int
+):
     names = ("rays", "radiance", "lights", "emission", "environment")
     lit = LitScene(
         scene=SimpleNamespace(objects=range(2)),  # type: ignore[arg-type]
@@ -175,14 +179,15 @@ def test_the_scene_has_the_lobe_that_explains_its_views(clearer: float, chosen: 
     )
     shown = SimpleNamespace(texel=np.array([1, 0, 0]))
     survey = SimpleNamespace(target=np.array([3, -1]), shown=np.ones(2), observations=shown)
-    lightings, run = [Lighting(lit, survey)], _Run(clearer)  # type: ignore[arg-type]
+    lightings, run = [Lighting(lit, survey)], _Run(clearer, of_beckmann)  # type: ignore[arg-type]
 
     def fitted(options: FitOptions) -> tuple[int, list[ObjectFit]]:
         return fitted_by_likelier_lobe(run, lightings, None, options)  # type: ignore[arg-type]
 
     lobe, found = fitted(FitOptions())
     assert lobe == chosen
-    assert found[0].evidence == EVIDENCE[chosen]
+    assert found[0].evidence == EVIDENCE[of_object]
+    assert [one.beckmann for one in found] == [of_object == BECKMANN, 0]
     assert found[0][:2] == (0.1, 0.5)
     assert found[0][7:10] == (0.12, 0.45, 0.6)
     assert (found[0].target, found[0].num_samples) == (3, 40)

@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from tests.physics.test_predict import RGB, _open_sky, _points
 from usdbrdf.transport.brdf import (
+    BECKMANN,
     CONDUCTOR,
     DIELECTRIC,
     F0_OF_PSI,
     PAPER,
+    beckmann_distribution,
     distribution,
     reflectance,
     width_of_masking,
@@ -53,7 +56,9 @@ def test_schlick_alone_is_too_dark_at_grazing_angles():
     assert width_of_masking(0.1, DIELECTRIC) == width_of_masking(0.1, CONDUCTOR) == 0.1
 
 
-def _microfacet_albedo(theta: float, alpha: float, psi: float, steps: int = 300) -> float:
+def _microfacet_albedo(
+    theta: float, alpha: float, psi: float, kind: int = DIELECTRIC, steps: int = 300
+) -> float:
     """Directional albedo by quadrature over half vectors, dw = 4 (wo.h) dh."""
     wo = np.array([np.sin(theta), 0.0, np.cos(theta)])
     log_s = np.linspace(np.log(1e-4), np.log(1e4 / alpha), 4 * steps)
@@ -68,10 +73,13 @@ def _microfacet_albedo(theta: float, alpha: float, psi: float, steps: int = 300)
     x, woh = np.where(front, cos_in, 1.0), np.where(front, woh, 1.0)
 
     def smith(c: np.ndarray) -> np.ndarray:
+        if kind == BECKMANN:  # not the rational form
+            s = np.minimum(c / (alpha * np.sqrt(np.maximum(1 - c**2, 1e-12))), 20)
+            return 2 / (1 + erf(s) + np.exp(-(s**2)) / (s * np.sqrt(np.pi)))
         return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2))
 
     base, rise = reflectance(woh, DIELECTRIC)
-    d = distribution(np.sin(t) ** 2, alpha)
+    d = (beckmann_distribution if kind == BECKMANN else distribution)(np.sin(t) ** 2, alpha)
     f = d * smith(x) * smith(wo[2]) * (base + F0_OF_PSI * psi * rise) / (4 * x * wo[2])
     value = np.where(front, f * x * 4 * woh, 0) * np.sin(t) ** 2 * np.cos(t)
     return float(value.mean(axis=1).sum() * 2 * np.pi * (log_s[1] - log_s[0]))
@@ -91,12 +99,44 @@ def test_even_light_is_multiplied_by_the_directional_albedo(degrees: float, phi:
     assert float(table[0, 0]) == pytest.approx(wanted, rel=0.02)
 
 
+@pytest.mark.parametrize(("degrees", "phi"), [(10, 0.1), (60, 0.2), (70, 0.4)])
+def test_facets_after_beckmann_reflect_even_light_by_their_albedo(degrees: float, phi: float):
+    lit = replace(_open_sky(), lobe=BECKMANN)
+    one = np.ones(400, np.float32)
+    found = lobe_radiance(lit, _points(degrees * np.ones(400)), phi * one, 0.5 * one, 64, 0)
+    wanted = _microfacet_albedo(np.radians(degrees), phi, 0.5, BECKMANN)
+    np.testing.assert_allclose(found.mean(axis=0), RGB * wanted, rtol=0.015)
+
+
+@pytest.mark.parametrize("alpha", [0.01, 0.1, 0.5, 1.0])
+def test_facets_cover_the_surface_once(alpha: float):
+    theta = np.concatenate([[0], np.geomspace(1e-5, np.pi / 2, 20_000)])
+    for of_angle in (distribution, beckmann_distribution):
+        seen = of_angle(np.sin(theta) ** 2, alpha) * np.cos(theta) * np.sin(theta)
+        assert 2 * np.pi * np.trapezoid(seen, theta) == pytest.approx(1, abs=1e-3)
+    assert np.isfinite(beckmann_distribution(np.float32(1), np.float32(alpha)))
+
+
 def test_cycles_shows_nearly_what_was_fitted():
     # Its masking is the height-correlated one, and light between facets is little.
     f0 = np.array([0.02, 0.04, 0.08])
     for phi in (0.05, 0.2, 0.4):
         fitted = fitted_albedo(phi, f0, kind=DIELECTRIC).mean(axis=0)
         np.testing.assert_allclose(fitted, cycles_albedo(phi, f0).lobe.mean(axis=0), rtol=0.12)
+
+
+def test_objects_with_facets_after_beckmann_reflect_by_these():
+    lit = replace(_open_sky(), lobe=DIELECTRIC)
+    one, points = np.ones(6, np.float32), _points(70 * np.ones(6))
+    owner = lit.scene.face_object[points.face]
+    of_objects = np.zeros(len(lit.scene.objects), bool)
+    assert (owner == owner[0]).all()
+    for beckmann, kind in ((of_objects, DIELECTRIC), (~of_objects, BECKMANN)):
+        found = lobe_radiance(
+            replace(lit, beckmann=beckmann), points, 0.3 * one, one, 32, 0, np.arange(6)
+        )
+        alone = lobe_radiance(replace(lit, lobe=kind), points, 0.3 * one, one, 32, 0, np.arange(6))
+        np.testing.assert_array_equal(found, alone)
 
 
 def test_a_metal_among_dielectrics_reflects_by_its_own_equations():

@@ -10,7 +10,7 @@ import pytest
 from tests.physics.brdf import f_nd
 from usdbrdf.relighting import lobe_plugin
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
-from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, reflectance
+from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, DIELECTRIC, PAPER, reflectance
 from usdbrdf.transport.let_through import share_let_through, share_seen
 
 _CASES = [(0.05, 0.9, 0.1), (0.3, 0.5, 0.4), (0.9, 0.1, 0.7)]
@@ -52,7 +52,10 @@ def test_value(mi: Any, phi: float, psi: float, rho: float) -> None:
     assert found == pytest.approx(expected, rel=2e-3, abs=1e-4)
 
 
-def test_value_of_the_lobe_of_renderers(mi: Any) -> None:
+@pytest.mark.parametrize(
+    ("kinds", "facets"), [((DIELECTRIC, CONDUCTOR), "ggx"), ((BECKMANN,), "beckmann")]
+)
+def test_value_of_the_lobe_of_renderers(mi: Any, kinds: tuple[int, ...], facets: str) -> None:
     # That of Mitsuba's own rough conductor, but for Fresnel's term: with one that is 1.
     import drjit as dr
 
@@ -65,11 +68,11 @@ def test_value_of_the_lobe_of_renderers(mi: Any) -> None:
     half = wo + wi
     cosine = (half / np.linalg.norm(half, axis=1, keepdims=True)) @ wi
     theirs = {
-        "type": "roughconductor", "distribution": "ggx", "material": "none", "sample_visible": True,
-        "alpha": 0.3,
+        "type": "roughconductor", "distribution": facets, "material": "none", "alpha": 0.3,
+        "sample_visible": True,
     }  # fmt: skip
     other = np.array(mi.load_dict(theirs).eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
-    for kind in (DIELECTRIC, CONDUCTOR):
+    for kind in kinds:
         bsdf = mi.load_dict(_plugin(0.3, 0.5, 0.0) | {"lobe": kind})
         found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo.T)))[0]
         base, rise = reflectance(cosine, kind)
@@ -118,11 +121,11 @@ def test_what_is_partly_a_metal_scatters_no_more_than_its_colour(mi: Any, f0: fl
     assert below.max() < 1.2
 
 
+@pytest.mark.parametrize("kind", [PAPER, BECKMANN])
 @pytest.mark.parametrize(("phi", "psi", "rho"), _CASES[1:])
-def test_samples_follow_the_density(mi: Any, phi: float, psi: float, rho: float) -> None:
-    sample, density = mi.chi2.BSDFAdapter(
-        lobe_plugin.NAME, _plugin(phi, psi, rho), wi=[0.6, 0.0, 0.8]
-    )
+def test_samples_follow_the_density(mi: Any, phi: float, psi: float, rho: float, kind: int) -> None:
+    properties = _plugin(phi, psi, rho) | {"lobe": kind}
+    sample, density = mi.chi2.BSDFAdapter(lobe_plugin.NAME, properties, wi=[0.6, 0.0, 0.8])
     chi2 = mi.chi2.ChiSquareTest(
         mi.chi2.SphericalDomain(), sample, density, sample_dim=3, res=101, ires=8
     )

@@ -13,7 +13,7 @@ from usdbrdf.transport.renderer_match import (
     shown_share_of_metal,
 )
 
-MICROFACET = "microfacet"
+MICROFACET, BECKMANN_FACETS = "microfacet", "beckmann"
 
 
 # Of glass that was not measured: as clear and smooth as panes are.

@@ -354,8 +354,9 @@ class FittedObject(MeasuredObject):
         _CONFIDENCE.format("psi"), tokens=_CONFIDENCES)] = "none"
     lobe: Annotated[str, Fact(FIT, "lobe", "token", "paper", """Equations that phi and psi are
         numbers of. paper: masking of width ((phi + 1) / 2)^2 and Schlick's Fresnel term;
-        microfacet: Smith's masking of alpha, and Fresnel's equations. All objects of an asset have
-        the same.""", tokens=("paper", "microfacet"))] = "paper"
+        microfacet: Smith's masking of alpha, and Fresnel's equations; beckmann: these with
+        facets after Beckmann. All objects of an asset have the paper's, or none.""",
+        tokens=("paper", "microfacet", "beckmann"))] = "paper"
     kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
         under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel;
         transparent: clear glass, by directive alone, which was not fitted.""",

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.preview_lobe import MICROFACET
+from usdbrdf.asset.preview_lobe import BECKMANN_FACETS
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
@@ -263,8 +263,10 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
             f"{asset.folder}: its objects have no roughness and specular yet. Run `usdbrdf fit` "
             "first. [asset.incomplete]"
         )
-    kind = DIELECTRIC if any(fit.lobe == MICROFACET for fit in fits) else PAPER
-    lit = replace(atlas.lit_scene(atlas.environment(environment)), lobe=kind)
+    kind = DIELECTRIC if any(fit.lobe != "paper" for fit in fits) else PAPER
+    beckmann = np.array([fit.lobe == BECKMANN_FACETS for fit in fits], np.bool_)
+    surfaces = atlas.lit_scene(atlas.environment(environment))
+    lit = replace(surfaces, lobe=kind, beckmann=beckmann)
     diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,

@@ -48,7 +48,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import GLASS, LEFT_OUT, METAL, REFIT
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
-from usdbrdf.transport.brdf import DIELECTRIC, PAPER
+from usdbrdf.transport.brdf import BECKMANN, DIELECTRIC, PAPER
 from usdbrdf.transport.lit_scene import LitScene, View
 from usdbrdf.transport.lobe_radiance import Mixture
 
@@ -91,6 +91,7 @@ class ObjectFit(NamedTuple):
     metal_phi, red, green, blue, metal_phi_error, f0_error, clearer  of the metal that explains the
                   samples better, see ``Conductor``
     num_samples   how many the fit used; target: the frame that shows the highlight best, -1: none
+    beckmann      1 where phi and psi are of facets after Beckmann
     """
 
     phi: float = math.nan
@@ -113,6 +114,7 @@ class ObjectFit(NamedTuple):
     clearer: float = math.nan
     num_samples: int = 0
     target: int = -1
+    beckmann: int = 0
 
     def arrays(self) -> dict[str, Array]:
         """As checkpoints hold it."""
@@ -121,12 +123,12 @@ class ObjectFit(NamedTuple):
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> ObjectFit:
         """The inverse of ``arrays``."""
-        *numbers, num_samples, target = arrays["fit"].tolist()
-        return cls._make([*numbers, int(num_samples), int(target)])
+        *numbers, num_samples, target, beckmann = arrays["fit"].tolist()
+        return cls._make([*numbers, int(num_samples), int(target), int(beckmann)])
 
     def rounded(self) -> ObjectFit:
         """Without the digits that depend on how many threads the linear algebra had."""
-        return ObjectFit._make([*(round(number, 4) for number in self[:-2]), *self[-2:]])
+        return ObjectFit._make([*(round(number, 4) for number in self[:-3]), *self[-3:]])
 
 
 def survey_frames(
@@ -184,16 +186,19 @@ def _view(frames: Frames, i: int, pixels: FramePixels) -> View:
 
 class FirstLook(NamedTuple):
     """Of one object: a fit per kind of lobe that was asked, none where it has too few samples, and
-    how many it has; and ln of the second kind's cost over the first's (see ``FittedKind``)."""
+    how many it has; and ln of the cost of DIELECTRIC over the paper's, and of BECKMANN over that
+    (see ``FittedKind``)."""
 
     lobes: dict[int, LobeEstimate]
     num_samples: int
     log_ratio: float = 0.0
+    of_beckmann: float = 0.0
 
     def arrays(self) -> dict[str, Array]:
         """As checkpoints hold it."""
         flat = {_NAMES[kind]: [*one[:7], *one[7], *one[8:]] for kind, one in self.lobes.items()}
-        every = {"num_samples": self.num_samples, "log_ratio": self.log_ratio, **flat}
+        ratios = {"log_ratio": self.log_ratio, "of_beckmann": self.of_beckmann}
+        every = {"num_samples": self.num_samples, **ratios, **flat}
         return {name: np.array(value) for name, value in every.items()}
 
     @classmethod
@@ -204,13 +209,16 @@ class FirstLook(NamedTuple):
             if name in arrays:
                 one = arrays[name].tolist()
                 lobes[kind] = LobeEstimate._make([*one[:7], (one[7], one[8]), *one[9:]])
-        return cls(lobes, int(arrays["num_samples"]), float(arrays["log_ratio"]))
+        ratios = float(arrays["log_ratio"]), float(arrays["of_beckmann"])
+        return cls(lobes, int(arrays["num_samples"]), *ratios)
 
 
-_NAMES = {PAPER: "paper", DIELECTRIC: "microfacet"}
+_NAMES = {PAPER: "paper", DIELECTRIC: "microfacet", BECKMANN: "beckmann"}
 # Of the logarithms of what lobes leave unexplained, summed over objects: what the two kinds must
 # differ by.
 _PAPER_CLEARER = calibration.number("fit.paper_clearer")
+# The same of one object's facets.
+_BECKMANN_CLEARER = calibration.number("fit.beckmann_clearer")
 
 
 def fitted_by_likelier_lobe(
@@ -224,13 +232,15 @@ def fitted_by_likelier_lobe(
     that; ``asked``: what a person wants of some, by number.
 
     Surfaces are taken to have the lobe of renderers, whose masking and Fresnel term follow from
-    the model of facets, unless the paper's explains the views of all objects clearly better.
+    the model of facets, unless the paper's explains the views of all objects clearly better; and
+    facets after Trowbridge and Reitz, unless Beckmann's explain those of an object so.
     """
     sizes = _sizes(lightings)
     looks: list[FirstLook | None] = [None] * len(sizes)
     kinds = [PAPER]
     if options.method == "views":
-        kinds = [kind for kind, name in _NAMES.items() if options.lobe in (name, "auto")]
+        kinds = [kind for kind in (PAPER, DIELECTRIC) if options.lobe in (_NAMES[kind], "auto")]
+        kinds += [BECKMANN] if DIELECTRIC in kinds else []
         looks = list(first_looks(run, lightings, reader, kinds, options))
     clearer = sum(look.log_ratio for look in looks if look)
     paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
@@ -254,6 +264,8 @@ class _Scene(NamedTuple):
 def _fit(scene: _Scene, piece: tuple[int, FirstLook | None, str]) -> dict[str, Array]:
     index, look, asked = piece
     lightings, reader, options, (lobe,) = scene
+    if look and lobe == DIELECTRIC and look.of_beckmann < -_BECKMANN_CLEARER:
+        lobe = BECKMANN
     return fit_object(lobe, lightings, reader, index, options, look, asked=asked).arrays()
 
 
@@ -261,7 +273,8 @@ def _look_at(scene: _Scene, index: int) -> dict[str, Array]:
     sampled, number = _sampled(scene.lightings, scene.reader, index, MIXTURE)
     fitted = fit_kinds(sampled, scene.kinds, first_seed(scene.options.seed)) if sampled else {}
     lobes = {kind: one.lobe for kind, one in fitted.items()}
-    return FirstLook(lobes, number, sum(one.log_ratio for one in fitted.values())).arrays()
+    ratios = (fitted[kind].log_ratio if kind in fitted else 0.0 for kind in (DIELECTRIC, BECKMANN))
+    return FirstLook(lobes, number, *ratios).arrays()
 
 
 def first_looks(
@@ -359,7 +372,7 @@ def fit_object(
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     found = ObjectFit(
         *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
-        fitted.contradiction, num_samples=used, target=target,
+        fitted.contradiction, num_samples=used, target=target, beckmann=int(lobe == BECKMANN),
     )  # fmt: skip
     if not metal:
         return found

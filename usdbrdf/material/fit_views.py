@@ -29,7 +29,7 @@ from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
+from usdbrdf.transport.brdf import CONDUCTOR, PAPER, is_dielectric
 from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
@@ -94,7 +94,7 @@ class SampledObject(NamedTuple):
         def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
             bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
             base, slope = np.concatenate(bases), np.concatenate(slopes)
-            if kind != DIELECTRIC:
+            if not is_dielectric(kind):
                 return base, slope
             mean, cosine = seen()
             taken = mean * np.stack(kept_below(phis, cosine))[:, :, None]

@@ -14,6 +14,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight
 from usdbrdf.model.material import Surface
 from usdbrdf.model.mesh import doubled_areas
+from usdbrdf.transport.brdf import BECKMANN
 from usdbrdf.transport.renderer_match import matching_factor
 
 Plain = dict[str, Any]
@@ -69,7 +70,7 @@ def two_of_mitsuba(surface: Surface) -> Plain:
     glossy = matching / grey / _GLOSSY_SHARE
     conductor = {
         "type": "roughconductor",
-        "distribution": "ggx",
+        "distribution": "beckmann" if material.lobe == BECKMANN else "ggx",
         "alpha": texture(np.maximum(material.roughness**2, 1e-3), material.wrap, "number"),
         "eta": {"type": "rgb", "value": eta},
         "k": {"type": "rgb", "value": 0.0},

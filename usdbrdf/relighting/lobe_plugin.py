@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.transport.brdf import (
+    BECKMANN,
     DIELECTRIC,
     F0_OF_PSI,
     MIN_ALPHA,
     PAPER,
+    beckmann_distribution,
+    beckmann_masking,
     distribution,
     fresnel,
+    is_dielectric,
     masking,
     masking_width,
     reflectance,
@@ -31,8 +35,8 @@ def register(mi: Any) -> None:
     It takes the textures ``diffuse`` and ``f0`` (colours) and ``phi``, the roughness parameter of
     the lobe, and the number ``lobe``, its kind: f = diffuse / pi + G1(wi) G1(wo) D(h) F(wo, h),
     with the terms of ``brdf``. The back is black. B. Haefner et al. 2021, eq. 2 to 6. Of DIELECTRIC
-    the diffuse part is what the surface lets through twice, t(wi) t(wo) diffuse / pi over t as seen
-    from the front (``let_through``).
+    and BECKMANN the diffuse part is what the surface lets through twice, t(wi) t(wo) diffuse / pi
+    over t as seen from the front (``let_through``).
     """
     if mi.variant() in _registered:
         return
@@ -48,7 +52,7 @@ def register(mi: Any) -> None:
             self.kind = int(props.get("lobe", PAPER))
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             matte = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-            if self.kind == DIELECTRIC:
+            if is_dielectric(self.kind):
                 shares = facet_shares()
                 knots = np.stack([shares.base, shares.rise], axis=-1)
                 means = np.concatenate(shares[2:], axis=1)
@@ -68,7 +72,7 @@ def register(mi: Any) -> None:
 
         def _let_through(self, cos_i: Any, cos_o: Any, f0: Any, phi: Any) -> Any:
             """t(wi) t(wo) over t as seen from the front."""
-            if self.kind != DIELECTRIC:
+            if not is_dielectric(self.kind):
                 return 1.0
             # What reflects more is partly a metal; the rest of it is a dielectric.
             mean = dr.minimum(dr.mean(f0), F0_OF_PSI)
@@ -95,15 +99,20 @@ def register(mi: Any) -> None:
             front = (cos_i > 0) & (cos_o > 0)
             h = dr.normalize(si.wi + wo)
             cos_h, wo_h = mi.Frame3f.cos_theta(h), dr.clip(dr.dot(wo, h), 0, 1)
-            d = distribution(mi.Frame3f.sin_theta_2(h), dr.maximum(phi, MIN_ALPHA))
-            y = masking_width(phi) if self.kind == PAPER else dr.maximum(phi, MIN_ALPHA)
+            alpha, sin2_h = dr.maximum(phi, MIN_ALPHA), mi.Frame3f.sin_theta_2(h)
+            d = drawn = distribution(sin2_h, alpha)
+            y = masking_width(phi) if self.kind == PAPER else alpha
             base, rise = reflectance(wo_h, self.kind, dr.safe_sqrt)
             g = masking(cos_i, y, dr.safe_sqrt) * masking(cos_o, y, dr.safe_sqrt)
+            if self.kind == BECKMANN:
+                d = beckmann_distribution(sin2_h, alpha, dr.exp)
+                of_facets = dr.safe_sqrt, dr.minimum
+                g = math.prod(beckmann_masking(x, alpha, *of_facets) for x in (cos_i, cos_o))
             base = base * share_of_base(f0, self.kind, dr.minimum)
             below = diffuse * self._let_through(cos_i, cos_o, f0, phi) / dr.pi
             value = (below + g * d * (base + f0 * rise)) * cos_o
             share = self._glossy_share(si, diffuse, f0)
-            lobe = d * cos_h / (4 * dr.maximum(wo_h, 1e-8))
+            lobe = drawn * cos_h / (4 * dr.maximum(wo_h, 1e-8))
             density = share * lobe + (1 - share) * cos_o / dr.pi
             return dr.select(front, value, 0), dr.select(front, density, 0)
 

@@ -12,7 +12,7 @@ import numpy as np
 from usdbrdf.asset.layers.interface import write_interface
 from usdbrdf.asset.layers.task_layers import write_refined_layer
 from usdbrdf.asset.maps import AssetMaps, MapWriter, TexelMap, overview
-from usdbrdf.asset.preview_lobe import MICROFACET
+from usdbrdf.asset.preview_lobe import BECKMANN_FACETS, MICROFACET
 from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.task import TaskRun
@@ -37,6 +37,7 @@ def fitted_objects(
     objects = []
     for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True)):
         word, observed = asked.get(i, ""), any(some.is_observed(i) for some in maps)
+        facets = BECKMANN_FACETS if own.beckmann else MICROFACET
         objects.append(
             FittedObject(
                 prim_path=obj.prim_path,
@@ -47,7 +48,7 @@ def fitted_objects(
                 num_pixels=own.num_samples,
                 method=options.method,
                 mapping=mapping,
-                lobe=MICROFACET if microfacet else "paper",
+                lobe=facets if microfacet else "paper",
                 directive=word,
                 **vars(judged(own, obj, options, observed, word)),
             )
@@ -71,8 +72,9 @@ def refined_objects(
         psi=np.array([item.psi_of_channels for item in objects], np.float32),
         conducts=np.array([item.is_metal for item in objects], np.bool_),
     )
+    beckmann = np.array([item.lobe == BECKMANN_FACETS for item in objects], np.bool_)
     lightings = [
-        Lighting(own.lighting, scene, own, own.own_frames)
+        Lighting(own.lighting, replace(scene, beckmann=beckmann), own, own.own_frames)
         for scene, own in zip(lit, maps, strict=True)
     ]
     refined = refined_light(

@@ -12,8 +12,9 @@ f_nd(phi, psi) = base(phi) + psi * slope(phi); psi = 0 still leaves the grazing 
 
 Measured in practice are other surfaces than the paper's. DIELECTRIC is the lobe of renderers: the
 same D, Smith's masking of the same alpha (y = alpha), and Fresnel's equations, made affine in psi
-through F0 of 0.02 and 0.06; below, ``share_of_base`` takes it to nothing. CONDUCTOR has that
-masking, and the paper's F with F0 of each channel.
+through F0 of 0.02 and 0.06; below, ``share_of_base`` takes it to nothing. BECKMANN is the same
+with Beckmann's distribution of facets and their masking. CONDUCTOR has the masking of DIELECTRIC,
+and the paper's F with F0 of each channel.
 
 The formulas are plain operators: they take numbers, NumPy's arrays and Dr.Jit's, and may be called
 from compiled functions, in whose precision they are computed.
@@ -30,7 +31,7 @@ from numba.extending import register_jitable
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double
 
-PAPER, DIELECTRIC, CONDUCTOR = 0, 1, 2  # kinds of lobes
+PAPER, DIELECTRIC, CONDUCTOR, BECKMANN = 0, 1, 2, 3  # kinds of lobes
 F0_OF_PSI = 0.08
 MIN_ALPHA = 0.001
 F = TypeVar("F", bound=Callable[..., Any])
@@ -71,6 +72,36 @@ def masking(x: Any, y: Any, sqrt: Any = np.sqrt) -> Any:
     return 1.0 / (x + sqrt(stretched(x2, 1.0 - x2, y * y)))
 
 
+_UPRIGHT = 1e-6
+
+
+@formula
+def beckmann_distribution(sin2_h: Any, alpha: Any, exp: Any = np.exp) -> Any:
+    """D of facets whose slopes are normally distributed (P. Beckmann and A. Spizzichino, 1963),
+    from sin^2 of the angle between normal and half vector."""
+    # A facet may stand upright: then this is 0, not 0 / 0.
+    cos2, alpha2 = 1.0 + _UPRIGHT - sin2_h, alpha * alpha
+    return exp(-sin2_h / (cos2 * alpha2)) / (np.pi * alpha2 * cos2 * cos2)
+
+
+# Where nothing is masked any more.
+_UNMASKED = 1.6
+
+
+@formula
+def beckmann_masking(x: Any, alpha: Any, sqrt: Any = np.sqrt, minimum: Any = np.minimum) -> Any:
+    """G1 of these facets over 2 x, as ``masking`` is, for a cosine x in (0, 1): the rational form
+    of B. Walter et al., "Microfacet Models for Refraction through Rough Surfaces", 2007."""
+    a = minimum(_UNMASKED, x / (alpha * sqrt(1.0 - x * x)))
+    return a * (3.535 + 2.181 * a) / (1.0 + a * (2.276 + 2.577 * a)) / (2.0 * x)
+
+
+@formula
+def is_dielectric(kind: int) -> bool:
+    """Whether Fresnel's equations of a dielectric hold for a kind of lobe."""
+    return kind in (DIELECTRIC, BECKMANN)
+
+
 @formula
 def grazing(cos_wh: Any) -> Any:
     """Schlick's (1 - w.h)^5 of a cosine in [0, 1]."""
@@ -94,7 +125,7 @@ _LOW_IOR, _HIGH_IOR = ((1 + f0**0.5) / (1 - f0**0.5) for f0 in (_LOW_F0, _HIGH_F
 @formula
 def reflectance(cos_wh: Any, kind: int, sqrt: Any = np.sqrt) -> Any:
     """(base, rise) of F = base + F0 rise at a cosine in [0, 1], by the kind of lobe."""
-    if kind == DIELECTRIC:
+    if is_dielectric(kind):
         low = dielectric_fresnel(_LOW_IOR, cos_wh, sqrt)
         rise = (dielectric_fresnel(_HIGH_IOR, cos_wh, sqrt) - low) / (_HIGH_F0 - _LOW_F0)
         return low - _LOW_F0 * rise, rise
@@ -106,7 +137,7 @@ def share_of_base(f0: Any, kind: int, minimum: Any = np.minimum) -> Any:
     """By what ``base`` is to be multiplied where F0 is known, so that F vanishes with F0: a
     dielectric of the index of air reflects nothing at any angle. Fresnel's equations below the
     least F0 that F is made affine from, to .007 (root mean square over cosines)."""
-    return minimum(1.0, f0 / _LOW_F0) ** (1 / 6) if kind == DIELECTRIC else 1.0
+    return minimum(1.0, f0 / _LOW_F0) ** (1 / 6) if is_dielectric(kind) else 1.0
 
 
 @formula

@@ -15,7 +15,7 @@ from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.transport.brdf import PAPER
+from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import Lights, lights_from_radiance
 from usdbrdf.transport.rays import Hits, RayScene
@@ -70,13 +70,24 @@ class SurfacePoints(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class LitScene(TexturedScene):
     """With its light: L_d as texture and as lights, the emission mask, and the surroundings; and
-    the kind of lobe (``brdf``) that its surfaces have."""
+    the kind of lobe (``brdf``) that its surfaces have, where it is DIELECTRIC but for the objects
+    that are ``beckmann`` (num_objects,)."""
 
     radiance: SurfaceTexture
     lights: Lights
     emission: SurfaceTexture
     environment: Environment
     lobe: int = PAPER
+    beckmann: Bool | None = None
+
+    def kinds_of_lobe(self, face: Int, metal: Bool) -> Int:
+        """(R,): of the surfaces of triangles (R,), some of them ``metal`` (R,)."""
+        kinds = np.full(len(face), self.lobe, np.int32)
+        if self.lobe == DIELECTRIC:
+            if self.beckmann is not None:
+                kinds[self.beckmann[self.scene.face_object[face]]] = BECKMANN
+            kinds[metal] = CONDUCTOR
+        return kinds
 
     def emits(self, place: SurfacePoints | Hits) -> Bool:
         """(R,): is there an emitter?"""

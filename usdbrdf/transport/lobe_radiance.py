@@ -18,12 +18,13 @@ import numpy as np
 from usdbrdf.kernel import kernel, loop, parallel_kernel
 from usdbrdf.model.arrays import Bits, Double, Float, Int, Long
 from usdbrdf.transport.brdf import (
-    CONDUCTOR,
-    DIELECTRIC,
+    BECKMANN,
     F0_OF_PSI,
     MIN_ALPHA,
     PAPER,
     alpha_of_phi,
+    beckmann_distribution,
+    beckmann_masking,
     clamped,
     half_vector,
     masking,
@@ -263,7 +264,7 @@ def integrate(
     samples, means of each group of consecutive points, with the group's roughnesses phis (G, Q)."""
     group = len(samples.cos_out) // len(phis)
     # Allocated here: to do so for each point takes longer than most of what is added there.
-    of_lobes = np.empty((3, phis.shape[1]), np.float32)
+    of_lobes = np.empty((4, phis.shape[1]), np.float32)
     of_angles = np.empty((2, samples.cos_in.shape[1]))
     for g in range(first, last):
         for r in range(g * group, (g + 1) * group):
@@ -286,16 +287,19 @@ def _add_point(
     of_angles: Double,
 ) -> None:
     """Those of point ``r``, times ``share``: D and G1 in single precision and for all roughnesses
-    side by side, as vector instructions want it; F for all samples. of_lobes (3, Q) and of_angles
+    side by side, as vector instructions want it; F for all samples. of_lobes (4, Q) and of_angles
     (2, K) are room for what is computed once."""
     cos_in, sin2_half, weighted = samples.cos_in[r], samples.sin2_half[r], samples.weighted[r]
     cos_half, cos_out = samples.cos_half[r], samples.cos_out[r]
     one, count = np.float32(1), len(phis)
-    alpha2, y2, scale = of_lobes[0], of_lobes[1], of_lobes[2]
+    alpha2, y2, scale, dg = of_lobes[0], of_lobes[1], of_lobes[2], of_lobes[3]
     for q in range(count):
         y = np.float32(width_of_masking(phis[q], kind))
         alpha2[q], y2[q] = alpha_of_phi(phis[q]) ** 2, y * y
-        scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
+        if kind == BECKMANN:
+            scale[q] = share * beckmann_masking(cos_out, y)
+        else:
+            scale[q] = share * masking(cos_out, y) * alpha2[q] / np.pi
     of_base, of_rise = of_angles[0], of_angles[1]
     for k in range(len(cos_in)):
         of_base[k], of_rise[k] = reflectance(cos_half[k], kind)
@@ -305,21 +309,26 @@ def _add_point(
         x, s2 = cos_in[k], sin2_half[k]
         if x <= 0:
             continue
-        x2, c2 = x * x, one - s2
-        rest = one - x2
+        x2, rest = x * x, one - x * x
         red, green, blue = weighted[k, 0], weighted[k, 1], weighted[k, 2]
         b, s = of_base[k], F0_OF_PSI * of_rise[k]
         b_r, b_g, b_b = np.float32(b * red), np.float32(b * green), np.float32(b * blue)
         s_r, s_g, s_b = np.float32(s * red), np.float32(s * green), np.float32(s * blue)
+        if kind == BECKMANN:
+            for q in range(count):
+                y = np.sqrt(y2[q])
+                dg[q] = scale[q] * beckmann_distribution(s2, y) * beckmann_masking(x, y)
+        else:
+            for q in range(count):
+                below = stretched(s2, one - s2, alpha2[q])
+                dg[q] = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
         for q in range(count):
-            below = stretched(s2, c2, alpha2[q])
-            dg = scale[q] / (below * below * (x + np.sqrt(stretched(x2, rest, y2[q]))))
-            base_r[q] += dg * b_r
-            base_g[q] += dg * b_g
-            base_b[q] += dg * b_b
-            slope_r[q] += dg * s_r
-            slope_g[q] += dg * s_g
-            slope_b[q] += dg * s_b
+            base_r[q] += dg[q] * b_r
+            base_g[q] += dg[q] * b_g
+            base_b[q] += dg[q] * b_b
+            slope_r[q] += dg[q] * s_r
+            slope_g[q] += dg[q] * s_g
+            slope_b[q] += dg[q] * s_b
 
 
 def trace_lobe_samples(
@@ -434,14 +443,14 @@ def lobe_radiance(
     psi = psi if psi.ndim == 2 else psi[:, None]
     result = np.zeros((len(phi), 3), np.float32)
     stream = np.arange(len(phi)) if stream is None else stream
-    metal = (psi > 1).any(axis=1)
-    if lit.lobe == DIELECTRIC and metal.any():
-        for kind, own in ((DIELECTRIC, ~metal), (CONDUCTOR, metal)):
-            which = np.flatnonzero(own)
+    kinds = lit.kinds_of_lobe(points.face, np.asarray((psi > 1).any(axis=1)))
+    if (kinds != lit.lobe).any():
+        for kind in np.unique(kinds):
+            which = np.flatnonzero(kinds == kind)
+            one = replace(lit, lobe=int(kind), beckmann=None)
             result[which] = lobe_radiance(
-                replace(lit, lobe=kind), points.take(which), phi[which], psi[which], rays, seed,
-                stream[which], group,
-            )  # fmt: skip
+                one, points.take(which), phi[which], psi[which], rays, seed, stream[which], group
+            )
         return result
     step = max(1, _RAYS_AT_ONCE // rays)
     for start in range(0, len(phi), step):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from usdbrdf.asset.preview_lobe import MICROFACET, fit_from_preview_surface
+from usdbrdf.asset.preview_lobe import BECKMANN_FACETS, MICROFACET, fit_from_preview_surface
 from usdbrdf.asset.readers.scene import (
     asset_file,
     authored,
@@ -27,7 +27,7 @@ from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.material import Material, Surface, constant_map, preview_material
 from usdbrdf.model.mesh import Triangulation
-from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, PAPER
+from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.renderer_match import shown_share_of_metal
 from usdbrdf.untrusted.usd_files import numbers_of
 
@@ -70,7 +70,7 @@ class _MaterialReader:
         mapping  "matched" or "microfacet" if the surface was told what renderers need to show a
                  fitted lobe: what comes back is the lobe that was meant. A map of roughness counts
                  by its mean.
-        lobe     whose equations the fitted numbers are of, "microfacet" or the paper's
+        lobe     whose equations the fitted numbers are of, "microfacet", "beckmann" or the paper's
                  Half metals and the specular workflow are never ours: those stay as they are
         """
         shader = bound.ComputeSurfaceSource()[0] if bound else None
@@ -105,7 +105,8 @@ class _MaterialReader:
             specular=known["specularColor"] if known["useSpecularWorkflow"].flat[0] else None,
         )
         kind = DIELECTRIC if MICROFACET in (mapping, lobe) else PAPER
-        if kind == DIELECTRIC and known["useSpecularWorkflow"].any():
+        kind = BECKMANN if lobe == BECKMANN_FACETS else kind
+        if kind != PAPER and known["useSpecularWorkflow"].any():
             kind = CONDUCTOR  # any reflectance, which Fresnel's equations of a dielectric have not
         normal = self._normal(shader.GetInput("normal") if shader else None)
         return replace(material, wrap=self.wrap or "clamp", lobe=kind, clear=clear, normal=normal)
