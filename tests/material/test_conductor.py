@@ -42,12 +42,12 @@ def _incident(seed: int) -> np.ndarray:
     return np.where(rng.random((len(TEXEL), 1)) < 0.2, 8.0, 1.0) * dim
 
 
-def _basis(seed: int):
+def _basis(seed: int, phi: float = PHI):
     """(base, slope) of roughnesses: sharp where phi is small, evened out where it is large."""
     light, noise = _incident(1), np.random.default_rng(seed)
 
     def basis(phis: Any) -> tuple[np.ndarray, np.ndarray]:
-        blur = np.exp(-np.abs(np.log(np.maximum(np.asarray(phis), 1e-3) / PHI)))
+        blur = np.exp(-np.abs(np.log(np.maximum(np.asarray(phis), 1e-3) / phi)))
         seen = light[..., None] * blur + light.mean() * (1 - blur)
         seen = seen * (1 + 0.03 * noise.standard_normal(seen.shape))
         return (0.01 * seen).astype(np.float32), (F0_OF_PSI * seen).astype(np.float32)
@@ -55,11 +55,11 @@ def _basis(seed: int):
     return basis
 
 
-def _found(radiance: np.ndarray, psi: float, *, certain: bool = False):
+def _found(radiance: np.ndarray, psi: float, *, certain: bool = False, phi: float = PHI):
     noisy = radiance * (1 + 0.02 * np.random.default_rng(9).standard_normal(radiance.shape))
     dielectric = LobeEstimate(PHI, psi, 0.02, 0.1, 0.0, 1.0, 0.9)
     irradiance = np.full((len(TEXEL), 3), 1.5, np.float32)
-    bases = _basis(2), _basis(3)
+    bases = _basis(2, phi), _basis(3, phi)
     noisy = noisy.astype(np.float32)
     return conductor_of(noisy, TEXEL, irradiance, bases, dielectric, certain=certain)
 
@@ -71,6 +71,13 @@ def test_a_metal_is_found_with_its_colour():
     np.testing.assert_allclose(metal.f0, F0, atol=0.03)
     assert metal.clearer > 0.5
     assert metal.f0_error < 0.05
+
+
+def test_the_roughest_metal_is_told_by_nobody_but_a_person():
+    rough = (0.01 + F0) * _incident(1)
+    assert _found(rough, 1.0, phi=0.46) is not None
+    assert _found(rough, 1.0, phi=0.6) is None
+    assert _found(rough, 1.0, phi=0.6, certain=True) is not None
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.4])

@@ -71,7 +71,8 @@ def conductor_of(
         errors[k] = _size(seen - base - f0 * slope, seen - other_base - f0 * other_slope)
     best = int(errors.argmin())
     f0 = reflectances[best]
-    if f0.mean() < _LEAST_F0 and not certain:
+    # What is rougher still than all that are tried looks like a diffuse surface, and may be one.
+    if (f0.mean() < _LEAST_F0 or best == len(_PHIS) - 1) and not certain:
         return None
     found = [_relative(basis([dielectric.phi]), level) for basis in bases]
     psi = dielectric.psi * F0_OF_PSI
