@@ -74,6 +74,26 @@ def test_it_finds_nothing_in_any_variant_of_a_sound_asset(run, built):
     assert done.returncode == 0, done.stderr
 
 
+def test_what_several_rules_look_at_is_gathered_once(built, monkeypatch):
+    from usd_validation_nvidia import ValidationEngine
+
+    from usdbrdf.validation.nvidia import Plugin
+
+    looked = []
+    monkeypatch.setattr("usdbrdf.validation.rule._asset_paths", lambda x: looked.append(x) or [])
+    plugin = Plugin()
+    plugin.on_startup()
+    try:
+        engine = ValidationEngine(init_rules=False, variants=False)
+        for checker in plugin._checkers:
+            engine.enable_rule(checker)
+        engine.validate(str(built.asset.root_layer))
+    finally:
+        plugin.on_shutdown()
+    assert looked
+    assert len(set(looked)) == len(looked)
+
+
 def test_its_engine_finds_a_fault(run, built):
     FAULTS["BindingBesideLooks"](built)
     done = run(built.asset.root_layer, "as selected", program=("-c", _ENGINE))

@@ -202,11 +202,11 @@ def test_meshes_whose_maps_cannot_be_carried_over_stay(with_ball, tmp_path, caps
     assert re.search(r"stay as they are: </room/ball> has a texture whose alpha is used\.", told)
 
 
-def _with_roughness(room, file, *, scale=None, kind="UsdUVTexture"):
+def _with_roughness(room, file, *, scale=None, kind="UsdUVTexture", inside="/room/varnish"):
     """A roughness that a node of its own reads, at coordinates scaled by ``scale``."""
     layer = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
     stage = Usd.Stage.Open(layer)
-    node = UsdShade.Shader.Define(stage, "/room/varnish/Rough")
+    node = UsdShade.Shader.Define(stage, f"{inside}/Rough")
     node.CreateIdAttr(kind)
     if kind == "UsdUVTexture":
         node.CreateInput("file", Types.Asset).Set(f"./{file}")
@@ -249,6 +249,7 @@ def test_textures_of_one_name_stay_apart(with_ball, tmp_path, capfd):
     [
         ({"scale": 4.0}, "has textures at several coordinates"),
         ({"kind": "UsdPrimvarReader_float"}, "reads values of its vertices"),
+        ({"inside": "/room/shared"}, "has a material with nodes elsewhere"),
     ],
 )
 def test_what_has_no_one_place_on_the_coarse_mesh_stays(with_ball, tmp_path, capsys, change, told):

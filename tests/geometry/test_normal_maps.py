@@ -86,6 +86,19 @@ def test_a_flat_surface_gives_exactly_flat_normals():
     assert (found == np.float32([0, 0, 1])).all()
 
 
+@pytest.mark.parametrize("height", [-0.02, 0.0, 0.005, 0.01, 0.03])
+def test_a_coarse_face_beyond_a_thin_board_sees_the_side_that_faces_as_it_does(height):
+    """A board 1 cm thick: its upper side is triangles 0 and 1, its lower one 2 and 3."""
+    upper = QUAD + np.float32([0, 0, 0.01])
+    board = RayScene(np.concatenate([upper, QUAD]), np.concatenate([HALVES, HALVES[:, ::-1] + 4]))
+    position = np.float32([[0.3, 0.6, height], [0.7, 0.2, height]])
+    for normal, faces in (([0, 0, 1], {0, 1}), ([0, 0, -1], {2, 3})):
+        normals = np.tile(np.float32(normal), (2, 1))
+        hits, met = seen_along_normals(board, position, normals, 0.05)
+        assert met.all()
+        assert set(hits.face.tolist()) == faces
+
+
 def test_waves_on_a_plane():
     """z = h sin(kx) sin(ky), 12 degrees steep, under two triangles."""
     height, k, side = 0.005, 2 * np.pi * 4, 257

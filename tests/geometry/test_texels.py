@@ -55,6 +55,13 @@ def test_areas_of_the_interior_texels_add_up_to_the_mesh(kind: str):
     assert (texels.area > 0).all()
 
 
+def test_the_mean_of_what_is_one_everywhere_is_no_more_than_one():
+    # Single precision adds weights and weighted values up to different roundings.
+    texels = _sphere().texels
+    ones = np.ones((len(texels.area), 3), np.float32)
+    assert texels.mean_of_object(0, ones).astype(np.float32).tolist() == [1, 1, 1]
+
+
 def test_the_surface_of_a_square_is_shared_out_exactly():
     texels = world_of([quad((0, 0, 0), (2, 0, 0), (0, 3, 0), size=(20, 10))]).texels
     np.testing.assert_allclose(texels.area, 2 * 3 / 200, rtol=1e-5)

@@ -205,6 +205,17 @@ def test_nobody_is_shut_out(opened, page_file, width, scheme):
     assert serious == [], [node["html"][:200] for v in found for node in v["nodes"]]
 
 
+@pytest.mark.parametrize("width", [1440, 390, 320])
+def test_the_steps_between_views_stay_side_by_side(opened, page_file, width):
+    shown = opened(page_file.as_uri(), viewport={"width": width, "height": 900})
+    before, after = (
+        shown.get_by_role("button", name=name, exact=True).bounding_box()
+        for name in ("previous", "next")
+    )
+    assert before["y"] == after["y"]
+    assert after["x"] - before["x"] - before["width"] < 12
+
+
 @pytest.mark.parametrize("width", [1440, 390])
 def test_figures_can_be_read_on_a_screen_of_any_width(opened, page_file, width):
     shown = opened(page_file.as_uri(), viewport={"width": width, "height": 900})

@@ -26,6 +26,18 @@ def test_a_missing_texture_and_photograph_are_named(built):
     assert "frame 02 é.exr@ does not exist. [usdbrdf.MissingPhotograph]" in findings
 
 
+def test_an_asset_without_its_whole_capture_is_not_warned_of(built):
+    """It is whole without; a capture of which some is missing is likely not what was meant."""
+    first, *others = built.scan.frames.image_paths
+    first.unlink()
+    (finding,) = validate(built.asset.root_layer)
+    assert (finding.rule, finding.severity) == ("usdbrdf.MissingPhotograph", Severity.WARNING)
+    for photograph in others:
+        photograph.unlink()
+    (finding,) = validate(built.asset.root_layer)
+    assert (finding.rule, finding.severity) == ("usdbrdf.MissingPhotograph", Severity.INFO)
+
+
 def test_usds_own_validators_are_asked(built):
     edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
     prim = Sdf.CreatePrimInLayer(edits, "/room/geo/wall/wall")

@@ -153,6 +153,7 @@ def _material(
     problems = {
         "has several materials": divided,
         "has no UsdPreviewSurface": not shader or shader.GetShaderId() != "UsdPreviewSurface",
+        "has a material with nodes elsewhere": bool(material) and _has_nodes_elsewhere(material),
         "has other materials for other purposes": any(
             other and other.GetPath() != material.GetPath() for other in others
         ),
@@ -172,6 +173,14 @@ def _material(
     }
     why = next((said for said, found in problems.items() if found), "")
     return (None, why) if why else (material, "")
+
+
+def _has_nodes_elsewhere(material: UsdShade.Material) -> bool:
+    """Whether its network goes on outside of it, where other materials may share it."""
+    inside = Usd.PrimRange(material.GetPrim())
+    sources = (path for prim in inside for each in prim.GetAttributes()
+               for path in each.GetConnections())  # fmt: skip
+    return any(not path.HasPrefix(material.GetPath()) for path in sources)
 
 
 def _where(node: UsdShade.Shader, name: str = "st") -> tuple[object, ...]:

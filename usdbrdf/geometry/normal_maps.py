@@ -16,6 +16,8 @@ from usdbrdf.transport.rays import Hits, RayScene
 # No normal of a map leans more than this from the coarse surface's, as a cosine: renderers divide
 # by it, and a surface that turns its back to the viewer is black.
 _LEAST_Z = 0.05
+# Surfaces that face the other way, which a ray goes through to one that is meant.
+_SHEETS = 4
 
 
 def corner_tangents(
@@ -81,17 +83,26 @@ def seen_along_normals(
     # From a little behind: where both surfaces meet, rounding lets either be in front.
     behind = np.float32(1e-3 * reach_m) + 8 * np.float32(1.2e-7) * np.abs(positions).max(initial=0)
     nearest = np.full(len(positions), np.inf, np.float32)
-    best: Hits | None = None
+    best = Hits(np.full(len(positions), -1, np.int32), *np.zeros((3, len(positions)), np.float32))
     for sign in (np.float32(1), np.float32(-1)):
-        directions = np.ascontiguousarray(sign * normals)
-        hits = fine.closest(np.ascontiguousarray(positions - directions * behind), directions)
-        away = np.abs(hits.distance - behind)
-        same = np.einsum("rc,rc->r", facing[hits.face], normals) > 0
-        better = (hits.face >= 0) & (away <= reach_m) & same & (away < nearest)
-        nearest[better] = away[better]
-        pairs = zip(hits, best or hits, strict=True)
-        best = Hits(*(np.where(better, new, old) for new, old in pairs))
-    assert best is not None
+        waiting, passed = np.arange(len(positions)), np.full(len(positions), -behind, np.float32)
+        for _ in range(_SHEETS):
+            directions = np.ascontiguousarray(sign * normals[waiting])
+            hits = fine.closest(
+                np.float32(positions[waiting] + directions * passed[:, None]), directions
+            )
+            away = hits.distance + passed
+            near = (hits.face >= 0) & (away <= reach_m)
+            same = np.einsum("rc,rc->r", facing[hits.face], normals[waiting]) > 0
+            better = near & same & (np.abs(away) < nearest[waiting])
+            nearest[waiting[better]] = np.abs(away[better])
+            for known, new in zip(best, hits, strict=True):
+                known[waiting[better]] = new[better]
+            # Behind the other side of something thin lies the side that is meant.
+            on = near & ~same
+            waiting, passed = waiting[on], away[on] + behind
+            if not len(waiting):
+                break
     return best, np.isfinite(nearest)
 
 

@@ -159,7 +159,9 @@ class Texels:
     def mean_of_object(self, index: int, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """(...): the mean over one object's surface of per-texel values (T, ...)."""
         own = self.of_object(index)
-        return np.average(values[own], axis=0, weights=np.maximum(self.area[own], 1e-12))
+        # Single precision has the mean of ones above one.
+        weights = np.maximum(self.area[own], 1e-12, dtype=np.float64)
+        return np.average(values[own], axis=0, weights=weights)
 
     def segments(self, index: Long) -> Int:
         """(N,) int32, equal for texels ``index`` (N,) of one object that face alike: their normals

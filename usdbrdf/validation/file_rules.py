@@ -182,7 +182,8 @@ def missing_texture(scene: AssetStage) -> Iterator[Fault]:
 @rule(Severity.WARNING)
 def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
     """The photographs that photographs.usdc names exist. They are not needed to render the asset,
-    but to evaluate it and to measure anything anew.
+    but to evaluate it and to measure anything anew. Without any the asset is likely a copy: that
+    is worth knowing, and no warning.
 
     Put the capture back where it was; ignore it where the asset is only shown."""
     file = scene.asset.photographs_layer if scene.asset else None
@@ -192,7 +193,8 @@ def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
     named = sorted({located(layer, path) for path in named_files(layer)})
     if gone := [path for path in named if not _is_there(path)]:
         more = f" Nor do {len(gone) - 1} more of its photographs." if len(gone) > 1 else ""
-        yield Fault(layer, f"@{gone[0]}@ does not exist.{more}")
+        severity = Severity.INFO if len(gone) == len(named) > 1 else None
+        yield Fault(layer, f"@{gone[0]}@ does not exist.{more}", severity)
 
 
 def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site]]]:

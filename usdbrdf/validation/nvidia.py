@@ -22,7 +22,8 @@ class Plugin:
     """What the entry point names: adds the rules when the validator starts."""
 
     def __init__(self) -> None:
-        self._checkers = [_checker(rule) for rule in RULES]
+        scenes = _Scenes()
+        self._checkers = [_checker(rule, scenes) for rule in RULES]
 
     def on_startup(self) -> None:
         for checker in self._checkers:
@@ -33,7 +34,23 @@ class Plugin:
             validator.unregister_rule(checker)
 
 
-def _checker(rule: Rule) -> type[Any]:
+class _Scenes:
+    """The stage that is being checked, as all rules look at it: what several of them need is
+    gathered once. The engine runs all checks of a stage before it switches its first variant."""
+
+    def __init__(self) -> None:
+        self._latest: AssetStage | None = None
+
+    def of(self, stage: Usd.Stage) -> AssetStage:
+        if self._latest is None or self._latest.stage != stage:
+            self._latest = AssetStage(stage)
+        return self._latest
+
+    def forget(self) -> None:
+        self._latest = None
+
+
+def _checker(rule: Rule, scenes: _Scenes) -> type[Any]:
     """A rule as a class; its name begins with UsdBrdf, as all names share one namespace."""
 
     # What is no coroutine it would run in another thread, while it switches the stage's variants.
@@ -44,11 +61,15 @@ def _checker(rule: Rule) -> type[Any]:
             Severity.WARNING: self._AddWarning,
             Severity.INFO: self._AddInfo,
         }
-        for fault in rule.check(AssetStage(stage)):
+        for fault in rule.check(scenes.of(stage)):
             layer = isinstance(fault.site, Sdf.Layer)
             message = f"@{fault.site.realPath}@: {fault.message}" if layer else fault.message
             at = None if layer else fault.site
             adders[fault.severity or rule.severity](message=message, at=at)
 
-    body = {"__doc__": f"{rule.description} {rule.advice}", "CheckStage": check_stage}
+    body = {
+        "__doc__": f"{rule.description} {rule.advice}",
+        "CheckStage": check_stage,
+        "ResetCaches": lambda self: scenes.forget(),
+    }
     return type(f"UsdBrdf{rule.name}", (validator.BaseRuleChecker,), body)

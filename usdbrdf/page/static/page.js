@@ -476,8 +476,9 @@
     body.append(
       el('div', { class: 'bar' },
         el('label', {}, 'View ', view),
-        el('button', { type: 'button', onclick: () => step(-1) }, 'previous'),
-        el('button', { type: 'button', onclick: () => step(1) }, 'next'), leftLabel, rightLabel),
+        el('span', { class: 'steps' },
+          el('button', { type: 'button', onclick: () => step(-1) }, 'previous'),
+          el('button', { type: 'button', onclick: () => step(1) }, 'next')), leftLabel, rightLabel),
       frame, at, told, flips);
     show();
     const line = (metric) => ['baseline', 'full'].map((model) => ({
