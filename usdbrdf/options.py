@@ -249,8 +249,8 @@ class FitOptions(Options):
     frame, L_d times a free factor; paper: one target frame, the paper's residual"""
     lobe: Literal["auto", "paper", "microfacet"] = option("--lobe", "auto")
     """whose lobe the surfaces have: paper: the paper's equations; microfacet: that of renderers,
-    Smith's masking and Fresnel's equations; auto: whichever explains the views (of the methods of
-    one target frame, the paper's)"""
+    Smith's masking and Fresnel's equations, with facets after GGX or Beckmann; auto: whichever
+    explains the views (of the methods of one target frame, the paper's)"""
     max_pixels: int = option("--max-pixels N", 1500, (50, 2**31 - 1))
     "fit to at most this many pixels of an object's target frame"
     mapping: Literal["measured", "matched"] = option("--material", "matched")

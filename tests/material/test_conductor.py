@@ -170,7 +170,8 @@ def _lobe(evidence: float) -> LobeEstimate:
 
 @pytest.mark.parametrize(("clearer", "of_beckmann", "chosen", "of_object"), [
     (0.9, 0.0, PAPER, PAPER),
-    (0.9, -0.9, PAPER, PAPER),  # which has facets of its own
+    (0.9, -0.1, PAPER, PAPER),
+    (0.9, -0.9, DIELECTRIC, BECKMANN),  # whose facets explain as much
     (-0.9, 0.1, DIELECTRIC, DIELECTRIC),
     (0.1, -0.1, DIELECTRIC, DIELECTRIC),  # hardly clearer: the lobe of renderers
     (-0.9, -0.4, DIELECTRIC, BECKMANN),

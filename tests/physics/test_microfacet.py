@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from tests.physics.surfaces import quad, world_of
 from tests.physics.test_predict import RGB, _open_sky, _points
 from usdbrdf.transport.brdf import (
     BECKMANN,
@@ -16,11 +17,13 @@ from usdbrdf.transport.brdf import (
     F0_OF_PSI,
     PAPER,
     beckmann_distribution,
+    beckmann_masking,
     distribution,
     reflectance,
     width_of_masking,
 )
 from usdbrdf.transport.directional_albedo import fitted_albedo
+from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.renderer_match import cycles_albedo
 
@@ -126,17 +129,31 @@ def test_cycles_shows_nearly_what_was_fitted():
 
 
 def test_objects_with_facets_after_beckmann_reflect_by_these():
-    lit = replace(_open_sky(), lobe=DIELECTRIC)
-    one, points = np.ones(6, np.float32), _points(70 * np.ones(6))
-    owner = lit.scene.face_object[points.face]
-    of_objects = np.zeros(len(lit.scene.objects), bool)
-    assert (owner == owner[0]).all()
-    for beckmann, kind in ((of_objects, DIELECTRIC), (~of_objects, BECKMANN)):
-        found = lobe_radiance(
-            replace(lit, beckmann=beckmann), points, 0.3 * one, one, 32, 0, np.arange(6)
-        )
-        alone = lobe_radiance(replace(lit, lobe=kind), points, 0.3 * one, one, 32, 0, np.arange(6))
-        np.testing.assert_array_equal(found, alone)
+    # Three floors side by side; the second has them.
+    world = world_of([quad((4 * k, 0, 0), (4, 0, 0), (0, 4, 0)) for k in range(3)])
+    lit = world.lit(world.per_object([RGB] * 3))
+    sky = replace(lit, environment=_open_sky().environment, lobe=DIELECTRIC)
+    face = np.array([0, 2, 3, 4, 5, 1], np.int32)
+    points = _points(70 * np.ones(6))._replace(face=face)
+    one, stream = np.ones(6, np.float32), np.arange(6)
+
+    def found(lit: LitScene, own: np.ndarray) -> np.ndarray:
+        return lobe_radiance(lit, points.take(own), 0.3 * one[own], one[own], 32, 0, own)
+
+    all_of_them = found(replace(sky, beckmann=np.array([False, True, False])), stream)
+    rounded = np.isin(stream, [1, 2])
+    for kind, own in ((DIELECTRIC, ~rounded), (BECKMANN, rounded)):
+        which = np.flatnonzero(own)
+        np.testing.assert_array_equal(all_of_them[own], found(replace(sky, lobe=kind), which))
+    assert (found(replace(sky, lobe=DIELECTRIC), stream) != all_of_them)[rounded].all()
+
+
+def test_light_that_comes_and_goes_along_the_normal_is_finite():
+    one = np.ones(64, np.float32)
+    lit = replace(_open_sky(), lobe=BECKMANN)
+    assert np.isfinite(lobe_radiance(lit, _points(0 * one), 0.1 * one, one, 64, 0)).all()
+    beyond = np.float32([1 - 1e-7, 1, 1 + 1e-7, 1 + 4e-7])
+    np.testing.assert_allclose(beckmann_masking(beyond, np.float32(0.1)), 0.5, rtol=1e-4)
 
 
 def test_a_metal_among_dielectrics_reflects_by_its_own_equations():

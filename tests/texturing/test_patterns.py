@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
@@ -20,6 +20,7 @@ from usdbrdf.texturing.patterns import (
     Covering,
     Equations,
     PatternedSurface,
+    _couple,
     add,
     pixels_of_frame,
     share_that_is_no_noise,
@@ -81,7 +82,8 @@ def _stripes(period: float = 3.4) -> Float:
 def _surface(floor: World, values: Float) -> PatternedSurface:
     own = np.arange(SIDE * SIDE, dtype=np.int32)
     scatter = np.full(len(own), 0.2**2, np.float32) * values.mean() ** 2
-    return PatternedSurface(floor.scene, floor.rays, floor.texels, values, own, scatter)
+    owner = floor.texels.object_index()
+    return PatternedSurface(floor.scene, floor.rays, floor.texels, owner, values, own, scatter)
 
 
 def _found(
@@ -124,9 +126,17 @@ def test_stripes_that_pixels_blur_come_back(floor: World, tmp_path: Path):
     assert _off(found, truth) < 0.35 * _off(mean, truth)
 
 
-def test_a_plain_floor_stays_plain(floor: World, tmp_path: Path):
+@pytest.mark.parametrize("spread", [0.0, 0.7])
+def test_a_plain_floor_stays_plain(floor: World, tmp_path: Path, spread: float):
+    # What was denoised or interpolated has noise that neighbours share.
     plain = np.ones((SIDE, SIDE, 3), np.float32)
-    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), _seen(plain, 0.03), tmp_path)
+    pictures = []
+    for k, (camera, shown) in enumerate(_seen(plain, 0.0)):
+        noise = np.random.default_rng(k).normal(size=shown.radiance.shape)
+        noise = gaussian_filter(noise, (spread, spread, 0))
+        noisy = shown.radiance + np.float32(0.03 / noise.std()) * noise.astype(np.float32)
+        pictures.append((camera, shown._replace(radiance=noisy)))
+    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures, tmp_path)
     assert _off(found, plain.reshape(-1, 3)) < 0.3 * 0.03
 
 
@@ -179,37 +189,106 @@ def test_the_unit_of_radiance_makes_no_difference(floor: World, tmp_path: Path, 
     np.testing.assert_allclose(again / np.float32(scale), once, rtol=2e-3, atol=2e-3)
 
 
-def test_what_a_texel_gets_does_not_depend_on_its_group(tmp_path: Path):
-    # Longer than what two groups share.
-    long = 320
-    floor = world_of([quad((0, 0, 0), (0.4, 0, 0), (0, long * TEXEL, 0), (20, long))])
-    texels = floor.texels
-    random = np.random.default_rng(3)
-    values = random.uniform(0.5, 1.5, (len(texels), 3)).astype(np.float32)
-    own = np.arange(len(texels), dtype=np.int32)
-    surface = PatternedSurface(
-        floor.scene, floor.rays, texels, values, own, np.full(len(own), 0.04, np.float32)
-    )
-    count = 30_000
-    pixels = Covering(
-        texel=random.integers(0, len(texels), count).astype(np.int32),
-        where=np.empty((count, 2), np.float32),
+@pytest.fixture(scope="module")
+def strips() -> World:
+    """Three strips side by side, with atlases of 20, 9 and 31 texels' width."""
+    sizes = ((20, 320), (9, 240), (31, 160))
+    return world_of([
+        quad((k, 0, 0), (width * TEXEL, 0, 0), (0, height * TEXEL, 0), (width, height))
+        for k, (width, height) in enumerate(sizes)
+    ])  # fmt: skip
+
+
+def _anywhere(world: World, count: int, own: npt.NDArray[np.int32]) -> Covering:
+    """Pixels of one size anywhere on the texels that are asked for."""
+    texels, random = world.texels, np.random.default_rng(3)
+    texel = random.choice(own[own >= 0], count).astype(np.int32)
+    owner = texels.object_index()[texel]
+    local, width = texels.pixel[texel] - texels.first_pixel[owner], texels.resolution[owner, 0]
+    where = np.stack([local % width, local // width], axis=-1) + random.random((count, 2))
+    return Covering(
+        texel=texel,
+        where=where.astype(np.float32),
         step=np.tile(np.float32([[1.1, 0.3], [-0.2, 0.9]]), (count, 1, 1)),
         rest=random.normal(0, 0.2, (count, 3)).astype(np.float32),
-        weight=np.full(count, 1 / ERROR**2, np.float32),
+        weight=random.uniform(10, 1000, count).astype(np.float32),
     )
-    flat = texels.pixel[pixels.texel]
-    pixels.where[...] = np.stack([flat % 20, flat // 20], axis=-1) + random.random((count, 2))
-    footprint = np.tile(np.float32([1, 0, 1]), (len(texels), 1))
+
+
+def _bare(world: World) -> PatternedSurface:
+    """All texels of 1, but for a tenth of them that nobody asks for."""
+    texels, random = world.texels, np.random.default_rng(5)
+    own = np.full(len(texels.nearest_texel), -1, np.int32)
+    own[texels.pixel] = np.where(random.random(len(texels)) < 0.1, -1, np.arange(len(texels)))
+    ones = np.ones((len(texels), 3), np.float32)
+    return PatternedSurface(
+        world.scene, world.rays, texels, texels.object_index(), ones, own, 0.04 * ones[:, 0]
+    )
+
+
+@pytest.mark.parametrize("inner", [[2000, 2007], [6400], [6395, 6405, 8560], [8563]])
+def test_what_a_texel_gets_does_not_depend_on_its_group(
+    strips: World, tmp_path: Path, inner: list[int]
+):
+    surface = _bare(strips)
+    count = len(strips.texels)
+    pixels = _anywhere(strips, 60_000, surface.own)
+    footprint = np.tile(np.float32([1, 0, 1]), (count, 1))
 
     def found(folder: str, ends: list[int]) -> Float:
         groups = [slice(a, b) for a, b in pairwise(ends)]
         run = TaskRun(tmp_path, "fit", tmp_path / folder)
         return with_patterns(run, surface, lambda: iter([pixels]), footprint, groups, 1)
 
-    whole = found("one", [0, len(texels)])
-    assert (whole != values).any()
-    np.testing.assert_array_equal(found("three", [0, 2000, 2007, len(texels)]), whole)
+    whole = found("one", [0, count])
+    assert (whole != surface.values).any()
+    np.testing.assert_array_equal(found("several", [0, *inner, count]), whole)
+
+
+def test_couplings_are_those_of_least_squares_and_of_one_object_alone(strips: World):
+    surface, texels = _bare(strips), strips.texels
+    pixels = _anywhere(strips, 200, surface.own)
+    equations = Equations.empty(len(texels))
+    add(equations, 0, surface, pixels)
+    matrix, pull = np.zeros((len(texels), len(texels))), np.zeros((len(texels), 3))
+    for m in range(len(pixels.texel)):
+        # By many points in each pixel, and texels' bilinear hats.
+        o = surface.object[pixels.texel[m]]
+        width, height = texels.resolution[o]
+        inside = (np.stack(np.meshgrid(*[np.arange(64) + 0.5] * 2), axis=-1) / 64 - 0.5).reshape(
+            -1, 2
+        )
+        at = pixels.where[m] + inside @ pixels.step[m] - 0.5
+        at = np.clip(at, 0, [width - 1, height - 1])
+        low = np.minimum(at.astype(int), [width - 2, height - 2])
+        covers = np.zeros(len(texels))
+        for right, down in np.ndindex(2, 2):
+            corner = low + [right, down]
+            share = np.prod(1 - np.abs(at - corner), axis=1) / len(at)
+            first = texels.first_texel[o]
+            np.add.at(covers, first + corner[:, 1] * width + corner[:, 0], share)
+        if (covers[surface.own[texels.pixel] < 0] > 0).any():
+            continue  # covers a texel that nobody asks for: not among a frame's
+        matrix += pixels.weight[m] * np.outer(covers, covers)
+        pull += pixels.weight[m] * np.outer(covers, pixels.rest[m])
+    asked = matrix.diagonal() > 0
+    assert asked.sum() > 200
+    unasked = surface.own[texels.pixel] < 0
+    touched = np.zeros(len(texels), bool)
+    ones = np.zeros((len(texels), 4), np.float32)
+    for k, texel in enumerate(np.flatnonzero(asked & ~unasked)[:: asked.sum() // 4][:4]):
+        ones[texel, k] = 1
+        touched[texel] = True
+    found = np.empty_like(ones)
+    owner = surface.object
+    _couple(
+        len(texels), equations.coupling, texels.pixel, texels.first_pixel[owner],
+        texels.resolution[owner, 0].astype(np.int64), surface.own, ones, found,
+    )  # fmt: skip
+    wanted = matrix @ ones
+    np.testing.assert_allclose(found, wanted, atol=0.05 * wanted.max())
+    # Pixels that cover a texel nobody asks for are in the equations alone.
+    assert np.abs(equations.pull - pull).max() < 5 * np.abs(pull).max()
 
 
 def test_equations_are_those_of_least_squares(floor: World):
@@ -261,9 +340,37 @@ def test_pixels_over_an_edge_are_left_out():
     own = np.arange(len(world.texels), dtype=np.int32)
     scatter = np.full(len(own), 1, np.float32)
     surface = PatternedSurface(
-        world.scene, world.rays, world.texels, values.astype(np.float32), own, scatter
-    )
+        world.scene, world.rays, world.texels, world.texels.object_index(),
+        values.astype(np.float32), own, scatter,
+    )  # fmt: skip
     for camera, shown in _seen(pattern, 0.0):
         pixels = pixels_of_frame(surface, shown, camera, 1e-4, ERROR)
         assert len(pixels.texel) > 500
         assert np.abs(pixels.rest).max() < 0.02
+
+
+def test_frames_that_show_nothing_of_it_tell_nothing(floor: World):
+    surface = _surface(floor, np.ones((SIDE * SIDE, 3), np.float32))
+    away = camera_at(look_at(np.array([0, 0.1, 1.0]), np.array([0, 5.0, 3.0])), LENS, 60, 60)
+    small = camera_at(look_at(np.array([0, 0.1, 1.0]), np.zeros(3)), (1.0, 1.0, 1.0, 1.0), 2, 2)
+    equations = Equations.empty(SIDE * SIDE)
+    for camera in (away, small):
+        shown = np.ones((camera.height, camera.width, 3), np.float32)
+        valid = np.ones(shown.shape[:2], np.bool_)
+        pixels = pixels_of_frame(surface, Picture(shown, valid, ~valid, ~valid), camera, 0, ERROR)
+        assert not len(pixels.texel)
+        add(equations, 0, surface, pixels)
+    assert not equations.coupling.any()
+
+
+def test_pixels_on_texels_that_nobody_asks_for_are_left_out(floor: World):
+    surface = _surface(floor, np.ones((SIDE * SIDE, 3), np.float32))
+    [(camera, shown)] = _seen(np.ones((SIDE, SIDE, 3), np.float32), 0.01, count=1)
+    unasked = np.zeros((SIDE, SIDE), bool)
+    unasked[:, 20:28] = True
+    surface.own[unasked.ravel()] = -1
+    pixels = pixels_of_frame(surface, shown, camera, 1e-4, ERROR)
+    equations = Equations.empty(SIDE * SIDE)
+    add(equations, 0, surface, pixels)
+    assert not equations.pixels[unasked.ravel()].any()
+    assert equations.pixels.sum() == pytest.approx(len(pixels.texel), rel=1e-5)

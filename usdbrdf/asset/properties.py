@@ -355,7 +355,7 @@ class FittedObject(MeasuredObject):
     lobe: Annotated[str, Fact(FIT, "lobe", "token", "paper", """Equations that phi and psi are
         numbers of. paper: masking of width ((phi + 1) / 2)^2 and Schlick's Fresnel term;
         microfacet: Smith's masking of alpha, and Fresnel's equations; beckmann: these with
-        facets after Beckmann. All objects of an asset have the paper's, or none.""",
+        facets after Beckmann. Either all objects of an asset have the paper's or none has.""",
         tokens=("paper", "microfacet", "beckmann"))] = "paper"
     kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
         under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel;

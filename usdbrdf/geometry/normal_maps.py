@@ -88,9 +88,8 @@ def seen_along_normals(
         waiting, passed = np.arange(len(positions)), np.full(len(positions), -behind, np.float32)
         for _ in range(_SHEETS):
             directions = np.ascontiguousarray(sign * normals[waiting])
-            hits = fine.closest(
-                np.float32(positions[waiting] + directions * passed[:, None]), directions
-            )
+            start = positions[waiting] + directions * passed[:, None]
+            hits = fine.closest(start.astype(np.float32), directions)
             away = hits.distance + passed
             near = (hits.face >= 0) & (away <= reach_m)
             same = np.einsum("rc,rc->r", facing[hits.face], normals[waiting]) > 0

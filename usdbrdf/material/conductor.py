@@ -49,6 +49,7 @@ def conductor_of(
     dielectric: LobeEstimate,
     *,
     certain: bool = False,
+    of_dielectric: tuple[OfPhis, OfPhis] | None = None,
 ) -> Conductor | None:
     """The metal that explains P samples clearly better than the best dielectric; None without one,
     unless it is ``certain`` to be a metal.
@@ -56,6 +57,7 @@ def conductor_of(
     radiance    (P, 3) of the samples; texel (P,) counted from 0 without gaps
     irradiance  (P, 3), W/m^2, S at the sample's texel
     bases       twice roughnesses -> (base, slope), (P, 3, K), with independent noise
+    of_dielectric  the same of the ``dielectric``'s kind of lobe, where that is another
     """
     count = int(texel.max()) + 1
     views = np.bincount(texel, minlength=count)
@@ -74,7 +76,7 @@ def conductor_of(
     # What is rougher still than all that are tried looks like a diffuse surface, and may be one.
     if (f0.mean() < _LEAST_F0 or best == len(_PHIS) - 1) and not certain:
         return None
-    found = [_relative(basis([dielectric.phi]), level) for basis in bases]
+    found = [_relative(basis([dielectric.phi]), level) for basis in of_dielectric or bases]
     psi = dielectric.psi * F0_OF_PSI
     rests = [seen - (base + psi * slope)[..., 0] for base, slope in found]
     diffuse = irradiance / level

@@ -192,12 +192,17 @@ class FirstLook(NamedTuple):
     lobes: dict[int, LobeEstimate]
     num_samples: int
     log_ratio: float = 0.0
-    of_beckmann: float = 0.0
+    ratio_of_beckmann: float = 0.0
+
+    @property
+    def has_facets_after_beckmann(self) -> bool:
+        """Whether these explain the views clearly better."""
+        return self.ratio_of_beckmann < -_BECKMANN_CLEARER
 
     def arrays(self) -> dict[str, Array]:
         """As checkpoints hold it."""
         flat = {_NAMES[kind]: [*one[:7], *one[7], *one[8:]] for kind, one in self.lobes.items()}
-        ratios = {"log_ratio": self.log_ratio, "of_beckmann": self.of_beckmann}
+        ratios = {"log_ratio": self.log_ratio, "ratio_of_beckmann": self.ratio_of_beckmann}
         every = {"num_samples": self.num_samples, **ratios, **flat}
         return {name: np.array(value) for name, value in every.items()}
 
@@ -209,7 +214,7 @@ class FirstLook(NamedTuple):
             if name in arrays:
                 one = arrays[name].tolist()
                 lobes[kind] = LobeEstimate._make([*one[:7], (one[7], one[8]), *one[9:]])
-        ratios = float(arrays["log_ratio"]), float(arrays["of_beckmann"])
+        ratios = float(arrays["log_ratio"]), float(arrays["ratio_of_beckmann"])
         return cls(lobes, int(arrays["num_samples"]), *ratios)
 
 
@@ -242,7 +247,11 @@ def fitted_by_likelier_lobe(
         kinds = [kind for kind in (PAPER, DIELECTRIC) if options.lobe in (_NAMES[kind], "auto")]
         kinds += [BECKMANN] if DIELECTRIC in kinds else []
         looks = list(first_looks(run, lightings, reader, kinds, options))
-    clearer = sum(look.log_ratio for look in looks if look)
+    clearer = sum(
+        look.log_ratio + look.ratio_of_beckmann * look.has_facets_after_beckmann
+        for look in looks
+        if look
+    )
     paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
     lobe = PAPER if paper else DIELECTRIC
 
@@ -264,7 +273,7 @@ class _Scene(NamedTuple):
 def _fit(scene: _Scene, piece: tuple[int, FirstLook | None, str]) -> dict[str, Array]:
     index, look, asked = piece
     lightings, reader, options, (lobe,) = scene
-    if look and lobe == DIELECTRIC and look.of_beckmann < -_BECKMANN_CLEARER:
+    if look and lobe == DIELECTRIC and look.has_facets_after_beckmann:
         lobe = BECKMANN
     return fit_object(lobe, lightings, reader, index, options, look, asked=asked).arrays()
 

@@ -29,7 +29,7 @@ from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import CONDUCTOR, PAPER, is_dielectric
+from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, PAPER, is_dielectric
 from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
@@ -249,13 +249,13 @@ def fit_views(
     if not (bright or metal) or (irradiance := sampled().irradiance) is None:
         return found, None
     samples = sampled().samples
+    one, other = (sampled().basis(0, own_seed) for own_seed in range(3 * seed, 3 * seed + 2))
     kind = PAPER if lobe == PAPER else CONDUCTOR
-    one, other = (
-        partial(sampled().basis(0, own_seed), kind) for own_seed in range(3 * seed, 3 * seed + 2)
-    )
     conductor = conductor_of(
-        samples.radiance, samples.texel, irradiance, (one, other), found, certain=metal
-    )
+        samples.radiance, samples.texel, irradiance, (partial(one, kind), partial(other, kind)),
+        found, certain=metal,
+        of_dielectric=(partial(one, lobe), partial(other, lobe)) if lobe == BECKMANN else None,
+    )  # fmt: skip
     return found, conductor
 
 

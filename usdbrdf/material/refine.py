@@ -39,6 +39,7 @@ from usdbrdf.texturing.passes import (
 )
 from usdbrdf.texturing.patterns import (
     BYTES_OF_EQUATIONS,
+    ROWS_BESIDE,
     Covering,
     PatternedSurface,
     pixels_of_frame,
@@ -59,7 +60,7 @@ _MOST_SAMPLES = 24
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
-_OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=40)
+_OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=44, pixel=450)
 # Texels around what was seen that are no more than so many times as bright as their fill.
 _RIM, _LEAK = 3, 2.0
 RELATIVE_ERROR = calibration.number("refine.relative_error")
@@ -316,10 +317,13 @@ def _with_patterns(
     known = np.isfinite(means.mean[:, 0]) & ~before.emissive & ~metal
     # Of a single sample, what it differs from the others by.
     variance = means.variance * level2 * np.minimum(before.samples, _MOST_SAMPLES)
-    variance = around(texels, np.where(known, variance, 0)[:, None], means.footprint)[:, 0]
+    told = np.stack([np.where(known, variance, 0), known], axis=-1).astype(np.float32)
+    variance, share = around(texels, told, means.footprint).T
+    variance = np.where(known, variance / np.maximum(share, 1e-6), 0).astype(np.float32)
     texel_of = np.full(len(texels.nearest_texel), -1, np.int32)
     texel_of[texels.pixel[known]] = np.flatnonzero(known)
-    surface = PatternedSurface(lit.scene, lit.rays, texels, diffuse, texel_of, variance)
+    owner = texels.object_index()
+    surface = PatternedSurface(lit.scene, lit.rays, texels, owner, diffuse, texel_of, variance)
 
     def of_frame(i: int) -> Covering:
         shown = reader.read(i)
@@ -332,7 +336,11 @@ def _with_patterns(
         bar = progress(ahead(of_frame, own), total=len(own), label="fit: patterns", unit="frames")
         yield from bar
 
-    groups = _groups(lit, frames.at(own), memory, _OF_PATTERNS, warns=False)
+    # Groups take what lies beside them along.
+    beside = min(2 * ROWS_BESIDE * int(texels.resolution[:, 0].max()), len(texels))
+    always = _OF_PATTERNS.always + _OF_PATTERNS.grouped * beside // len(texels)
+    need = _OF_PATTERNS._replace(always=always)
+    groups = _groups(lit, frames.at(own), memory, need, warns=False)
     return with_patterns(run, surface, pixels, means.footprint, groups, seed)
 
 
@@ -340,8 +348,12 @@ def frame_reader(
     lightings: Sequence[LitScene], frames: Frames, memory: float | None
 ) -> FrameReader:
     """Keeps the frames for which refining leaves room in ``memory`` (GiB)."""
-    lit, need = lightings[0], _need(lightings)
-    return FrameReader(frames, bytes_for_frames(lit.texels, lit.scene, frames, memory, need))
+    lit = lightings[0]
+    room = (
+        bytes_for_frames(lit.texels, lit.scene, frames, memory, need)
+        for need in (_need(lightings), _OF_PATTERNS)
+    )
+    return FrameReader(frames, min(room))
 
 
 def _need(lightings: Sequence[LitScene]) -> BytesPerTexel:

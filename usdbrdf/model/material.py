@@ -25,7 +25,8 @@ class Material:
     wrap       what the maps are beyond uv of 0 to 1: "clamp", "repeat" or "mirror"
     base, metallic   (H, W, 3) and (H, W, 1) float32, of what diffuse and f0 of a metal were mixed;
                None where there is no metal
-    lobe       the kind of specular lobe (``transport.brdf``): 0 the paper's, 1 a dielectric's
+    lobe       the kind of specular lobe (``transport.brdf``): 0 the paper's, 1 a dielectric's,
+               2 a conductor's, 3 a dielectric's with facets after Beckmann
     clear      light passes as if nothing was there, as through a pane
     normal     (H, W, 3) float32, normals in tangent space, x along u, y along v; None where there
                is no such map

@@ -37,7 +37,9 @@ def fitted_objects(
     objects = []
     for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True)):
         word, observed = asked.get(i, ""), any(some.is_observed(i) for some in maps)
-        facets = BECKMANN_FACETS if own.beckmann else MICROFACET
+        judgement = judged(own, obj, options, observed, word)
+        # A metal's numbers are of the facets of renderers.
+        lobe = BECKMANN_FACETS if own.beckmann and judgement.kind == "dielectric" else MICROFACET
         objects.append(
             FittedObject(
                 prim_path=obj.prim_path,
@@ -48,9 +50,9 @@ def fitted_objects(
                 num_pixels=own.num_samples,
                 method=options.method,
                 mapping=mapping,
-                lobe=facets if microfacet else "paper",
+                lobe=lobe if microfacet else "paper",
                 directive=word,
-                **vars(judged(own, obj, options, observed, word)),
+                **vars(judgement),
             )
         )
     return objects

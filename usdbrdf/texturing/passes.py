@@ -35,12 +35,13 @@ _SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
 
 class BytesPerTexel(NamedTuple):
     """grouped: of a texel in the present group; result: of every texel; after: in place of both,
-    when all groups are done; always: of every texel, beside these."""
+    when all groups are done; always: of every texel, beside these. pixel: of each of a frame's."""
 
     grouped: int
     result: int
     after: int
     always: int = 0
+    pixel: int = _PER_PIXEL
 
 
 # Running statistics (144), a texel's place among the blocks of texels while these are sorted out,
@@ -127,7 +128,7 @@ def _budget(
     held += _PER_TRIANGLE * len(scene.triangles) + need.always * len(texels)
     # Whoever called may hold more, and an allocator keeps some of what was freed.
     give_back_freed()
-    held = max(held, resident_bytes()) + _PER_PIXEL * int(frames.resolution.prod(axis=1).max())
+    held = max(held, resident_bytes()) + need.pixel * int(frames.resolution.prod(axis=1).max())
     after = held + need.after * len(texels)
     return limit, held + need.result * len(texels), after
 

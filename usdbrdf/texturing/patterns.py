@@ -58,12 +58,14 @@ ROWS_BESIDE = _APART * (_STEPS + 1)
 
 
 class PatternedSurface(NamedTuple):
-    """What patterns are looked for on: ``values`` (T, 3), W/(m^2 sr), of texels; ``own`` (P,) int32
-    the texel of every flat pixel that is asked for, else -1; variance (T,) of a pixel's errors."""
+    """What patterns are looked for on: ``values`` (T, 3), W/(m^2 sr), of texels, and the ``object``
+    of each (T,); ``own`` (P,) int32 the texel of every flat pixel that is asked for, else -1;
+    variance (T,) of a pixel's errors."""
 
     scene: Scene
     rays: RayScene
     texels: Texels
+    object: Int
     values: Float
     own: Int
     variance: Float
@@ -105,8 +107,8 @@ class Equations(NamedTuple):
         return cls(zeros(len(_BESIDE)), zeros(3), zeros(), zeros())
 
 
-# Bytes per texel of these, and of the vectors of the iteration.
-BYTES_OF_EQUATIONS = 4 * (len(_BESIDE) + 5) + 4 * 4 * 5
+# Bytes per texel of these, and of the iteration's vectors.
+BYTES_OF_EQUATIONS = 4 * (len(_BESIDE) + 5) + 176
 
 
 def pixels_of_frame(
@@ -308,7 +310,7 @@ def _without_common(
 def add(equations: Equations, first: int, surface: PatternedSurface, pixels: Covering) -> None:
     """Pixels more, in place, into the equations of the texels from number ``first`` on."""
     texels = surface.texels
-    owner = texels.object_index()[pixels.texel]
+    owner = surface.object[pixels.texel]
     _add(
         0, len(pixels.texel), pixels, owner, first, surface.own, texels.pixel, texels.first_pixel,
         texels.resolution, equations,
@@ -363,32 +365,32 @@ def steps(
     "told": what it explains of the squares, how many numbers were free for that, which squares are
     left, and how many pixels. level (n,): the radiance of which contrasts are a share."""
     texels = surface.texels
-    pixel, owner = texels.pixel[part], texels.object_index()[part]
-    width = texels.resolution[owner, 0].astype(np.int64)
-    low = int(pixel[0])
-    number = np.full(int(pixel[-1]) - low + 1, -1, np.int32)
-    number[pixel - low] = np.arange(len(pixel), dtype=np.int32)
-    looser = 1 / np.maximum(_CONTRAST * level, 1e-15) ** 2
+    owner, low = surface.object[part], int(texels.pixel[part.start])
+    pixel, width = texels.pixel[part] - low, texels.resolution[owner, 0].astype(np.int64)
+    first = texels.first_pixel[owner] - low
+    number = np.full(int(pixel[-1]) + 1, -1, np.int32)
+    number[pixel] = np.arange(len(pixel), dtype=np.int32)
+    ridge = 1 / np.maximum(_CONTRAST * level, 1e-15) ** 2
 
     def coupled(values: Float) -> Float:
         found = np.empty_like(values)
-        _couple(len(pixel), equations.coupling, pixel - low, width, number, values, found)
+        _couple(len(pixel), equations.coupling, pixel, first, width, number, values, found)
         return found
 
     # Ones and minus ones: what is left of them on the mean is how many numbers are free
     # (M. Hutchinson, "A stochastic estimator of the trace of the influence matrix", 1990).
     own = np.arange(part.start, part.stop, dtype=np.int64)
     sign = np.where(shifts_of(own, 1, seed)[:, :1] < 0.5, -1, 1).astype(np.float32)
-    first = coupled(np.concatenate([np.ones_like(sign), sign], axis=1))
+    sums = coupled(np.concatenate([np.ones_like(sign), sign], axis=1))
     # All couplings are positive, so these bound the eigenvalues by 1.
-    bound = (first[:, :1] + looser[:, None]).astype(np.float32)
-    left = np.concatenate([equations.pull, first[:, 1:]], axis=1) / bound
+    bound = (sums[:, :1] + ridge[:, None]).astype(np.float32)
+    left = np.concatenate([equations.pull, sums[:, 1:]], axis=1) / bound
     middle, half = (1 + _SMALLEST) / 2, (1 - _SMALLEST) / 2
     rate = half / middle
     change = left / np.float32(middle)
     found = change.copy()
     for _ in range(_STEPS - 1):
-        left -= (coupled(change) + looser[:, None] * change) / bound
+        left -= (coupled(change) + ridge[:, None] * change) / bound
         faster = 1 / (2 * middle / half - rate)
         change = np.float32(faster * rate) * change + np.float32(2 * faster / half) * left
         rate = faster
@@ -407,10 +409,10 @@ def steps(
 
 @parallel_kernel
 def _couple(
-    start: int, stop: int, coupling: Float, pixel: Long, width: Long, number: Int, values: Float,
-    out: Float,
+    start: int, stop: int, coupling: Float, pixel: Long, first: Long, width: Long, number: Int,
+    values: Float, out: Float,
 ) -> None:  # fmt: skip
-    """B^T W B times ``values`` (T, C)."""
+    """B^T W B times ``values`` (T, C); first (T,): the first pixel of each one's atlas."""
     channels = values.shape[1]
     for t in range(start, stop):
         for c in range(channels):
@@ -429,7 +431,7 @@ def _couple(
                     for c in range(channels):
                         out[t, c] += strength * values[s, c]
             before = pixel[t] - apart
-            if before >= 0:
+            if before >= max(first[t], 0):
                 s = number[before]
                 if s >= 0 and coupling[s, k] > 0:
                     for c in range(channels):

@@ -92,7 +92,8 @@ _UNMASKED = 1.6
 def beckmann_masking(x: Any, alpha: Any, sqrt: Any = np.sqrt, minimum: Any = np.minimum) -> Any:
     """G1 of these facets over 2 x, as ``masking`` is, for a cosine x in (0, 1): the rational form
     of B. Walter et al., "Microfacet Models for Refraction through Rough Surfaces", 2007."""
-    a = minimum(_UNMASKED, x / (alpha * sqrt(1.0 - x * x)))
+    # Rounding may take x above 1.
+    a = minimum(_UNMASKED, x / (alpha * sqrt(abs(1.0 - x * x) + _UPRIGHT**2)))
     return a * (3.535 + 2.181 * a) / (1.0 + a * (2.276 + 2.577 * a)) / (2.0 * x)
 
 
