@@ -234,7 +234,7 @@ def needs_float(values: Float) -> bool:
     if (size > _HALF_UNTIL).any():
         return True
     some = size > 0
-    return np.count_nonzero(some & (size < _HALF_FROM)) * 2 > np.count_nonzero(some)
+    return bool(np.count_nonzero(some & (size < _HALF_FROM)) * 2 > np.count_nonzero(some))
 
 
 def resized(pixels: Float, width: int, height: int) -> Float:
