@@ -87,9 +87,17 @@ _CLEARLY = 2.0
 def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
     """The up axis where a format does not say: z, unless people held their cameras clearly upright
     along y."""
+    return "Y" if upright_along(records) == "Y" else "Z"
+
+
+def upright_along(records: Sequence[FrameRecord]) -> str:
+    """The axis along which people held their cameras clearly upright, as "Y" or "-Y"; "" where
+    there is none."""
     axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
     up = np.nan_to_num(axes.sum(axis=0))
-    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
+    middle, most = np.argsort(np.abs(up)).tolist()[1:]
+    clearly = abs(up[most]) > _CLEARLY * abs(up[middle])
+    return f"{'-' if up[most] < 0 else ''}{'XYZ'[most]}" if clearly else ""
 
 
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2

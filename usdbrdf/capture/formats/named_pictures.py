@@ -262,7 +262,7 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
 
 def scan_of(
     records: Sequence[FrameRecord],
-    geometry: Path | Callable[[], ScanGeometry],
+    geometry: Path | Callable[[], Path | ScanGeometry],
     options: CaptureOptions,
     findings: Findings,
     *,
@@ -275,7 +275,8 @@ def scan_of(
     name: str = "",
     objects: Callable[[FileMesh], LabelTable] | None = None,
 ) -> Scan:
-    """The capture of these frames and this mesh (a file, or what reads it).
+    """The capture of these frames and this mesh (a file, or what finds or reads it, which is asked
+    once the poses are known to be sound: ``inspect`` tells of the frames where there is none).
 
     objects   what knows the objects of the mesh; ``--objects`` comes first
     source    the document that messages name; ``folder``, the capture's own, absolute
@@ -321,10 +322,11 @@ def scan_of(
             )
 
     def read_geometry() -> ScanGeometry:
-        if not isinstance(geometry, Path):
-            return geometry()
+        found = geometry if isinstance(geometry, Path) else geometry()
+        if not isinstance(found, Path):
+            return found
         return geometry_from_file(
-            geometry,
+            found,
             options.objects or objects,
             options,
             findings,
