@@ -16,6 +16,7 @@ from typing import Any
 
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import environment_failures, whole_folder
+from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.documents import write_json
 from usdbrdf.files.ply import write_ply
 from usdbrdf.job.progress import progress, warn
@@ -87,12 +88,18 @@ def _document(scan: Scan, names: list[str]) -> dict[str, Any]:
     return {
         "camera_model": "PINHOLE",
         "encoding": frames.encoding,
+        # Frames that photographs through lenses became: their files do not tell.
+        **({"radiometric": False} if _holds_light(frames) and not frames.radiometric else {}),
         "meters_per_unit": scan.meters_per_unit,
         "up_axis": scan.up_axis,
         "mesh": "mesh.ply",
         "objects": "objects.json",
         "frames": [_entry(frames, i, name) for i, name in enumerate(names)],
     }
+
+
+def _holds_light(frames: Frames) -> bool:
+    return kind_of_encoding(frames.encoding) != "display"
 
 
 def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
@@ -107,11 +114,11 @@ def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
         "exposure_time": float(frames.exposure_time[i]),
     }
     saturation = float(frames.saturation_radiance[i])
-    if frames.radiometric and math.isfinite(saturation):
+    if _holds_light(frames) and math.isfinite(saturation):
         entry["saturation_radiance"] = saturation
     if frames.captured_pose is not None:
         entry["captured_transform_matrix"] = frames.captured_pose[i].tolist()
-    if frames.radiometric and frames.noise_floor_radiance[i] > 0:
+    if _holds_light(frames) and frames.noise_floor_radiance[i] > 0:
         entry["noise_floor_radiance"] = float(frames.noise_floor_radiance[i])
     return entry
 
