@@ -96,7 +96,8 @@ def test_photographs_stay_photographs(capture, tmp_path):
 
 
 def test_frames_that_photographs_became_do_not_pass_for_radiance(tmp_path):
-    """Neither do their clipped pixels, which no EXR file tells."""
+    """Neither do their clipped pixels, which no EXR file tells; and what the photographs do not
+    show is no damage."""
     capture = capture_through(tmp_path / "room", "OPENCV")
     with edited(capture.manifest) as document:
         for i, frame in enumerate(document["frames"]):

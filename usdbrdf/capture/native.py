@@ -14,10 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.documents import write_json
+from usdbrdf.files.images import read_radiance, write_preview_png
 from usdbrdf.files.ply import write_ply
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Int
@@ -57,6 +60,7 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         copies = zip(images, names, strict=True)
         for image, name in progress(copies, total=len(names), label="frames", unit="files"):
             shutil.copyfile(image, staged / name)
+        masks = _write_masks(scan, images, names, staged)
         points = scan.mesh.points[: captured_points(scan)]
         write_ply(staged / "mesh.ply", points, *captured_faces(scan))
         objects = [
@@ -65,7 +69,22 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
             for i, label in enumerate(scan.objects)
         ]
         write_json(staged / "objects.json", {"objects": objects})
-        write_json(staged / "transforms.json", _document(scan, names))
+        write_json(staged / "transforms.json", _document(scan, names, masks))
+
+
+def _write_masks(
+    scan: Scan, images: Sequence[Path], names: Sequence[str], folder: Path
+) -> dict[int, str]:
+    """Masks for frames that photographs through lenses became, by the frames' numbers: what the
+    photographs do not show is unknown, which a reader of frames else takes for damage."""
+    masks = {}
+    for i, view in enumerate(scan.views):
+        if view is not None:
+            (folder / "masks").mkdir(exist_ok=True)
+            masks[i] = f"masks/{Path(names[i]).name}.png"
+            known = np.isfinite(read_radiance(images[i])).all(axis=2, keepdims=True)
+            write_preview_png(folder / masks[i], np.repeat(np.uint8(255) * known, 3, axis=2))
+    return masks
 
 
 def as_copied(scan: Scan, asked: Scan) -> Scan:
@@ -83,7 +102,7 @@ def _frame_names(frames: Frames) -> list[str]:
     return [f"frames/{n}{path.name}" for n, path in zip(numbered, frames.image_paths, strict=True)]
 
 
-def _document(scan: Scan, names: list[str]) -> dict[str, Any]:
+def _document(scan: Scan, names: list[str], masks: dict[int, str]) -> dict[str, Any]:
     frames = scan.frames
     return {
         "camera_model": "PINHOLE",
@@ -94,7 +113,10 @@ def _document(scan: Scan, names: list[str]) -> dict[str, Any]:
         "up_axis": scan.up_axis,
         "mesh": "mesh.ply",
         "objects": "objects.json",
-        "frames": [_entry(frames, i, name) for i, name in enumerate(names)],
+        "frames": [
+            _entry(frames, i, name) | ({"mask_path": masks[i]} if i in masks else {})
+            for i, name in enumerate(names)
+        ],
     }
 
 
