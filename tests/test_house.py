@@ -287,6 +287,7 @@ ENGINEERING: dict[str, str] = {
     "_PER_SEGMENT": "time: how many are asked",
     "_PER_TEXEL": "bytes",
     "_PER_TRIANGLE": "bytes",
+    "_PHASES": "discretisation of a filter",
     "_POINTS": "time: how many are asked",
     "_PROBED_FRAMES": "time",
     "_PROBED_SIDE": "time",

@@ -13,9 +13,11 @@ from tests.json_schemas import checked
 from tests.scenes import MadeCapture, edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.alignment import aligned
+from usdbrdf.capture.bracketed import merge_brackets
 from usdbrdf.capture.brackets import Merged, merge, response_from_brackets
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import exif_exposure, read_exr, write_preview_png
 from usdbrdf.options import IngestOptions
@@ -233,6 +235,51 @@ def test_a_capture_of_brackets_becomes_one_of_radiance(tmp_path, same_poses, cap
     ratio /= np.nanmedian(ratio, axis=0)
     assert np.nanmedian(np.abs(ratio - 1)) < 0.02
     assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged")]) == 6
+
+
+def _folder_of_photographs(folder: Path, times: np.ndarray) -> None:
+    folder.mkdir()
+    for k, codes in enumerate(_shoot(_scene((60, 80), decades=3), times)):
+        _write_photograph(folder / f"IMG_{k}.png", codes, time=times[k])
+
+
+def test_photographs_of_a_folder_are_one_bracket(tmp_path):
+    pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
+    folder, merged = tmp_path / "stack", tmp_path / "merged"
+    _folder_of_photographs(folder, 4.0 ** -np.arange(6.0))
+    assert main(["merge-brackets", str(folder), "-o", str(merged), "-q"]) == 0
+    (frame,) = read_json(merged / "transforms.json")["frames"]
+    assert frame["saturation_radiance"] > frame["noise_floor_radiance"] > 0
+    radiance = read_exr(merged / frame["file_path"])
+    known = (radiance > frame["noise_floor_radiance"]) & (radiance < frame["saturation_radiance"])
+    ratio = np.where(known, radiance / _scene((60, 80), decades=3), np.nan)
+    ratio /= np.nanmedian(ratio, axis=(0, 1))
+    assert known.mean() > 0.9
+    assert np.nanmedian(np.abs(ratio - 1)) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([1.0, 0.25, 1.0, 0.25], r"IMG_0.png is exposed as.*several views.*\[brackets\.views\]$"),
+        ([1.0], r"neither a transforms.json nor two photographs.*\[brackets\.none\]$"),
+    ],
+)
+def test_a_folder_that_is_not_one_bracket_is_refused(tmp_path, times, said):
+    _folder_of_photographs(tmp_path / "stack", np.array(times))
+    with pytest.raises(InputRefused, match=said):
+        merge_brackets(tmp_path / "stack", tmp_path / "merged")
+
+
+def test_a_lamp_that_clips_in_all_exposures_is_never_unknown(bracket):
+    """Although its flicker makes what a channel tells contradict itself."""
+    _, codes, response = bracket
+    codes = codes.copy()
+    codes[:, 40:60, 40:60] = (255, 128, 100)
+    merged = merge(codes, EXPOSURES, response)
+    face = merged.radiance[41:59, 41:59]
+    assert not np.isnan(face).any()
+    assert (face[..., 0] >= merged.saturation).all()
 
 
 @pytest.mark.parametrize("fault", ["no exposure", "no brackets", "another size", "no file"])

@@ -97,6 +97,21 @@ def test_photographs_are_read_on_as_if_they_were_granted(capture):
     assert len(found.refusals) == 1
 
 
+def test_exposures_that_nobody_states_are_not_called_a_second(capture):
+    def exposures():
+        found = inspect(capture.folder, InspectOptions(assume_srgb=True))
+        (row,) = (line for line in found.lines() if line.startswith("exposures"))
+        return row.split(maxsplit=1)[1]
+
+    assert exposures() == "2: 0.02 to 0.08 s (2.0 stops)"
+    _as_photographs(capture)
+    assert exposures() == "2, 2.0 stops apart"
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            del frame["exposure_time"]
+    assert exposures() == "not stated"
+
+
 def test_few_frames_are_looked_at_unless_one_of_them_is_bad(tmp_path):
     capture = make_capture(tmp_path / "room", frames=30)
     write_exr(capture.image(1), np.zeros((24, 32, 3), np.float32))

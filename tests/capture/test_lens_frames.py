@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
 from usdbrdf.asset.readers.views import photographs_of_views
+from usdbrdf.capture import develop
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.develop import resampled
 from usdbrdf.capture.lens_views import pinhole_views
@@ -247,6 +249,29 @@ def test_frames_are_remade_where_they_are_missing_and_the_photographs_count(tmp_
     with owned_folder(asset.folder):
         assert ingest(made.folder, asset, IngestOptions()).reran
     assert first.read_bytes() != content
+
+
+def test_places_of_pixels_are_computed_once_for_each_camera(tmp_path, monkeypatch):
+    """And those of other cameras are not kept in memory: a rig's take turns from frame to frame."""
+    made = capture_through(tmp_path / "room", "OPENCV", frames=16)
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["fl_x"] = document["fl_x"] + 0.01 * (i % 8)
+    computed, kept = [], []
+    places = develop._places.__wrapped__
+
+    def counted(*camera):
+        computed.append(camera)
+        kept.append(develop._places.cache_info().currsize)
+        return places(*camera)
+
+    monkeypatch.setattr(develop, "_places", lru_cache(develop._KEPT_MAPS)(counted))
+    scan = read_scan(made.folder, IngestOptions())
+    (tmp_path / "frames").mkdir()
+    frames = develop.developed_in(scan.frames, scan.views, tmp_path)
+    assert all(path.is_file() for path in frames.image_paths)
+    assert len(computed) == len(set(computed)) == 8
+    assert max(kept) == 0
 
 
 class _Maps:

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.lens_scenes import capture_through
 from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.develop import developed_in
 from usdbrdf.capture.native import write_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure, InputRefused
@@ -91,6 +93,30 @@ def test_photographs_stay_photographs(capture, tmp_path):
     with pytest.raises(InputRefused, match=r"--assume-srgb"):
         read_scan(tmp_path / "copy", IngestOptions())
     _assert_same(scan, read_scan(tmp_path / "copy", IngestOptions(assume_srgb=True)))
+
+
+def test_frames_that_photographs_became_do_not_pass_for_radiance(tmp_path):
+    """Neither do their clipped pixels, which no EXR file tells; and what the photographs do not
+    show is no damage."""
+    capture = capture_through(tmp_path / "room", "OPENCV")
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            image = np.clip(read_exr(capture.image(i)) * 80, 0, 255).astype(np.uint8)
+            frame["file_path"] = f"frames/{i:04d}.png"
+            frame["exposure_time"] = (0.02, 0.08)[i % 2]
+            write_preview_png(capture.folder / frame["file_path"], image)
+    asked = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    (tmp_path / "made").mkdir()
+    frames = developed_in(asked.frames, asked.views, tmp_path / "made")
+    write_capture(replace(asked, frames=frames), frames.image_paths, tmp_path / "copy")
+    again = read_scan(tmp_path / "copy", IngestOptions())
+    assert not again.frames.radiometric
+    assert any("not radiometric" in w and w.endswith("[capture.ldr]") for w in again.warnings)
+    for name in ("saturation_radiance", "noise_floor_radiance", "exposure_time", "intrinsics"):
+        np.testing.assert_array_equal(getattr(again.frames, name), getattr(asked.frames, name))
+    np.testing.assert_allclose(
+        again.frames.world_from_camera, asked.frames.world_from_camera, atol=1e-9
+    )
 
 
 def test_images_of_one_name_from_several_folders(capture, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
-from tests.scenes import edited, make_capture
+from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.formats import colmap
 from usdbrdf.capture.formats.named_pictures import mask_beside
@@ -181,6 +181,28 @@ def test_a_model_without_points_and_with_colmaps_own_mesh_and_masks(tmp_path):
     assert [view is not None for view in scan.views] == [i in (3, 5, 7) for i in range(10)]
     assert any("[colmap.scale]" in warning for warning in scan.warnings)
     assert any("3 masks" in warning for warning in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    ("turn", "axis", "upright"),
+    [
+        (np.eye(3), "Z", ""),
+        (np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "Y", ""),  # z up becomes y up
+        (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), "Z", "-Y"),  # as COLMAP starts
+    ],
+)
+def test_the_way_up_is_that_of_upright_cameras(tmp_path, turn, axis, upright):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    model = pycolmap.Reconstruction(made.folder / "sparse/0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn), np.zeros(3)))
+    write_model(made.folder / "sparse/0", model)
+    write_ply(made.folder / "mesh.ply", made.points @ turn.T, made.triangles, made.face_object)
+    scan = read_scan(made.folder, IngestOptions())
+    assert scan.up_axis == axis
+    assert any(f"taken are metres and {axis}." in warning for warning in scan.warnings)
+    told = [warning for warning in scan.warnings if "[colmap.up-axis]" in warning]
+    assert len(told) == bool(upright)
+    assert not told or f"upright along {upright}, not along Z" in told[0]
 
 
 def test_masks_of_subfolders_are_not_mixed_up(tmp_path):

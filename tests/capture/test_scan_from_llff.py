@@ -8,8 +8,9 @@ import pytest
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
 from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.inspection import inspect
 from usdbrdf.errors import InputRefused
-from usdbrdf.options import IngestOptions
+from usdbrdf.options import IngestOptions, InspectOptions
 
 OPTIONS = IngestOptions(assume_srgb=True)
 
@@ -116,3 +117,10 @@ def test_refusals(capture, damage, sentence):
     damage(capture)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(capture, OPTIONS)
+
+
+def test_frames_are_told_of_where_there_is_no_mesh(capture):
+    (capture / "surface.ply").unlink()
+    found = inspect(capture, InspectOptions(assume_srgb=True))
+    assert found.summary()["frames"]["count"] == len(truth().images)
+    assert "[mesh.missing]" in str(found.refusals[0])

@@ -263,7 +263,7 @@ def test_couplings_are_those_of_least_squares_and_of_one_object_alone(strips: Wo
         low = np.minimum(at.astype(int), [width - 2, height - 2])
         covers = np.zeros(len(texels))
         for right, down in np.ndindex(2, 2):
-            corner = low + [right, down]
+            corner = low + np.array([right, down])
             share = np.prod(1 - np.abs(at - corner), axis=1) / len(at)
             first = texels.first_texel[o]
             np.add.at(covers, first + corner[:, 1] * width + corner[:, 0], share)

@@ -161,13 +161,14 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
     with environment_failures(str(path)):
         below = next(_recognised_below(path, sound), None)
         said = (
-            f"but {below[0].as_posix()}/ in it is ({below[1].name}). Name that folder"
+            f"no capture itself, but {below[0].as_posix()}/ in it is one ({below[1].name}). Name "
+            "that folder"
             if below
-            else what_lies_there(path)
+            else f"no capture of a known format: {what_lies_there(path)}"
         )
     raise InputRefused(
-        f"{path}: not a capture that any adapter recognises: {said}, or choose with --adapter "
-        "(`usdbrdf adapters` says what each of them asks for). [adapter.none]"
+        f"{path}: {said}, or state the format with --adapter (`usdbrdf adapters` lists what each "
+        "asks for). [adapter.none]"
     )
 
 

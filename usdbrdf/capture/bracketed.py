@@ -1,8 +1,9 @@
 """A capture whose frames are brackets becomes one of radiance, before anything else reads it.
 
 In transforms.json a frame has ``brackets``, a list of ``{"file_path", "exposure_time"}``, or
-several frames have one transform_matrix. All photographs are 8-bit ones of one camera with fixed
-settings but for the exposure, which where it is not stated is in their EXIF data.
+several frames have one transform_matrix. A folder without it holds the photographs of one bracket.
+All photographs are 8-bit ones of one camera with fixed settings but for the exposure, which where
+it is not stated is in their EXIF data.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
+_PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 # Brackets that the response is told by.
 _TELLING = 12
 
@@ -47,7 +49,10 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     Raises InputRefused for what makes no brackets.
     """
     source = capture / "transforms.json" if capture.is_dir() else capture
-    document = read_json(source, nonfinite_below=("transform_matrix",))
+    if capture.is_dir() and not source.is_file():
+        document: Any = _document_of_folder(capture)
+    else:
+        document = read_json(source, nonfinite_below=("transform_matrix",))
     brackets = _brackets(source, document)
     telling = [brackets[i] for i in spread_evenly(len(brackets), _TELLING)]
     response = response_from_brackets(
@@ -155,6 +160,26 @@ def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:
             "capture's own document. [capture.format]"
         )
     return frames
+
+
+def _document_of_folder(folder: Path) -> dict[str, Any]:
+    """What a transforms.json would say of a folder of photographs, all of one view."""
+    with environment_failures(str(folder)):
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _PHOTOGRAPHS)
+    if len(paths) < 2:
+        raise InputRefused(
+            f"{folder}: neither a transforms.json nor two photographs (JPEG, PNG) of one view. "
+            "Name the folder of a capture or of a bracket. [brackets.none]"
+        )
+    exposures = [exif_exposure(path) for path in paths]
+    if None not in exposures and len(set(exposures)) < len(paths):
+        first = next(p for p, e in zip(paths, exposures, strict=True) if exposures.count(e) > 1)
+        raise InputRefused(
+            f"{folder}: {first.name} is exposed as another photograph is, so these are of several "
+            "views. Put each bracket into a folder of its own, or list those of each view in a "
+            "transforms.json. [brackets.views]"
+        )
+    return {"frames": [{"brackets": [{"file_path": path.name} for path in paths]}]}
 
 
 def _brackets(source: Path, document: Any) -> list[Bracket]:

@@ -230,7 +230,10 @@ def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | Non
     radiance = np.where(clipped, 2 * ceiling, np.where(dark, 0, radiance))
     # What moves covers more than a pixel; what noise does is alone.
     ghost = uniform_filter(against.any(axis=2).astype(np.float32), 3) > _ALONE
-    radiance[ghost] = np.nan
+    # Nothing passed before what clips in all exposures; how bright it is at least stays known.
+    lamp = clipped.any(axis=2)
+    radiance[ghost & ~lamp] = np.nan
+    radiance[lamp & np.isnan(radiance).any(axis=2)] = 2 * ceiling
     return Merged(
         radiance=radiance.astype(np.float32),
         saturation=ceiling,

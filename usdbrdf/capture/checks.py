@@ -24,7 +24,7 @@ from usdbrdf.files.images import (
     white_of_mask,
 )
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Double
+from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.model.mesh import ScanGeometry
@@ -87,9 +87,17 @@ _CLEARLY = 2.0
 def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
     """The up axis where a format does not say: z, unless people held their cameras clearly upright
     along y."""
+    return "Y" if upright_along(records) == "Y" else "Z"
+
+
+def upright_along(records: Sequence[FrameRecord]) -> str:
+    """The axis along which people held their cameras clearly upright, as "Y" or "-Y"; "" where
+    there is none."""
     axes = np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
     up = np.nan_to_num(axes.sum(axis=0))
-    return "Y" if up[1] > _CLEARLY * np.abs(up[[0, 2]]).max() else "Z"
+    middle, most = np.argsort(np.abs(up)).tolist()[1:]
+    clearly = abs(up[most]) > _CLEARLY * abs(up[middle])
+    return f"{'-' if up[most] < 0 else ''}{'XYZ'[most]}" if clearly else ""
 
 
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
@@ -399,8 +407,9 @@ def _looked_through(
         if digest in name_of:
             findings.drop(names[i], f"the same image as {name_of[digest]!r}", "capture.duplicate")
             continue
-        useless = _why_useless(pixels, max_nonfinite)
-        if not useless and masks and not _shows_any(masks[i]):
+        white = _white(masks[i]) if masks else None
+        useless = _why_useless(pixels, white, max_nonfinite)
+        if not useless and white is not None and not white.any():
             useless = "its mask is black everywhere", "capture.mask"
         if useless:
             findings.drop(names[i], *useless)
@@ -413,10 +422,11 @@ def _looked_through(
     return usable
 
 
-def _shows_any(mask: Path | None) -> bool:
+def _white(mask: Path | None) -> Bool | None:
+    """What a mask leaves of its picture; None without one."""
     with suppress(ImageRefused):  # of which who resamples the photograph will tell
-        return mask is None or bool(white_of_mask(mask).any())
-    return True
+        return None if mask is None else white_of_mask(mask)
+    return None
 
 
 def spread_evenly(count: int, most: int | None) -> list[int]:
@@ -426,9 +436,14 @@ def spread_evenly(count: int, most: int | None) -> list[int]:
     return [int(i) for i in np.unique(np.linspace(0, count - 1, most).round())]
 
 
-def _why_useless(pixels: FramePixels, max_nonfinite: float) -> tuple[str, str] | None:
-    """Why a frame says nothing, and the rule; None if it does say something."""
-    unknown = float(pixels.unknown.mean())
+def _why_useless(
+    pixels: FramePixels, white: Bool | None, max_nonfinite: float
+) -> tuple[str, str] | None:
+    """Why a frame says nothing, and the rule; None if it does say something. What its mask hides
+    may be unknown."""
+    if white is None or white.shape != pixels.unknown.shape:
+        white = np.ones_like(pixels.unknown)
+    unknown = float((pixels.unknown & white).mean())
     if unknown > max_nonfinite:
         limit = f"(limit {max_nonfinite:.0%})"
         text = f"{unknown:.0%} of the pixels are NaN, infinite or negative {limit}"

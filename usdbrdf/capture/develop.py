@@ -14,13 +14,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from usdbrdf.capture.checks import FrameRecord
-from usdbrdf.capture.lens_views import PinholeView, shows_any, views_of
+from usdbrdf.capture.lens_views import Intrinsics, PinholeView, Size, shows_any, views_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
@@ -38,12 +38,14 @@ _UNSAFE = r"[^A-Za-z0-9_-]"  # in names that other programs are to read
 # Of what a frame is called after its photograph, whose name may fill what a file system allows.
 _LONGEST = 64
 _LOBES = 3
+# Of a pixel's width, between which weights are interpolated: to 1e-7, as float32 holds them.
+_PHASES = 4096
 # Values of which a pixel is the mean, per side, at most.
 _MAX_TAPS = 16
 # Weights of a tap below this do not bring its fault along.
 _TOUCHES = 1e-4
 # Rows of a frame whose places in the photograph are computed at a time, and frames whose places
-# are kept: the faces of a sphere.
+# are kept: the faces of one sphere.
 _ROWS, _KEPT_MAPS = 64, 6
 
 
@@ -126,11 +128,13 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
     """
     if not any(views):
         return frames
-    some = [(i, view) for i, view in enumerate(views) if view is not None]
+    some, camera = _by_camera(views), None
     for i, view in progress(some, total=len(some), label="lenses", unit="frames"):
+        if camera != (camera := (view.lens, view.intrinsics)):
+            _places.cache_clear()
         place(str(frames.image_paths[i]), partial(_write_frame, frames, i, view))
-    for cache in (_recorded, _places, mask_at_size):
-        cache.cache_clear()
+    for kept in (_recorded, _places, mask_at_size):
+        kept.cache_clear()
     stays = kind_of_encoding(frames.encoding) == "linear"
     return replace(
         frames,
@@ -138,6 +142,16 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
         encoding=frames.encoding if stays else "lin_rec709_scene",
         photograph_encoding=frames.encoding,
     )
+
+
+def _by_camera(views: Sequence[View | None]) -> list[tuple[int, View]]:
+    """The views with their numbers, those of one camera together: the places of its pixels are
+    computed once, and those of one camera alone fill memory. Faces of a photograph stay so too."""
+    cameras: dict[tuple[Lens, Intrinsics], list[tuple[int, View]]] = {}
+    for i, view in enumerate(views):
+        if view is not None:
+            cameras.setdefault((view.lens, view.intrinsics), []).append((i, view))
+    return [one for together in cameras.values() for one in together]
 
 
 def developed_in(frames: Frames, views: Sequence[View | None], folder: Path) -> Frames:
@@ -158,7 +172,7 @@ def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
     write_exr(
         path,
         image,
-        half=not needs_float(np.nan_to_num(image)),
+        half=not needs_float(image),
         holes=True,
         encoding=frames.encoding if stays else "lin_rec709_scene",
     )
@@ -209,7 +223,10 @@ def resampled(source: Float, view: View, camera: Camera, saturation: float) -> F
     turn = float(source.shape[1]) if sphere else 0.0
     inset = _LOBES if sphere else 0
     limit = np.float32(CLIPPED_SHARE * saturation)
-    _resample(len(image), padded, places, inset, turn, limit, np.float32(saturation), image)
+    _resample(
+        len(image), padded, places, inset, turn, _weight_table(), limit, np.float32(saturation),
+        image,
+    )  # fmt: skip
     return image
 
 
@@ -224,11 +241,11 @@ def _around_sphere(source: Float) -> Float:
 @lru_cache(maxsize=_KEPT_MAPS)
 def _places(
     lens: Lens,
-    of_photograph: tuple[float, float, float, float],
+    of_photograph: Intrinsics,
     face: str,
     turn: bytes,
-    intrinsics: tuple[float, float, float, float],
-    resolution: tuple[int, int],
+    intrinsics: Intrinsics,
+    resolution: Size,
 ) -> Float:
     """(H, W, 2) float32: where the photograph shows what the frame's pixels look at."""
     width, height = resolution
@@ -247,7 +264,7 @@ def _places(
 @parallel_kernel
 def _resample(
     first: int, last: int, source: Float, places: Float, inset: int, turn: float,
-    limit: np.float32, saturation: np.float32, image: Float,
+    table: Double, limit: np.float32, saturation: np.float32, image: Float,
 ) -> None:  # fmt: skip
     """inset: pixels that ``source`` has been padded by; turn: pixels of a whole turn, or 0."""
     width = places.shape[1]
@@ -267,7 +284,7 @@ def _resample(
                 dy = (tap % taps_y + 0.5) / taps_y - 0.5
                 u = places[j, i, 0] + dx * ux + dy * uy
                 v = places[j, i, 1] + dx * vx + dy * vy
-                if not _value_at(source, u, v, inset, turn, limit, weights, value):
+                if not _value_at(source, u, v, inset, turn, limit, table, weights, value):
                     known = False
                     break
                 for c in range(3):
@@ -312,7 +329,7 @@ def _taps(u: float, v: float) -> int:
 @kernel
 def _value_at(
     source: Float, u: float, v: float, inset: int, turn: float, limit: np.float32,
-    weights: Double, value: Double,
+    table: Double, weights: Double, value: Double,
 ) -> bool:  # fmt: skip
     """The photograph at a place, into ``value`` (3,); False where it is unknown there."""
     height, width = source.shape[:2]
@@ -323,7 +340,7 @@ def _value_at(
     x, y = u + inset - 0.5, v + inset - 0.5
     i, j = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - i, y - j
-    clean = _lanczos(source, i, j, fx, fy, limit, weights, value)
+    clean = _lanczos(source, i, j, fx, fy, limit, table, weights, value)
     i0, j0 = min(max(i, 0), width - 1), min(max(j, 0), height - 1)
     i1, j1 = min(max(i + 1, 0), width - 1), min(max(j + 1, 0), height - 1)
     for c in range(3):
@@ -348,43 +365,53 @@ def _value_at(
 
 @kernel
 def _lanczos(
-    source: Float, i: int, j: int, fx: float, fy: float, limit: np.float32, weights: Double,
-    value: Double,
+    source: Float, i: int, j: int, fx: float, fy: float, limit: np.float32, table: Double,
+    weights: Double, value: Double,
 ) -> bool:  # fmt: skip
     """The filter's mean into ``value``; False where one of its pixels is clipped or unknown."""
     height, width = source.shape[:2]
-    _set_weights(fx, weights[0])
-    _set_weights(fy, weights[1])
-    value[:] = 0.0
+    first, top = i + 1 - _LOBES, j + 1 - _LOBES
+    inside = first >= 0 and first + 2 * _LOBES <= width
+    _set_weights(fx, table, weights[0])
+    _set_weights(fy, table, weights[1])
+    # Sums in variables of their own stay in registers; in an array each step waits for the last.
+    red, green, blue, clean = 0.0, 0.0, 0.0, True
     for b in range(2 * _LOBES):
-        row = min(max(j + 1 - _LOBES + b, 0), height - 1)
+        row = min(max(top + b, 0), height - 1)
+        line_red, line_green, line_blue = 0.0, 0.0, 0.0
         for a in range(2 * _LOBES):
-            column = min(max(i + 1 - _LOBES + a, 0), width - 1)
-            weight = weights[1, b] * weights[0, a]
-            for c in range(3):
-                # NaN is no less than the limit, either.
-                if not source[row, column, c] < limit:
-                    return False
-                value[c] += weight * source[row, column, c]
+            column = first + a if inside else min(max(first + a, 0), width - 1)
+            weight = weights[0, a]
+            p, q, s = source[row, column, 0], source[row, column, 1], source[row, column, 2]
+            # NaN is no less than the limit, either.
+            clean &= (p < limit) & (q < limit) & (s < limit)
+            line_red += weight * p
+            line_green += weight * q
+            line_blue += weight * s
+        if not clean:
+            return False
+        red += weights[1, b] * line_red
+        green += weights[1, b] * line_green
+        blue += weights[1, b] * line_blue
+    value[0], value[1], value[2] = red, green, blue
     return True
 
 
 @kernel
-def _set_weights(f: float, weights: Double) -> None:
-    """sinc(d) sinc(d / lobes) at the distances d = a - f of the pixels a = 1 - lobes, ..., lobes,
-    their sum made 1."""
-    if f < 1e-6 or f > 1 - 1e-6:
-        weights[:] = 0.0
-        weights[_LOBES - 1 + int(f > 0.5)] = 1.0
-        return
-    total = 0.0
-    # sin(pi (a - f)) is sin(pi f), but for its sign.
-    sine, sign = np.sin(np.pi * f), -1.0
+def _set_weights(f: float, table: Double, weights: Double) -> None:
+    """The row of ``_weight_table`` for any fraction f of a pixel."""
+    place = f * _PHASES
+    n = int(place)
+    t = place - n
     for k in range(2 * _LOBES):
-        distance = k + 1 - _LOBES - f
-        weight = sign * sine * np.sin(np.pi * distance / _LOBES) / distance**2
-        weights[k] = weight
-        total += weight
-        sign = -sign
-    for k in range(2 * _LOBES):
-        weights[k] /= total
+        weights[k] = (1 - t) * table[n, k] + t * table[n + 1, k]
+
+
+@cache
+def _weight_table() -> Double:
+    """(phases + 2, 2 lobes): sinc(d) sinc(d / lobes) at the distances d = a - f of the pixels
+    a = 1 - lobes, ..., lobes, their sum made 1, for f from 0 on to 1 and a step beyond."""
+    f = np.arange(_PHASES + 2) / _PHASES
+    distance = np.arange(1 - _LOBES, _LOBES + 1) - f[:, None]
+    weights = np.sinc(distance) * np.sinc(distance / _LOBES)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))

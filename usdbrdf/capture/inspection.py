@@ -344,12 +344,21 @@ def _frame_rows(frames: Frames, dropped: int, looked_at: int) -> Iterator[tuple[
     if len(sizes) > 1:
         listed = (f"{w} x {h} ({n} frames)" for (w, h), n in sizes[:_LISTED])
         yield "resolutions", f"{len(sizes)}: {', '.join(listed)}"
-    times = np.unique(frames.exposure_time)
-    stops = math.log2(times[-1] / times[0])
-    several = f" to {times[-1]:.4g} s ({stops:.1f} stops)" if len(times) > 1 else " s"
-    yield "exposures", f"{len(times)}: {times[0]:.4g}{several}"
+    yield "exposures", _exposures_row(frames)
     kind = "radiance" if frames.radiometric else "not radiometric"
     yield "encoding", f"{frames.encoding}, {kind}"
+
+
+def _exposures_row(frames: Frames) -> str:
+    times = np.unique(frames.exposure_time)
+    if (times == 1).all():
+        return "not stated"
+    apart = f"{math.log2(times[-1] / times[0]):.1f} stops"
+    if not frames.radiometric:
+        # EXIF's count aperture and sensitivity in: they are no seconds.
+        return f"{len(times)}, {apart} apart" if len(times) > 1 else "1, that of all frames"
+    several = f" to {times[-1]:.4g} s ({apart})" if len(times) > 1 else " s"
+    return f"{len(times)}: {times[0]:.4g}{several}"
 
 
 def _by_rule(dropped: Sequence[DroppedFrame]) -> dict[str, list[DroppedFrame]]:

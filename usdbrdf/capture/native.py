@@ -14,9 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import environment_failures, whole_folder
+from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.documents import write_json
+from usdbrdf.files.images import read_radiance, write_preview_png
 from usdbrdf.files.ply import write_ply
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Int
@@ -56,6 +60,7 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
         copies = zip(images, names, strict=True)
         for image, name in progress(copies, total=len(names), label="frames", unit="files"):
             shutil.copyfile(image, staged / name)
+        masks = _write_masks(scan, images, names, staged)
         points = scan.mesh.points[: captured_points(scan)]
         write_ply(staged / "mesh.ply", points, *captured_faces(scan))
         objects = [
@@ -64,7 +69,22 @@ def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
             for i, label in enumerate(scan.objects)
         ]
         write_json(staged / "objects.json", {"objects": objects})
-        write_json(staged / "transforms.json", _document(scan, names))
+        write_json(staged / "transforms.json", _document(scan, names, masks))
+
+
+def _write_masks(
+    scan: Scan, images: Sequence[Path], names: Sequence[str], folder: Path
+) -> dict[int, str]:
+    """Masks for frames that photographs through lenses became, by the frames' numbers: what the
+    photographs do not show is unknown, which a reader of frames else takes for damage."""
+    masks = {}
+    for i, view in enumerate(scan.views):
+        if view is not None:
+            (folder / "masks").mkdir(exist_ok=True)
+            masks[i] = f"masks/{Path(names[i]).name}.png"
+            known = np.isfinite(read_radiance(images[i])).all(axis=2, keepdims=True)
+            write_preview_png(folder / masks[i], np.repeat(np.uint8(255) * known, 3, axis=2))
+    return masks
 
 
 def as_copied(scan: Scan, asked: Scan) -> Scan:
@@ -82,17 +102,26 @@ def _frame_names(frames: Frames) -> list[str]:
     return [f"frames/{n}{path.name}" for n, path in zip(numbered, frames.image_paths, strict=True)]
 
 
-def _document(scan: Scan, names: list[str]) -> dict[str, Any]:
+def _document(scan: Scan, names: list[str], masks: dict[int, str]) -> dict[str, Any]:
     frames = scan.frames
     return {
         "camera_model": "PINHOLE",
         "encoding": frames.encoding,
+        # Frames that photographs through lenses became: their files do not tell.
+        **({"radiometric": False} if _holds_light(frames) and not frames.radiometric else {}),
         "meters_per_unit": scan.meters_per_unit,
         "up_axis": scan.up_axis,
         "mesh": "mesh.ply",
         "objects": "objects.json",
-        "frames": [_entry(frames, i, name) for i, name in enumerate(names)],
+        "frames": [
+            _entry(frames, i, name) | ({"mask_path": masks[i]} if i in masks else {})
+            for i, name in enumerate(names)
+        ],
     }
+
+
+def _holds_light(frames: Frames) -> bool:
+    return kind_of_encoding(frames.encoding) != "display"
 
 
 def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
@@ -107,11 +136,11 @@ def _entry(frames: Frames, i: int, name: str) -> dict[str, Any]:
         "exposure_time": float(frames.exposure_time[i]),
     }
     saturation = float(frames.saturation_radiance[i])
-    if frames.radiometric and math.isfinite(saturation):
+    if _holds_light(frames) and math.isfinite(saturation):
         entry["saturation_radiance"] = saturation
     if frames.captured_pose is not None:
         entry["captured_transform_matrix"] = frames.captured_pose[i].tolist()
-    if frames.radiometric and frames.noise_floor_radiance[i] > 0:
+    if _holds_light(frames) and frames.noise_floor_radiance[i] > 0:
         entry["noise_floor_radiance"] = float(frames.noise_floor_radiance[i])
     return entry
 

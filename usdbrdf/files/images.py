@@ -228,12 +228,13 @@ def needs_float(values: Float) -> bool:
     """Whether half floats would clamp any of the values, or round most of those that are not 0.
 
     Halves end at 65504 and lose digits below 2^-14: radiance in other units lies beyond either.
+    NaN does not count.
     """
     size = np.abs(values)
-    if float(size.max(initial=0)) > _HALF_UNTIL:
+    if (size > _HALF_UNTIL).any():
         return True
-    some = size[size > 0]
-    return bool(some.size and np.count_nonzero(some < _HALF_FROM) * 2 > some.size)
+    some = size > 0
+    return bool(np.count_nonzero(some & (size < _HALF_FROM)) * 2 > np.count_nonzero(some))
 
 
 def resized(pixels: Float, width: int, height: int) -> Float:
@@ -472,11 +473,10 @@ def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool 
         stored = pixels_of(staged, open_image(staged))
         if pixels.dtype == np.uint8:
             stored = np.rint(stored * 255)
-        known = np.ones(pixels.shape, bool) if holes else np.isfinite(pixels)
-        if stored.shape == pixels.shape and np.array_equal(
-            stored[known], pixels[known], equal_nan=holes
-        ):
-            return
+        if stored.shape == pixels.shape:
+            unasked = np.isnan(pixels) & np.isnan(stored) if holes else ~np.isfinite(pixels)
+            if ((stored == pixels) | unasked).all():
+                return
         cause = None
     except ImageRefused as error:
         cause = error

@@ -260,10 +260,10 @@ def test_a_failure_is_told_in_one_sentence(session, program, tmp_path):
     scan.mkdir()
     told = session("convert", program, scan, tmp_path / "out", 0)
     assert told["state"] == "failed"
-    assert told["line"].startswith(f"{scan}: not a capture that any adapter recognises")
+    assert told["line"].startswith(f"{scan}: no capture of a known format")
     assert told["line"].endswith("[adapter.none]")
     assert alerts(told["panel"]).startswith("Failed")
-    assert "any adapter recognises" in alerts(told["panel"])
+    assert "no capture of a known format" in alerts(told["panel"])
     assert told["properties"] == {}
 
 

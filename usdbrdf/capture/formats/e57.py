@@ -6,6 +6,7 @@ they have there. Pinholes look down -z with y up; whole spheres have x straight 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "e57unpack do), or name the folder with --frames. [capture.frames]"
         )
     records = frame_records(taken, pictures, findings)
-    mesh = mesh_beside(
+    mesh = partial(
+        mesh_beside,
         folder,
         options,
         "mesh.*",

@@ -7,6 +7,7 @@ white-balanced. World: y up, metres, as mesh.obj.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     pictures = pictures_of(folder, options, *_FOLDERS)
     refuse_without_pictures(pictures, source)
     records = frame_records(source, pictures, findings)
-    mesh = mesh_beside(folder, options, "mesh.obj", how="Download mesh.obj of this scene")
+    mesh = partial(mesh_beside, folder, options, "mesh.obj", how="Download mesh.obj of this scene")
     return scan_of(
         records,
         mesh,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{folder}: neither cam.txt nor train/transforms.json. Name the scene's folder. "
             "[capture.format]"
         )
-    mesh = mesh_beside(folder, options, "scene.obj", "scene.ply", how=_HOW)
+    mesh = partial(mesh_beside, folder, options, "scene.obj", "scene.ply", how=_HOW)
     segmented = any(_segmentation_of(record).is_file() for record in records)
     return scan_of(
         records,

@@ -7,6 +7,7 @@ nearest and the farthest depth. The principal point is the picture's middle.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +72,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 mask_path=pictures.mask_of(image, folder, options),
             )
         )
-    mesh = mesh_beside(
+    mesh = partial(
+        mesh_beside,
         folder,
         options,
         how="LLFF has poses and no surface: make a mesh in the same frame, for instance with "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     refuse_without_pictures(pictures, source)
     records = frame_records(source, pictures, options, findings)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
-    mesh = mesh_beside(
+    mesh = partial(
+        mesh_beside,
         folder,
         options,
         "mesh.*",

@@ -262,7 +262,7 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
 
 def scan_of(
     records: Sequence[FrameRecord],
-    geometry: Path | Callable[[], ScanGeometry],
+    geometry: Path | Callable[[], Path | ScanGeometry],
     options: CaptureOptions,
     findings: Findings,
     *,
@@ -272,15 +272,18 @@ def scan_of(
     meters_per_unit: float = 1.0,
     up_axis: str = "Z",
     encoding: str | None = None,
+    radiometric: bool = True,
     name: str = "",
     objects: Callable[[FileMesh], LabelTable] | None = None,
 ) -> Scan:
-    """The capture of these frames and this mesh (a file, or what reads it).
+    """The capture of these frames and this mesh (a file, or what finds or reads it, which is asked
+    once the poses are known to be sound: ``inspect`` tells of the frames where there is none).
 
     objects   what knows the objects of the mesh; ``--objects`` comes first
     source    the document that messages name; ``folder``, the capture's own, absolute
     encoding  of the images, where the format says; the user's comes first. InputRefused where these
               hold something of another kind
+    radiometric  False of linear images that 8-bit photographs became
     """
     for record in records:
         if record.lens.bends and "undistort" in record.image_path.parent.name.lower():
@@ -314,6 +317,11 @@ def scan_of(
     if photographs:
         records = as_photographs(records, findings, source)
     else:
+        if not radiometric:
+            findings.warn(
+                f"{source.name}: says that its images are not radiometric, so neither is the "
+                "result: colours and relative brightness only. [capture.ldr]"
+            )
         if unknown := sum(math.isinf(r.saturation_radiance) for r in records):
             findings.warn(
                 f"{source.name}: {unknown} of {len(records)} frames state no saturation, so "
@@ -321,10 +329,11 @@ def scan_of(
             )
 
     def read_geometry() -> ScanGeometry:
-        if not isinstance(geometry, Path):
-            return geometry()
+        found = geometry if isinstance(geometry, Path) else geometry()
+        if not isinstance(found, Path):
+            return found
         return geometry_from_file(
-            geometry,
+            found,
             options.objects or objects,
             options,
             findings,
@@ -341,7 +350,7 @@ def scan_of(
         adapter=adapter,
         source=source,
         encoding=radiance_encoding(options, photographs=photographs),
-        radiometric=not photographs,
+        radiometric=radiometric and not photographs,
         meters_per_unit=meters_per_unit,
         up_axis=up_axis,
     )

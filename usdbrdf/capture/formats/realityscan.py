@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +94,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     ]
     records.sort(key=lambda record: record.image_path)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
-    mesh = mesh_beside(
+    mesh = partial(
+        mesh_beside,
         folder,
         options,
         "mesh.*",

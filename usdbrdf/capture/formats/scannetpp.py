@@ -7,6 +7,7 @@ groups of segments, and each vertex of the mesh is in one segment.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             )
         )
     records.sort(key=lambda record: record.image_path)
-    mesh = mesh_beside(
-        folder, options, f"scans/{_MESH}", how=f"Download scans/{_MESH} of this scene"
+    mesh = partial(
+        mesh_beside, folder, options, f"scans/{_MESH}", how=f"Download scans/{_MESH} of this scene"
     )
     return scan_of(
         records,

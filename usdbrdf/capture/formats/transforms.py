@@ -78,9 +78,21 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=source.parent,
         encoding=_encoding(capture),
+        radiometric=_radiometric(capture),
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         up_axis=up_axis or "Z",
     )
+
+
+def _radiometric(capture: _Capture) -> bool:
+    """What the document says of linear images: false of those that 8-bit photographs became."""
+    stated = capture.document.get("radiometric", True)
+    if not isinstance(stated, bool):
+        raise capture.refuse(
+            f"radiometric is {str(stated)[:40]!r}, neither true nor false. Correct it.",
+            "capture.format",
+        )
+    return stated
 
 
 def _encoding(capture: _Capture) -> str | None:
