@@ -37,6 +37,7 @@ def _lighting(
         error=np.full(count, error, np.float32),
         known=np.ones(count, bool),
         emissive=shines,
+        bound=np.zeros(count, np.float32),
     )
 
 
@@ -63,13 +64,44 @@ def test_what_shines_in_one_lighting_the_other_tells(pair: World):
     assert not base_color_of(pair.texels, [lit, lit])[lamp].any()
 
 
-def test_what_is_only_bounded_counts_little_beside_what_is_measured(pair: World):
-    bounded, sure = _lighting(pair, 5, 0), _lighting(pair, 5, 0)
-    bounded = bounded._replace(
-        radiance=2 * bounded.radiance, error=np.full(len(pair.texels), np.inf, np.float32)
+def _clipped(given: Reflection, which: np.ndarray, bound: float) -> Reflection:
+    """Some texels are as bright as ``bound``, W/(m^2 sr), at least, in whatever channel."""
+    return given._replace(
+        radiance=np.where(which[:, None], np.float32(bound), given.radiance),
+        error=np.where(which, np.inf, given.error).astype(np.float32),
+        bound=np.where(which, np.float32(bound), 0),
     )
+
+
+def test_what_clips_has_the_hue_of_its_object_and_is_as_bright_as_it_must_be(pair: World):
+    wall = pair.texels.of_object(0)
+    half = np.zeros(len(pair.texels), bool)
+    half[wall] = pair.texels.position[wall, 0] > 0.5
+    sure = _lighting(pair, 5, 0)
+    # The brightest channel shows 5 / pi times 0.7.
+    for share, brighter in ((0.5, 1.0), (1.0, 1.0), (1.2, 1.2), (9.0, 1 / 0.7)):
+        found = base_color_of(pair.texels, [_clipped(sure, half, share * 0.7 * 5 / np.pi)])
+        np.testing.assert_allclose(found[half], found[half][:1] * np.ones((half.sum(), 1)))
+        np.testing.assert_allclose(found[half][0], brighter * RHO, rtol=1e-3)
+        np.testing.assert_allclose(
+            found[wall][~half[wall]], RHO[None] + 0 * found[wall][~half[wall]], rtol=1e-5
+        )
+
+
+def test_a_thing_that_clips_all_over_is_grey(pair: World):
+    lamp = np.zeros(len(pair.texels), bool)
+    lamp[pair.texels.of_object(1)] = True
+    for share, wanted in ((0.5, NEUTRAL), (1.6 / NEUTRAL * 0.5, 0.8), (9.0, 1.0)):
+        given = _clipped(_lighting(pair, 5, 0), lamp, share * NEUTRAL * 5 / np.pi)
+        np.testing.assert_allclose(base_color_of(pair.texels, [given])[lamp], wanted, rtol=1e-5)
+
+
+def test_what_is_only_bounded_counts_nothing_beside_what_is_measured(pair: World):
+    sure = _lighting(pair, 5, 0)
+    bounded = _clipped(sure, np.ones(len(pair.texels), bool), 9.0)
     found = base_color_of(pair.texels, [bounded, sure])
     assert _rms(found[pair.texels.of_object(0)], RHO) < 1e-3
+    np.testing.assert_array_equal(found, base_color_of(pair.texels, [sure, bounded]))
 
 
 def test_what_no_lighting_shows_is_filled_in_or_neutral(pair: World):

@@ -153,7 +153,8 @@ def refined_light(
     beside_seen = [_beside_seen(texels, one.before) for one in lightings]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
-        """Base colour, and of each lighting L_d with what it reflects where nobody looked."""
+        """Base colour, and of each lighting L_d with what it reflects where nobody looked or all
+        frames clipped."""
         shown = [
             Reflection(
                 radiance=diffuse,
@@ -161,6 +162,7 @@ def refined_light(
                 error=error,
                 known=one.before.coverage.observed,
                 emissive=one.before.emissive,
+                bound=np.where(one.before.coverage.clipped, one.before.lit.min(axis=1), 0),
             )
             for one, (diffuse, error), incoming in zip(lightings, found, irradiance, strict=True)
         ]
@@ -172,7 +174,8 @@ def refined_light(
             # seen before it.
             leaks = beside & (hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1))
             hidden = np.where(leaks[:, None], one.radiance, hidden)
-            light.append(np.where((one.known | one.emissive)[:, None], one.radiance, hidden))
+            told = one.measured | one.emissive
+            light.append(np.where(told[:, None], one.radiance, hidden))
         return base_color, light
 
     _, first = reflected([one.before.irradiance for one in lightings])

@@ -49,33 +49,53 @@ def albedo_map(
 class Reflection(NamedTuple):
     """One lighting: of T texels radiance and irradiance (T, 3), as ``albedo_map`` has them and
     ``known`` and ``emissive`` (T,) too; error (T,), standard deviation of radiance / irradiance
-    relative to it, as far as the samples and the rays tell, infinite where that is only bounded."""
+    relative to it, as far as the samples and the rays tell; bound (T,), W/(m^2 sr): of what clips
+    in every frame how bright its brightest channel is at least, of all else 0."""
 
     radiance: Float
     irradiance: Float
     error: Float
     known: Bool
     emissive: Bool
+    bound: Float
+
+    @property
+    def measured(self) -> Bool:
+        """(T,): more is known than a bound."""
+        return np.asarray(self.known & (self.bound == 0), np.bool_)
+
+    def as_bright_as_bounds(self, base_color: Float) -> Float:
+        """A base colour (T, 3), brighter where it reflects less than frames saw at least; its hue
+        stays, for one channel alone may have clipped, and no channel exceeds 1."""
+        reflected = (base_color * self.irradiance).max(axis=1) / np.pi
+        brighter = np.maximum(self.bound / np.maximum(reflected, _TINY), 1)
+        brighter = np.minimum(brighter, 1 / np.maximum(base_color.max(axis=1), _TINY))
+        return np.asarray(base_color * np.maximum(brighter, 1)[:, None], np.float32)
 
 
 def base_color_of(texels: Texels, lightings: Sequence[Reflection]) -> Float:
     """(T, 3) in [0, 1]: the albedo that all lightings tell, each weighted by the inverse of its
-    variance; what shines in one of them, others tell alone."""
+    variance; what shines in one of them, others tell alone. What clips in every frame has the hue
+    of its object's measured texels: its own is unknown."""
     if len(lightings) == 1:
         (only,) = lightings
-        return albedo_map(texels, only.radiance, only.irradiance, only.known, only.emissive)[0]
+        seen = only.radiance, only.irradiance, only.measured, only.emissive
+        return only.as_bright_as_bounds(albedo_map(texels, *seen)[0])
     total, weights = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), np.float32)
     for one in lightings:
-        albedo, tells = _albedo(one.radiance, one.irradiance, one.known & ~one.emissive)
-        # A bound is better than nothing.
-        weight = np.maximum(1 / (one.error**2 + _OF_LIGHTING**2), 1e-6)
+        albedo, tells = _albedo(one.radiance, one.irradiance, one.measured & ~one.emissive)
+        weight = 1 / (one.error**2 + _OF_LIGHTING**2)
         weight = np.where(tells, weight, 0).astype(np.float32)
         total += weight[:, None] * np.clip(albedo, 0, 1)
         weights += weight
-    known = np.any([one.known & ~one.emissive for one in lightings], axis=0)
+    known = np.any([one.measured & ~one.emissive for one in lightings], axis=0)
     emissive = np.all([one.emissive for one in lightings], axis=0)
     mean = total / np.maximum(weights, _TINY)[:, None]
-    return _filled_in(texels, np.asarray(mean, np.float32), weights > 0, known, emissive)
+    base_color = _filled_in(texels, np.asarray(mean, np.float32), weights > 0, known, emissive)
+    for one in lightings:
+        brighter = one.as_bright_as_bounds(base_color)
+        base_color = np.where((weights > 0)[:, None], base_color, brighter)
+    return base_color
 
 
 def _albedo(radiance: Float, irradiance: Float, reflects: Bool) -> tuple[Float, Bool]:
