@@ -19,7 +19,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
@@ -92,6 +91,10 @@ def solved(
     asked: Asked, sources: Sources, start: Solution | None = None, iterations: int = _ITERATIONS
 ) -> Solution:
     """The strengths that explain best what the texels reflect."""
+    # Segment by segment, so that sums over one are of neighbours.
+    order = np.argsort(asked.segment, kind="stable")
+    asked = Asked._make(values[order] for values in asked)
+    sources = sources._replace(share=np.ascontiguousarray(sources.share[:, order]))
     if start is None:
         light = np.log(asked.irradiance + sources.irradiance(sources.mean))
         rest = np.log(asked.reflected) - light
@@ -117,7 +120,7 @@ def _solved_channel(
     asked: Asked, sources: Sources, start: Solution, channel: int, counted: Bool, iterations: int
 ) -> tuple[Double, Double, Double, Double]:
     """One channel's part of ``solved``: Gauss-Newton steps on the weighted squares of the texels
-    that are ``counted`` (N,)."""
+    that are ``counted`` (N,); all are in the order of their segments."""
     known, observed = asked.irradiance[:, channel], np.log(asked.reflected[:, channel])
     mirrored = asked.mirrored[:, channel]
     g, albedo, gloss = (
@@ -131,11 +134,13 @@ def _solved_channel(
     of_albedo = num_sources + np.arange(num_segments)
     of_gloss = of_albedo + num_segments
 
-    # (M, N): sums over the texels of each segment.
-    texels = np.arange(len(asked.segment))
-    gather = sparse.csr_matrix(
-        (np.ones(len(texels)), (asked.segment, texels)), shape=(num_segments, len(texels))
-    )
+    first = (np.cumsum(size) - size)[size > 0]
+
+    def gathered(values: Double) -> Double:
+        """(..., M): sums of values (..., N) over the texels of each segment."""
+        sums = np.zeros((*values.shape[:-1], num_segments))
+        sums[..., size > 0] = np.add.reduceat(values, first, axis=-1)
+        return sums
 
     for _ in range(iterations):
         brought = np.exp(g)[:, None] * sources.share
@@ -156,12 +161,12 @@ def _solved_channel(
         gradient[:num_sources] = by_source @ (weight * residual)
         parts = by_albedo * weight, by_gloss * weight
         for place, part in zip((of_albedo, of_gloss), parts, strict=True):
-            both = gather @ (by_source * part).T
-            curvature[place, :num_sources], curvature[:num_sources, place] = both, both.T
-            gradient[place] = gather @ (part * residual)
-        curvature[of_albedo, of_albedo] = gather @ (by_albedo * parts[0])
-        curvature[of_gloss, of_gloss] = gather @ (by_gloss * parts[1])
-        both = gather @ (by_gloss * parts[0])
+            both = gathered(by_source * part)
+            curvature[place, :num_sources], curvature[:num_sources, place] = both.T, both
+            gradient[place] = gathered(part * residual)
+        curvature[of_albedo, of_albedo] = gathered(by_albedo * parts[0])
+        curvature[of_gloss, of_gloss] = gathered(by_gloss * parts[1])
+        both = gathered(by_gloss * parts[0])
         curvature[of_albedo, of_gloss] = curvature[of_gloss, of_albedo] = both
         _add_priors(curvature, gradient, sources, channel, (g, albedo, gloss, mean))
         # What would be less glossy than not at all stays as it is.
@@ -209,12 +214,11 @@ def _add_priors(
     precision = sources.deviation**-2.0 / np.where(sources.bound, 1, max((~sources.bound).sum(), 1))
     curvature[index, index] += precision
     gradient[:k] += precision * off
-    for (a, b), deviation in zip(sources.pairs, sources.apart, strict=True):
-        pull = deviation**-2
-        for one, other in ((a, b), (b, a)):
-            curvature[one, one] += pull
-            curvature[one, other] -= pull
-            gradient[one] -= pull * (g[one] - g[other])
+    pull = sources.apart**-2.0
+    for one, other in (sources.pairs.T, sources.pairs.T[::-1]):
+        np.add.at(curvature, (one, one), pull)
+        np.add.at(curvature, (one, other), -pull)
+        np.add.at(gradient, one, -pull * (g[one] - g[other]))
     segment = np.arange(k, k + len(albedo))
     glossy = segment + len(albedo)
     usual, spread = sources.gloss[0], max(sources.gloss[1], _GIVEN)
