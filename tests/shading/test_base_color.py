@@ -88,6 +88,15 @@ def test_what_clips_has_the_hue_of_its_object_and_is_as_bright_as_it_must_be(pai
         )
 
 
+def test_what_clips_and_nothing_shines_on_has_a_colour_too(pair: World):
+    lamp = np.zeros(len(pair.texels), bool)
+    lamp[pair.texels.of_object(1)] = True
+    given = _lighting(pair, 5, 0)
+    dark = given._replace(irradiance=np.where(lamp[:, None], 0, given.irradiance))
+    found = base_color_of(pair.texels, [_clipped(dark, lamp, 4.0)])
+    np.testing.assert_allclose(found[lamp], 1)
+
+
 def test_a_thing_that_clips_all_over_is_grey(pair: World):
     lamp = np.zeros(len(pair.texels), bool)
     lamp[pair.texels.of_object(1)] = True

@@ -67,7 +67,8 @@ class Reflection(NamedTuple):
     def as_bright_as_bounds(self, base_color: Float) -> Float:
         """A base colour (T, 3), brighter where it reflects less than frames saw at least; its hue
         stays, for one channel alone may have clipped, and no channel exceeds 1."""
-        reflected = (base_color * self.irradiance).max(axis=1) / np.pi
+        # In double precision: what nothing shines on may be any times too dark.
+        reflected = (base_color.astype(np.float64) * self.irradiance).max(axis=1) / np.pi
         brighter = np.maximum(self.bound / np.maximum(reflected, _TINY), 1)
         brighter = np.minimum(brighter, 1 / np.maximum(base_color.max(axis=1), _TINY))
         return np.asarray(base_color * np.maximum(brighter, 1)[:, None], np.float32)
