@@ -140,13 +140,16 @@ def refined_light(
     """
     need = _need([one.lit for one in lightings])
     texels, found = lightings[0].lit.texels, []
-    owner, metal = texels.object_index(), lobes.conducts[texels.object_index()]
+    owner = texels.object_index()
+    metal = lobes.conducts[owner]
+    bounds = []
     for one in lightings:
         means = _means_without_lobes(run.part(one.name), one, reader, lobes, need, memory, seed)
         diffuse, error = _diffuse_of_means(one, means, lobes)
         diffuse = _with_patterns(
-            run.part(one.name), one, reader, metal, diffuse, means, memory, seed
+            run.part(one.name), one, reader, lobes, diffuse, means, memory, seed
         )
+        bounds.append(np.where(one.before.coverage.clipped, one.before.lit.min(axis=1), 0))
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
@@ -162,9 +165,11 @@ def refined_light(
                 error=error,
                 known=one.before.coverage.observed,
                 emissive=one.before.emissive,
-                bound=np.where(one.before.coverage.clipped, one.before.lit.min(axis=1), 0),
+                bound=bound,
             )
-            for one, (diffuse, error), incoming in zip(lightings, found, irradiance, strict=True)
+            for one, (diffuse, error), bound, incoming in zip(
+                lightings, found, bounds, irradiance, strict=True
+            )
         ]
         base_color = base_color_of(texels, shown)
         light = []
@@ -308,7 +313,7 @@ def _with_patterns(
     run: TaskRun,
     lighting: Lighting,
     reader: FrameReader,
-    metal: Bool,
+    lobes: Lobes,
     diffuse: Float,
     means: RobustMean,
     memory: float | None,
@@ -317,23 +322,24 @@ def _with_patterns(
     """``diffuse`` (T, 3) of a lighting, with what the frames' pixels together tell beside it."""
     _, lit, before, own = lighting
     frames, texels, level2 = reader.frames, lit.texels, _level(before.lit) ** 2
-    known = np.isfinite(means.mean[:, 0]) & ~before.emissive & ~metal
+    # Read once: each frame asks for it.
+    owner, samples = texels.object_index(), before.samples
+    known = np.isfinite(means.mean[:, 0]) & ~before.emissive & ~lobes.conducts[owner]
     # Of a single sample, what it differs from the others by.
-    variance = means.variance * level2 * np.minimum(before.samples, _MOST_SAMPLES)
+    variance = means.variance * level2 * np.minimum(samples, _MOST_SAMPLES)
     told = np.stack([np.where(known, variance, 0), known], axis=-1).astype(np.float32)
     variance, share = around(texels, told, means.footprint).T
     variance = np.where(known, variance / np.maximum(share, 1e-6), 0).astype(np.float32)
     texel_of = np.full(len(texels.nearest_texel), -1, np.int32)
     texel_of[texels.pixel[known]] = np.flatnonzero(known)
-    owner = texels.object_index()
     surface = PatternedSurface(lit.scene, lit.rays, texels, owner, diffuse, texel_of, variance)
 
     def of_frame(i: int) -> Covering:
         shown = reader.read(i)
-        picture = Picture(shown.radiance, shown.valid, shown.clipped, shown.dark)
         noise = OF_NOISE_FLOOR * float(frames.noise_floor_radiance[i])
-        found = pixels_of_frame(surface, picture, frames.camera(i), noise, RELATIVE_ERROR)
-        return found.take(_subsample(found.texel, before.samples[found.texel], i, seed))
+        picture, camera = Picture.of(shown), frames.camera(i)
+        found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR)
+        return found.take(_subsample(found.texel, samples[found.texel], i, seed))
 
     def pixels() -> Iterator[Covering]:
         bar = progress(ahead(of_frame, own), total=len(own), label="fit: patterns", unit="frames")

@@ -310,7 +310,7 @@ def samples_from_frames(
         pixels, camera = read(i), frames.camera(i)
         which = blocks.texels_in_view(camera, MIN_COSINE)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
-        picture = Picture(pixels.radiance, pixels.valid, pixels.clipped, pixels.dark)
+        picture = Picture.of(pixels)
         kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
         sampled, dark = kind == SAMPLE, kind == DARK
         return FrameSamples(

@@ -118,7 +118,7 @@ def pixels_of_frame(
     and the share ``error`` of their radiance."""
     scene, texels = surface.scene, surface.texels
     face, point = visible_faces(surface.rays, camera)
-    shown = np.where(face >= 0, scene.face_object[face], -1).astype(np.int32)
+    surfaces = FirstSurfaces.of(face, point, scene.face_object)
     size = face.shape
     texel = np.full(size, -1, np.int32)
     where = np.zeros((*size, 2), np.float32)
@@ -134,13 +134,14 @@ def pixels_of_frame(
     _residuals(
         size[0], surface.own, surface.values, texels.pixel, texels.first_pixel,
         texels.resolution, texels.position, texels.geometric_normal, eye, pixel_size,
-        FirstSurfaces(shown, point), picture.radiance, fits, texel, where, step, rest,
+        surfaces, picture.radiance, fits, texel, where, step, rest,
     )  # fmt: skip
     weight = np.zeros(size, np.float32)
     beside = np.empty_like(rest)
     _without_common(
-        size[0], shown, texel, rest, surface.values, surface.variance, noise, error, beside, weight
-    )
+        size[0], surfaces.object, texel, rest, surface.values, surface.variance, noise, error,
+        beside, weight,
+    )  # fmt: skip
     kept = weight > 0
     return Covering(texel[kept], where[kept], step[kept], beside[kept], weight[kept])
 

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from usdbrdf import calibration
+from usdbrdf.files.frames import FramePixels
 from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -98,6 +99,13 @@ class FirstSurfaces(NamedTuple):
     object: Int
     point: Float
 
+    @classmethod
+    def of(cls, face: Int, point: Float, face_object: Int) -> FirstSurfaces:
+        """Those of triangles (H, W), -1 where there is none, at points (H, W, 3)."""
+        shown = face_object[face]
+        shown[face < 0] = -1
+        return cls(shown, point)
+
 
 class Picture(NamedTuple):
     """One frame: radiance (H, W, 3) float32; valid, clipped, dark (H, W) bool."""
@@ -106,6 +114,10 @@ class Picture(NamedTuple):
     valid: Bool
     clipped: Bool
     dark: Bool
+
+    @classmethod
+    def of(cls, pixels: FramePixels) -> Picture:
+        return cls(pixels.radiance, pixels.valid, pixels.clipped, pixels.dark)
 
 
 def glares(picture: Picture) -> Bool:
@@ -152,10 +164,7 @@ class _Surface(NamedTuple):
 
 def first_surfaces(rays: RayScene, face_object: Int, camera: Camera) -> FirstSurfaces:
     """The first hits of the rays through all pixels' centres."""
-    face, point = visible_faces(rays, camera)
-    shown = face_object[face]
-    shown[face < 0] = -1
-    return FirstSurfaces(shown, point)
+    return FirstSurfaces.of(*visible_faces(rays, camera), face_object)
 
 
 def samples_from_frame(
