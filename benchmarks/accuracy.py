@@ -110,8 +110,9 @@ def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str,
         )
         for t in np.flatnonzero((kind == SAMPLE) & (place >= 0)):
             store[place[t]].append(radiance[t])
-    exact = np.array([np.median(samples, axis=0) for samples in store])
-    relative = atlas.map("lit")[chosen] / np.maximum(exact, 1e-9) - 1
+    seen = np.array([len(samples) > 0 for samples in store])
+    exact = np.array([np.median(samples, axis=0) for samples in store if samples])
+    relative = atlas.map("lit")[chosen[seen]] / np.maximum(exact, 1e-9) - 1
     return {
         "median_abs_relative": float(np.median(np.abs(relative))),
         "median_signed": float(np.median(relative)),

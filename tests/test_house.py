@@ -151,6 +151,7 @@ _OPEN = {
 
 CALIBRATED_ROOMS = ("capture", "material", "shading", "tasks", "texturing")
 ENGINEERING: dict[str, str] = {
+    "ACROSS": "memory: texels that a pixel may cover",
     "ASKED": "time",
     "BRIGHT_CODE": "codes of 8-bit images",
     "BYTES_OF_EQUATIONS": "bytes",
@@ -170,6 +171,7 @@ ENGINEERING: dict[str, str] = {
     "OF_TEXTURING": "bytes",
     "OLD_NERFSTUDIO": "convention of a format",
     "PER_SEGMENT": "time: how many are asked",
+    "REACH": "memory: texels that a pixel may cover",
     "RINGS": "mathematics: nodes of a quadrature",
     "ROWS_BESIDE": "geometry: how far steps of a search reach",
     "SAMPLE": "codes of what a texel shows in a frame",
@@ -177,7 +179,6 @@ ENGINEERING: dict[str, str] = {
     "TILE_SIDE": "texels of a tile",
     "UNASKED": "mathematics: deviation of what is nothing as likely as anything",
     "WIDTH": "pixels of a picture",
-    "_ACROSS": "geometry: texels that one pixel covers",
     "_ALONE": "mathematics: two of nine",
     "_APART": "geometry: texels that one pixel covers",
     "_AROUND": "codes, or texels, that are taken together",
@@ -204,6 +205,7 @@ ENGINEERING: dict[str, str] = {
     "_DARKEST": "numerics",
     "_DIFFUSE_RAYS": "rays: noise against time",
     "_DIRECTIONS": "discretisation of the search",
+    "_ENOUGH": "geometry: pixels that make a mean",
     "_EXACT": "numerics: of float64",
     "_FACES": "geometry: sides of a cube",
     "_FARTHEST_CENTRE": "limit of what is refused",
@@ -233,6 +235,7 @@ ENGINEERING: dict[str, str] = {
     "_LARGEST": "limit of what is refused",
     "_LEAK": "geometry: texels that pixels may mix",
     "_LEAST": "numerics",
+    "_LEAST_EQUAL": "numerics: of a quotient",
     "_LEAST_OF_SEGMENT": "time: how many are asked",
     "_LEVELS": "steps of a search",
     "_LEVEL_1": "discretisation of the search",

@@ -37,14 +37,8 @@ from usdbrdf.texturing.passes import (
     smallest_groups,
     with_rows_beside,
 )
-from usdbrdf.texturing.patterns import (
-    BYTES_OF_EQUATIONS,
-    ROWS_BESIDE,
-    Covering,
-    PatternedSurface,
-    pixels_of_frame,
-    with_patterns,
-)
+from usdbrdf.texturing.pattern_pixels import Covering, PatternedSurface, pixels_of_frame
+from usdbrdf.texturing.patterns import BYTES_OF_EQUATIONS, ROWS_BESIDE, with_patterns
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.texturing.samples import MIN_COSINE, Picture
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
