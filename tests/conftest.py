@@ -112,7 +112,8 @@ FRESH = ("faults/test_what_children_open.py", "job/test_child.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow, and what is for the night."""
+    """Mark what is slow, and what is for the night; slow files first, of each kind those with the
+    most tests."""
     here = Path(__file__).parent
     cases: Counter[str] = Counter()
     for item in items:
@@ -126,6 +127,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         place = item.path.relative_to(here).as_posix()
         if any(place == slow or place.startswith(f"{slow}/") for slow in SLOW):
             item.add_marker(pytest.mark.slow)
+    tests = Counter(item.path for item in items)
+    items.sort(key=lambda item: ("slow" not in item.keywords, -tests[item.path], item.path))
 
 
 @pytest.fixture(autouse=True, scope="session")
