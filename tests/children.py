@@ -30,13 +30,15 @@ import usdbrdf.job.child as product
 from usdbrdf.files.atomic import environment_failures
 
 # With less address space what a child has imported already counts; in less time, that it has.
-_LEAST_MEMORY, _LEAST_SECONDS = 16 << 30, 1
+_LEAST_MEMORY, _LEAST_SECONDS = 4 << 30, 1
 _IMPORTED = (
     "numpy", "pxr.Usd", "pxr.UsdGeom", "pxr.UsdShade", "trimesh", "xatlas", "flip_evaluator",
     "usdbrdf.geometry.unwrap", "usdbrdf.untrusted.bounds", "usdbrdf.untrusted.mesh_files",
 )  # fmt: skip
-# What has threads cannot be forked.
-_NO_THREADS = {"OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "1"}
+# What has threads cannot be forked; USD would say that it has none.
+_NO_THREADS = {
+    "OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0",
+}  # fmt: skip
 _NUMBER, _NONE = struct.Struct("q"), 0
 
 
