@@ -49,6 +49,8 @@ class ForkedChild:
         self._end = end
         self._status: int | None = None
         self.pid = self._told(None)
+        if self.pid == _NONE:
+            end.close()
 
     def wait(self, timeout: float | None = None) -> int:
         if self._status is None:
