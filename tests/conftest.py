@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +11,8 @@ from types import SimpleNamespace
 import pytest
 from threadpoolctl import threadpool_limits
 
+import usdbrdf.job.child
+from tests.children import Children
 from tests.synthetic_asset import box, build, make_scan
 from usdbrdf.job.progress import set_quiet
 
@@ -103,9 +107,13 @@ NIGHTLY = (
     "test_scales.py::test_maps_and_summaries_do_not_know_how_large_the_scene_is",
 )
 
+# Tests of how children start, what they import and what they may open: they start fresh.
+FRESH = ("faults/test_what_children_open.py", "job/test_child.py")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow, and what is for the night."""
+    """Mark what is slow, and what is for the night; slow files first, of each kind those with the
+    most tests."""
     here = Path(__file__).parent
     cases: Counter[str] = Counter()
     for item in items:
@@ -119,12 +127,33 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         place = item.path.relative_to(here).as_posix()
         if any(place == slow or place.startswith(f"{slow}/") for slow in SLOW):
             item.add_marker(pytest.mark.slow)
+    tests = Counter(item.path for item in items)
+    items.sort(key=lambda item: ("slow" not in item.keywords, -tests[item.path], item.path))
 
 
 @pytest.fixture(autouse=True, scope="session")
 def _one_thread_of_blas():
     """As in the work of a task: the tests' processes share the cores already."""
     with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+@pytest.fixture(scope="session")
+def _forking():
+    children = Children()
+    yield children
+    children.end()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _children(_forking, request):
+    """Forked, where a test is not about their start."""
+    place = request.path.relative_to(Path(__file__).parent).as_posix()
+    if place in FRESH or os.environ.get("USDBRDF_FRESH_CHILDREN") or sys.platform != "linux":
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(usdbrdf.job.child, "_started", _forking.started)
         yield
 
 

@@ -77,6 +77,17 @@ def test_charts_have_texels_of_the_size_that_was_asked_for(unwrapped):
         assert texels.area[own][interior].sum() == pytest.approx(area, rel=0.08)
 
 
+@pytest.mark.parametrize("faces", [1, 1 << 30])
+def test_children_deal_out_the_objects_as_they_like(unwrapped, monkeypatch, faces):
+    """One for each object, or one for all: the same charts."""
+    scene, resolution = unwrapped
+    monkeypatch.setattr(module, "_FACES_OF_CHILD", faces)
+    monkeypatch.setattr(module, "_AT_ONCE", 2)
+    uv, again = unwrap(scene, TexelSizes.even(scene, 0.02))
+    np.testing.assert_array_equal(uv, scene.corner_uv)
+    np.testing.assert_array_equal(again, resolution)
+
+
 def test_no_two_triangles_share_a_texel_centre(unwrapped):
     scene, resolution = unwrapped
     pixel = scene.corner_uv * resolution[scene.face_object][:, None]

@@ -63,6 +63,12 @@ def _lit(world, environment: Environment, texture: float = 0.25):
     return surface, lit, albedo
 
 
+@pytest.fixture(scope="module")
+def sunny(yard):
+    """What ``_lit`` gives of the yard under sun and sky."""
+    return _lit(yard, Environment(SKY, True).under(SUN))
+
+
 def _seen(which) -> Surroundings:
     """The directions ``which`` (H, W) of SKY."""
     radiance = np.where(which[..., None], SKY, 0).reshape(-1, 3)
@@ -78,8 +84,8 @@ def _of_upper_half(image) -> np.ndarray:
 
 
 @pytest.mark.parametrize("clips", [False, True])
-def test_sun_and_sky_are_found_by_the_light_that_they_cast(yard, clips: bool):
-    surface, lit, _ = _lit(yard, Environment(SKY, True).under(SUN))
+def test_sun_and_sky_are_found_by_the_light_that_they_cast(sunny, clips: bool):
+    surface, lit, _ = sunny
     saturation = float(np.quantile(lit.max(axis=1), 0.85)) if clips else np.inf
     clipped = lit.max(axis=1) > saturation
     shown = np.where(clipped[:, None], saturation, lit).astype(np.float32)

@@ -30,6 +30,8 @@ MAX_SIDE = 16384
 _SECONDS, _SECONDS_OF_FACE = 120.0, 2e-3
 # Children at work: xatlas takes one core, and each holds all the geometry.
 _AT_ONCE = min(4, os.cpu_count() or 1)
+# Triangles for which another one starts: it takes most of a second to import what it needs.
+_FACES_OF_CHILD = 2000
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -194,7 +196,8 @@ def _side_by_side(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     first = np.array([obj.first_face for obj in scene.objects], np.int64)
     count = np.array([obj.num_faces for obj in scene.objects], np.int64)
     given = {"points": scene.points, "triangles": scene.triangles, **sizes._asdict()}
-    shares: list[list[int]] = [[] for _ in range(min(_AT_ONCE, len(count)))]
+    wanted = 1 + int(count.sum()) // _FACES_OF_CHILD
+    shares: list[list[int]] = [[] for _ in range(min(_AT_ONCE, len(count), wanted))]
     for i in np.argsort(-count, kind="stable"):
         min(shares, key=lambda share: int(count[share].sum())).append(int(i))
     corner_uv = np.zeros((len(scene.triangles), 3, 2), np.float32)
