@@ -77,7 +77,7 @@ def ingest(
         refuse_other_scenes(scans)
         warnings = warned(sentence for scan in scans.values() for sentence in scan.warnings)
         header = StageHeader.of_scan(asset.name, *scans.values())
-        check_root(asset, header)
+        check_root(asset, header, next(iter(scans.values())).capture_up)
         told: dict[str, Any] = {}
         for name, scan in scans.items():
             # Photographs through lenses become frames when nothing but pixels can be refused.
