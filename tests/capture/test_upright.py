@@ -150,6 +150,9 @@ def test_another_turn_makes_the_scan_anew(capture, tmp_path):
     before = layer.read_bytes()
     assert main(["ingest", str(folder), "-o", str(out), "--up-axis=-Z", *allow]) == 0
     assert layer.read_bytes() == before
+    layer.unlink()
+    assert main(["ingest", str(folder), "-o", str(out), "--up-axis=-Z", *allow]) == 0
+    assert layer.read_bytes() == before
     # The same axis of the stage, half a turn apart.
     assert main(["ingest", str(folder), "-o", str(out), "--up-axis", "Z", *allow]) == 6
 

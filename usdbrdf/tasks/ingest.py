@@ -93,7 +93,7 @@ def ingest(
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(ScanFiles.of(asset, run.output), scan, draft)
-        write_root(run.output_once(asset.root_layer.name), asset, header)
+        write_root(run.output_once(asset.root_layer.name), asset, header, scan.capture_up)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         write_layers_to_come(run, asset, lightings, header)
         return {

@@ -19,9 +19,9 @@ from usdbrdf.asset.header import (
     Provenance,
     Scopes,
     StageHeader,
-    capture_up_of,
     new_layer,
     read_header,
+    read_provenance,
 )
 from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
@@ -65,7 +65,8 @@ def check_root(asset: Asset, header: StageHeader, capture_up: str = "") -> None:
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
-    ours = root.meters_per_unit, capture_up_of(asset) or root.up_axis
+    turned_from = read_provenance(asset.root_layer).get("capture_up", "")
+    ours = root.meters_per_unit, turned_from or root.up_axis
     theirs = header.meters_per_unit, capture_up or header.up_axis
     if ours != theirs:
         raise OwnershipConflict(

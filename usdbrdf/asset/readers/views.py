@@ -162,14 +162,9 @@ def _rigid_records(
     the capture was; the others are in ``findings``."""
     records = frame_records(source, options, findings, images=images)
     pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
-    rigid, up = (
-        rigid_records(records, findings, source, pose_scale=pose_scale),
-        capture_up_of(asset),
-    )
-    return [
-        replace(record, world_from_camera=upright_pose(record.world_from_camera, up))
-        for record in rigid
-    ]
+    rigid = rigid_records(records, findings, source, pose_scale=pose_scale)
+    up = capture_up_of(asset)
+    return [replace(r, world_from_camera=upright_pose(r.world_from_camera, up)) for r in rigid]
 
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:
