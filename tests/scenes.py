@@ -19,6 +19,8 @@ import numpy.typing as npt
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.material import turned_up
+from usdbrdf.model.upright import usd_up
 from usdbrdf.transport.rays import RayScene
 
 Float = npt.NDArray[np.float32]
@@ -150,6 +152,32 @@ def rescale_images(capture: MadeCapture, factor: float) -> None:
         image = read_exr(capture.image(i))
         image = image[::2, ::2] if factor == 0.5 else image.repeat(2, axis=0).repeat(2, axis=1)
         write_exr(capture.image(i), image)
+
+
+def from_z_up(up: str) -> Double:
+    """(4, 4) the capture's coordinates of which this axis is up, from those of the room as made:
+    what ``upright`` does undone, after the room's z has become y where that is USD's up."""
+    axis, turn = usd_up(up)
+    before = np.eye(4)
+    before[:3, :3] = turn.T
+    return before @ turned_up("Z", axis)
+
+
+def turned_capture(made: MadeCapture, folder: Path, up: str, *, stated: bool = False) -> Path:
+    """The room again with another axis up; its frames stay where they are."""
+    folder.mkdir(parents=True)
+    turn = from_z_up(up)
+    points = (made.points @ turn[:3, :3].T).astype(np.float32)
+    write_ply(folder / "mesh.ply", points, made.triangles, made.face_object)
+    document = json.loads(made.manifest.read_text())
+    for i, frame in enumerate(document["frames"]):
+        frame["file_path"] = str(made.image(i))
+        frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
+    if stated:
+        document["up_axis"] = up
+    (folder / "transforms.json").write_text(json.dumps(document))
+    (folder / "objects.json").write_bytes((made.folder / "objects.json").read_bytes())
+    return folder
 
 
 @contextmanager

@@ -147,6 +147,8 @@ def _argument(said: _Said) -> inspect.Parameter:
         negative=(),
         allow_repeating=True,
         json_list=False,
+        # A direction such as -Y is no option.
+        allow_leading_hyphen=any(choice.startswith("-") for choice in field.choices),
         consume_multiple=(1, None) if kind == tuple[Insert, ...] else None,
     )
     return inspect.Parameter(

@@ -45,6 +45,7 @@ def _environment() -> Surroundings:
 
 # What may stand in the place of a file with the objects' names.
 AUTO: Literal["auto"] = "auto"
+UpAxis = Literal["Y", "Z", "-Y", "-Z", "X", "-X"]
 
 
 def _seed() -> int:
@@ -148,8 +149,8 @@ class CaptureOptions(Options):
         "--meters-per-unit M", None, _LENGTH, unset="as the format says"
     )
     "length of a scene unit in metres"
-    up_axis: Literal["Y", "Z"] | None = option("--up-axis", None, unset="as the format says")
-    "axis that points up"
+    up_axis: UpAxis | None = option("--up-axis", None, unset="as the format says")
+    "axis of the capture that points up; the asset has y or z up, so other captures are turned"
 
     @property
     def looked_at(self) -> int | None:
@@ -344,7 +345,7 @@ class Insert(Options):
     "factor on the model's size"
     rotate_deg: float = option("rotate DEG", 0.0)
     "about the up axis, counter-clockwise seen from above"
-    up: Literal["Y", "Z"] | None = option("up Y|Z", None)
+    up: UpAxis | None = option("up Y|Z|-Y|-Z|X|-X", None)
     "up axis of an OBJ or PLY"
     color: tuple[float, ...] | None = option("color R,G,B", None, (0, math.inf), counts=(3,))
     "instead of the model's"

@@ -200,9 +200,10 @@ def test_the_way_up_is_that_of_upright_cameras(tmp_path, turn, axis, upright):
     scan = read_scan(made.folder, IngestOptions())
     assert scan.up_axis == axis
     assert any(f"taken are metres and {axis}." in warning for warning in scan.warnings)
-    told = [warning for warning in scan.warnings if "[colmap.up-axis]" in warning]
+    told = [warning for warning in scan.warnings if "[capture.up-axis]" in warning]
     assert len(told) == bool(upright)
     assert not told or f"upright along {upright}, not along Z" in told[0]
+    assert not told or f"try --up-axis {upright}." in told[0]
 
 
 def test_masks_of_subfolders_are_not_mixed_up(tmp_path):

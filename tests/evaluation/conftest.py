@@ -13,7 +13,7 @@ import pytest
 from pxr import Sdf
 
 import usdbrdf
-from tests.scenes import MadeCapture, make_capture
+from tests.scenes import MadeCapture, make_capture, turned_capture
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.files.images import write_exr
 from usdbrdf.job.progress import set_quiet
@@ -44,16 +44,33 @@ def make(tmp_path_factory) -> Callable[..., Made]:
         set_quiet(True)
         folder = tmp_path_factory.mktemp("made")
         made = make_capture(folder / "scan", **capture)
-        options = usdbrdf.ConvertOptions(
-            ingest=ingest or usdbrdf.IngestOptions(),
-            texture=usdbrdf.TextureOptions(texel_size=texel_size),
-            shade=usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64)),
-            fit=usdbrdf.FitOptions(method="paper", max_pixels=50),
-        )
-        usdbrdf.convert(made.folder, folder / "room", options)
+        converted(made.folder, folder / "room", texel_size, ingest)
         return Made(capture=made, asset=folder / "room")
 
     return make
+
+
+def converted(
+    capture: Path, asset: Path, texel_size: float, ingest: usdbrdf.IngestOptions | None
+) -> None:
+    """Convert a capture in next to no time."""
+    options = usdbrdf.ConvertOptions(
+        ingest=ingest or usdbrdf.IngestOptions(),
+        texture=usdbrdf.TextureOptions(texel_size=texel_size),
+        shade=usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.1, max_rays=64)),
+        fit=usdbrdf.FitOptions(method="paper", max_pixels=50),
+    )
+    usdbrdf.convert(capture, asset, options)
+
+
+@pytest.fixture(scope="session")
+def turned(room, tmp_path_factory) -> Path:
+    """The asset of the same room, captured with x up."""
+    folder = tmp_path_factory.mktemp("turned")
+    capture = turned_capture(room.capture, folder / "scan", "X")
+    ingest = usdbrdf.IngestOptions(up_axis="X", allow_outside=(room.capture.folder,))
+    converted(capture, folder / "room", 0.15, ingest)
+    return folder / "room"
 
 
 @pytest.fixture(scope="session")

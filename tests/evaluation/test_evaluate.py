@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 import usdbrdf
 from tests.json_schemas import checked
-from tests.scenes import MadeCapture, look_at, make_capture
+from tests.scenes import MadeCapture, edited, look_at, make_capture, turned_capture
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.evaluation.evaluate_views import measured_atlas
@@ -210,3 +211,24 @@ def test_albedo_of_another_mesh_is_refused(room, tmp_path):
     _, atlas = measured_atlas(room.asset)
     with pytest.raises(InputRefused, match=r"\(5, 3\), but .*mesh.ply.*\[evaluate.truth\]"):
         compare_with_truth(atlas, truth, room.capture.folder / "mesh.ply", "albedo")
+
+
+def test_a_capture_that_was_turned_has_the_figures_of_one_that_was_not(
+    room, turned, views, found, tmp_path
+):
+    """Its views and its truth come in its own coordinates."""
+    folder = turned_capture(views, tmp_path / "views", "X")
+    with edited(folder / "transforms.json") as document:
+        del document["frames"][1:]
+    options = replace(LOW, allow_outside=(views.folder,))
+    (ours,) = usdbrdf.evaluate(turned, folder / "transforms.json", tmp_path / "out", options)[
+        "frames"
+    ]
+    theirs = found[1]["frames"][0]
+    assert ours["compared"] == theirs["compared"] == 1
+    for name in ("l2_baseline", "l2_full", "l2_shown_full"):
+        assert ours[name] == pytest.approx(theirs[name], rel=0.01), name
+    truth = write_truth(tmp_path / "truth", room.capture)
+    _, atlas = measured_atlas(turned)
+    known = true_albedo(atlas, truth, turned.parent / "scan" / "mesh.ply")
+    assert np.abs(known - atlas.texels.position).max() < 1e-5

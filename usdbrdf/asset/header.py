@@ -87,6 +87,12 @@ def read_provenance(layer: Path) -> dict[str, Any]:
     return dict(open_metadata(layer).customLayerData.get("usdbrdf", {}))
 
 
+def capture_up_of(asset: Asset) -> str:
+    """The axis that was up in an asset's capture, where it was turned (``model.upright``); ""
+    where it was not."""
+    return str(read_provenance(asset.layer("scan")).get("capture_up", ""))
+
+
 def refuse_old_layout(asset: Asset) -> None:
     """OwnershipConflict where a version made the asset that had other files and other prims. The
     root layer is never written again, and edits.usda is about the prims that were there."""

@@ -232,8 +232,9 @@ def files_beside(adapter: Adapter, path: Path) -> list[Path]:
 
 
 def read_with(adapter: Adapter, path: Path, options: CaptureOptions) -> Scan:
-    """What a chosen adapter makes of a capture."""
+    """What a chosen adapter makes of a capture, turned where USD cannot state what is up in it."""
     from usdbrdf.model.capture import Scan
+    from usdbrdf.model.upright import upright
 
     assert adapter.module is not None
     for named in (path, options.mesh, options.objects, options.frames):
@@ -254,7 +255,7 @@ def read_with(adapter: Adapter, path: Path, options: CaptureOptions) -> Scan:
         ) from error
     if options.frames is not None:
         _refuse_unused(options.frames, scan, adapter)
-    return scan
+    return upright(scan)
 
 
 def _refuse_unused(frames: Path, scan: Scan, adapter: Adapter) -> None:

@@ -26,6 +26,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames, Scan, View
 from usdbrdf.model.mesh import ObjectLabel, ScanMesh
+from usdbrdf.model.upright import as_captured
 from usdbrdf.options import CaptureOptions, InspectOptions
 
 # Frames whose radiance is measured, and what is named in one line.
@@ -55,7 +56,9 @@ class Inspection:
     adapter, description  of the one that recognised it; "" where none did
     frames, radiance      None where they could not be read
     views                 how frames come of photographs, as those of a Scan
-    mesh, objects         in the capture's unit, meters_per_unit and up_axis those of a Scan
+    mesh, objects         in the capture's unit and coordinates, as are frames; meters_per_unit that
+                          of a Scan
+    up_axis               of the capture
     own_faces             of the mesh; second skins come after them
     dropped               frames that cannot be used
     looked_at             frames whose pixels were checked
@@ -227,6 +230,7 @@ def inspect(
 
 
 def _of_scan(seen: Inspection, scan: Scan, options: CaptureOptions) -> Inspection:
+    scan = as_captured(scan)
     return replace(
         seen,
         frames=scan.frames,

@@ -146,7 +146,7 @@ def _refuse_another_scene(first: Scan, other: Scan) -> None:
             "objects are others",
             "objects: name one objects.json for both with --objects. [lighting.objects]",
         )
-    units = [(scan.meters_per_unit, scan.up_axis) for scan in (first, other)]
+    units = [(s.meters_per_unit, s.capture_up or s.up_axis) for s in (first, other)]
     if units[0] != units[1]:
         raise refused(
             "units are others",

@@ -25,6 +25,7 @@ from usdbrdf.files.ply import write_ply
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Int
 from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.upright import as_captured
 
 
 def refuse_taken(folder: Path, capture: Path) -> None:
@@ -45,10 +46,12 @@ def refuse_taken(folder: Path, capture: Path) -> None:
 
 def write_capture(scan: Scan, images: Sequence[Path], folder: Path) -> None:
     """Write a scan, whose frames lie in ``images`` now, as a capture that the adapter "transforms"
-    reads; it appears whole or not at all in the new or empty ``folder``.
+    reads; it appears whole or not at all in the new or empty ``folder``, in the coordinates of the
+    capture that it was.
 
     Frames are copied as they are. Raises EnvironmentFailure where the disk does not take them.
     """
+    scan = as_captured(scan)
     if scan.usd_geometry is not None:
         warn(
             f"{folder}: mesh.ply holds the triangles and objects of {scan.usd_geometry.name}, not "

@@ -52,6 +52,7 @@ from usdbrdf.model.mesh import (
     doubled_areas,
     welded_ids,
 )
+from usdbrdf.model.upright import is_turned
 from usdbrdf.options import AUTO, CaptureOptions
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
@@ -219,16 +220,15 @@ def geometry_from_usd(
         mesh.corner_normals[missing] = corner_normals(
             mesh.points, mesh.triangles[missing], options.crease_angle_deg
         )
+    own = ", so the asset holds the meshes itself instead of referring to them."
     if not found.object_prims:
-        findings.warn(
-            f"{path.name}: {len(found.objects)} objects have been made from face subsets, so the "
-            "asset holds the meshes itself instead of referring to them. [stage.subsets]"
-        )
+        made = f"{len(found.objects)} objects have been made from face subsets"
+        findings.warn(f"{path.name}: {made}{own} [stage.subsets]")
+    elif is_turned(options.up_axis):
+        findings.warn(f"{path.name}: is turned, from {options.up_axis} up{own} [stage.turned]")
+        found = replace(found, object_prims=())
     if options.objects == AUTO:
-        findings.warn(
-            f"{path.name}: objects are segmented anew, so the asset holds the meshes itself "
-            "instead of referring to them. [objects.auto]"
-        )
+        findings.warn(f"{path.name}: objects are segmented anew{own} [objects.auto]")
         whole = replace(mesh, face_object=np.zeros_like(mesh.face_object))
         found = replace(
             found, mesh=whole, objects=_ONE_OBJECT, object_prims=(), label_source="segmented"

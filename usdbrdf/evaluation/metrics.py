@@ -16,11 +16,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.readers.scene import read_fit
+from usdbrdf.asset.readers.scene import capture_up_of_stage, read_fit
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import load_arrays, read_json
 from usdbrdf.job.child import run_child
 from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.upright import upright_points
 from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 # Fewer observations than this are no median.
@@ -245,7 +246,8 @@ def true_albedo(atlas: AssetMaps, folder: Path, mesh: Path) -> Float:
             "vertices. Name the mesh that it belongs to with --mesh. [evaluate.truth]"
         )
     known = known_objects(folder, atlas)
-    corners = source.points[source.triangles]
+    points = upright_points(source.points, capture_up_of_stage(atlas.stage))
+    corners = points[source.triangles]
     result = np.zeros((len(atlas.texels), 3), np.float32)
     for i, obj in enumerate(atlas.scene.objects):
         own = atlas.texels.of_object(i)

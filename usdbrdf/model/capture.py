@@ -161,8 +161,11 @@ class View:
 class Scan:
     """A capture, checked: what ``ingest`` writes into the stage.
 
-    meters_per_unit, up_axis ("Y" or "Z") describe the scene units of mesh and poses; usd_geometry
-    and object_prims are ``ScanGeometry``'s.
+    meters_per_unit, up_axis describe the scene units of mesh and poses; usd_geometry and
+    object_prims are ``ScanGeometry``'s.
+    up_axis        "Y" or "Z"; as adapters read it, any of ``options.UpAxis``: see ``model.upright``
+    capture_up     the axis of the capture that was up, where it was turned for USD's sake; "" where
+                   mesh and poses are in the capture's own coordinates
     views          how frames come of photographs, None where the image is the photograph itself; ()
                    where all are. The image paths of views are relative to the folder that they are
                    yet to be written into (``capture.develop``)
@@ -184,6 +187,7 @@ class Scan:
     frames: Frames
     meters_per_unit: float = 1.0
     up_axis: str = "Z"
+    capture_up: str = ""
     usd_geometry: Path | None = None
     object_prims: tuple[str, ...] = ()
     views: tuple[View | None, ...] = ()

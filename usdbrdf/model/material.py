@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.upright import usd_up
 
 UNKNOWN_DIFFUSE = 0.5
 
@@ -110,11 +111,14 @@ class Surface:
 
 
 def turned_up(model_up: str, scene_up: str) -> Double:
-    """(4, 4) rotation about x that brings one up axis, "Y" or "Z", to the other."""
+    """(4, 4) rotation about x that brings one up axis, "Y" or "Z", to the other; a model with
+    another up is brought to one of these first, as captures are."""
+    model_up, first = usd_up(model_up)
     turn = np.eye(4)
     if model_up != scene_up:
         sign = 1.0 if scene_up == "Z" else -1.0
         turn[1:3, 1:3] = [[0.0, -sign], [sign, 0.0]]
+    turn[:3, :3] = turn[:3, :3] @ first
     return turn
 
 

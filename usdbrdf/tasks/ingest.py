@@ -77,7 +77,7 @@ def ingest(
         refuse_other_scenes(scans)
         warnings = warned(sentence for scan in scans.values() for sentence in scan.warnings)
         header = StageHeader.of_scan(asset.name, *scans.values())
-        check_root(asset, header)
+        check_root(asset, header, next(iter(scans.values())).capture_up)
         told: dict[str, Any] = {}
         for name, scan in scans.items():
             # Photographs through lenses become frames when nothing but pixels can be refused.
@@ -93,7 +93,7 @@ def ingest(
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
         write_scan_layer(ScanFiles.of(asset, run.output), scan, draft)
-        write_root(run.output_once(asset.root_layer.name), asset, header)
+        write_root(run.output_once(asset.root_layer.name), asset, header, scan.capture_up)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         write_layers_to_come(run, asset, lightings, header)
         return {

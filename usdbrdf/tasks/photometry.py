@@ -19,6 +19,7 @@ from usdbrdf.files.frames import Read, read_frame, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.upright import as_captured, upright
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
@@ -38,8 +39,7 @@ from usdbrdf.texturing.agreement import (
 from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
 
-# Frames that are asked whether they agree.
-ASKED = 16
+ASKED = 16  # frames that are asked whether they agree
 
 
 def asked_of_its_pixels(
@@ -47,6 +47,7 @@ def asked_of_its_pixels(
 ) -> tuple[Scan, dict[str, Any]]:
     """The scan, whose frames lie in ``images`` now, its exposures estimated if that is wanted, and
     what was found, for the record: under "warnings" what the user has been warned of."""
+    scan = as_captured(scan)  # whose conventions the sentences name
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     surface, rays = surface_and_rays(scan.mesh)
     refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
@@ -67,7 +68,7 @@ def asked_of_its_pixels(
     if options.objects == AUTO:
         mesh, objects, found = segmented(scan.mesh, own_faces(scan), scan.frames, read)
         scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
-    return scan, told
+    return upright(scan), told
 
 
 def agreement_of_frames(
@@ -95,8 +96,7 @@ def agreement_of_frames(
     if not is_doubtful(given):
         return given
     found = under(CONVENTIONS)
-    name = other_convention(given, found)
-    better = found.get(name)
+    better = found.get(name := other_convention(given, found))
     if better is not None:
         differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "cannot"
         raise InputRefused(

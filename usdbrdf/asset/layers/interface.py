@@ -93,10 +93,11 @@ def components_of(scan: Scan) -> tuple[Component, ...]:
     return tuple(components)
 
 
-def write_root(path: Path, asset: Asset, header: StageHeader) -> None:
+def write_root(path: Path, asset: Asset, header: StageHeader, capture_up: str = "") -> None:
     """NAME.usda: the artist's layer, the interfaces, strongest first, and the payload. Written
-    once, never again."""
-    layer = new_layer(header, Provenance(role="root", version=LAYOUT))
+    once, never again; so it notes from which axis up the capture was turned, too."""
+    provenance = Provenance(role="root", version=LAYOUT)
+    layer = new_layer(header, provenance, capture_up=capture_up or None)
     layer.documentation = (
         "Captured scene with measured materials. Put your own opinions into edits.usda, the "
         "strongest layer: no tool writes it again. The files in layers/ are regenerated."

@@ -21,6 +21,7 @@ from usdbrdf.asset.header import (
     StageHeader,
     new_layer,
     read_header,
+    read_provenance,
 )
 from usdbrdf.asset.layers import input_usd
 from usdbrdf.asset.layers.author import (
@@ -56,14 +57,17 @@ NEAR_M, FAR_M = 0.01, 1000.0
 _PLACES = ("image", "photograph", "mask")
 
 
-def check_root(asset: Asset, header: StageHeader) -> None:
-    """Raise if the asset has a root layer that says otherwise about units or the up axis. USD
-    believes the root, which is never written again: a capture in other units would come out in the
-    wrong size, beneath edits that were made for the old one."""
+def check_root(asset: Asset, header: StageHeader, capture_up: str = "") -> None:
+    """Raise if the asset has a root layer that says otherwise about units or the up axis, or was
+    turned from another one than ``capture_up``. USD believes the root, which is never written
+    again: a capture in other units would come out in the wrong size, beneath edits that were made
+    for the old one."""
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
-    ours, theirs = ((h.meters_per_unit, h.up_axis) for h in (root, header))
+    turned_from = read_provenance(asset.root_layer).get("capture_up", "")
+    ours = root.meters_per_unit, turned_from or root.up_axis
+    theirs = header.meters_per_unit, capture_up or header.up_axis
     if ours != theirs:
         raise OwnershipConflict(
             f"{asset.root_layer}: the asset was made with {ours[0]:g} metres per unit and "
@@ -167,6 +171,7 @@ def write_scan_layer(files: ScanFiles, scan: Scan, draft: Draft) -> None:
         radiometric=frames.radiometric,
         counts=scan.counts,
         objects_from=scan.label_source,
+        capture_up=scan.capture_up or None,
         lightings=list(dict.fromkeys(frames.lightings)) or None,
         scopes=scopes.names,
         competing_bindings=competing or None,

@@ -131,6 +131,17 @@ def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | N
     return Path(value.resolvedPath or layer.ComputeAbsolutePath(value.path))
 
 
+def _records_of_scan(stage: Usd.Stage) -> list[dict[str, Any]]:
+    """What the scan layers of a stage say of how they were made."""
+    used = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetUsedLayers()]
+    return [record for record in used if record.get("role") == "scan"]
+
+
+def capture_up_of_stage(stage: Usd.Stage) -> str:
+    """As ``header.capture_up_of`` the asset that a stage shows."""
+    return next((str(r["capture_up"]) for r in _records_of_scan(stage) if "capture_up" in r), "")
+
+
 def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
     Meshes without normals of their own get them by the crease angle that ingest was given."""
@@ -140,9 +151,8 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
             f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
-    used = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetUsedLayers()]
-    records = (record for record in used if record.get("role") == "scan")
-    angles = (record.get("parameters", {}).get("crease_angle_deg") for record in records)
+    given = (record.get("parameters", {}) for record in _records_of_scan(stage))
+    angles = (parameters.get("crease_angle_deg") for parameters in given)
     angle = next((a for a in angles if a is not None), IngestOptions().crease_angle_deg)
     read = (_read_mesh(UsdGeom.Mesh(prim), float(angle)) for prim in prims)
     points, triangles, normals, uvs = zip(*read, strict=True)

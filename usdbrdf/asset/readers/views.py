@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.header import capture_up_of, read_provenance
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.scene import frames_from_stage, lighting_of_stage
 from usdbrdf.capture.camera_checks import refuse_rays_that_miss
@@ -38,6 +38,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.model.scene import Scene
+from usdbrdf.model.upright import upright_pose
 from usdbrdf.options import CaptureOptions
 from usdbrdf.transport.rays import RayScene
 
@@ -157,10 +158,13 @@ def photographs_of_views(
 def _rigid_records(
     source: Path, asset: Asset, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> list[FrameRecord]:
-    """The usable frames of a document, in the capture's unit; the others are in ``findings``."""
+    """The usable frames of a document, which are in the capture's unit and coordinates, turned as
+    the capture was; the others are in ``findings``."""
     records = frame_records(source, options, findings, images=images)
     pose_scale = read_provenance(asset.layer("scan")).get("parameters", {}).get("pose_scale")
-    return rigid_records(records, findings, source, pose_scale=pose_scale)
+    rigid = rigid_records(records, findings, source, pose_scale=pose_scale)
+    up = capture_up_of(asset)
+    return [replace(r, world_from_camera=upright_pose(r.world_from_camera, up)) for r in rigid]
 
 
 def _as_the_captures_photographs(record: FrameRecord, captured: Frames) -> FrameRecord:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of, upright_along
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
 from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -62,18 +62,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     findings = Findings()
     chosen = _chosen(path, options, findings)
     records = _records(path, chosen, options, findings)
-    up_axis = up_axis_of(records)
+    up_axis = up_axis_assumed(records, options, findings, path.name)
     if options.meters_per_unit is None or options.up_axis is None:
         findings.warn(
             f"{path.name}: a COLMAP model has no scale and no direction up; taken are metres and "
             f"{up_axis}. State them with --meters-per-unit and --up-axis. [colmap.scale]"
-        )
-    upright = upright_along(records)
-    if options.up_axis is None and upright not in ("", up_axis):
-        findings.warn(
-            f"{path.name}: its cameras are upright along {upright}, not along {up_axis}, which is "
-            "taken to be up, so that sun and sky are looked for on the wrong side. Turn the model "
-            "with 'colmap model_orientation_aligner' before the mesh is made. [colmap.up-axis]"
         )
     objects = path_in_capture(path, "objects.json", options)
     return scan_of(

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, clause_of, up_axis_of
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of, up_axis_assumed
 from usdbrdf.capture.formats.named_pictures import mesh_beside, rigid_pose, scan_of
 from usdbrdf.capture.parts import LabelTable
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -69,7 +69,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         adapter=NAME,
         source=source,
         folder=folder,
-        up_axis=up_axis_of(records),
+        up_axis=up_axis_assumed(records, options, findings, source.name),
         objects=_voted(records) if segmented else None,
     )
 

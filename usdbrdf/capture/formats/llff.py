@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
 from usdbrdf.capture.formats.named_pictures import (
     mesh_beside,
     pictures_of,
@@ -87,5 +87,5 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         adapter=NAME,
         source=source,
         folder=folder,
-        up_axis=up_axis_of(records),
+        up_axis=up_axis_assumed(records, options, findings, source.name),
     )

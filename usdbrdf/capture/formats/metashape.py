@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_of
+from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
@@ -85,7 +85,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         adapter=NAME,
         source=source,
         folder=folder,
-        up_axis=up_axis_of(records),
+        up_axis=up_axis_assumed(records, options, findings, source.name),
     )
 
 

@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of, up_axis_of
+from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of, up_axis_assumed
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.named_pictures import Pictured, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
@@ -24,7 +24,7 @@ from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Curve, Lens, whole_sphere
-from usdbrdf.options import CaptureOptions
+from usdbrdf.options import CaptureOptions, UpAxis
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -55,13 +55,15 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     source = path / "transforms.json" if path.is_dir() else path
     findings = Findings()
     capture, records = _captured(source, options, findings)
-    up_axis = _stated(capture, "up_axis", ("Y", "Z"))
-    if up_axis is None and options.up_axis is None and (up_axis := up_axis_of(records)) == "Y":
-        findings.warn(
-            f"{source.name}: states no up_axis, and its cameras are upright along y, not "
-            "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
-            "[capture.up-axis]"
-        )
+    up_axis = _stated(capture, "up_axis", get_args(UpAxis))
+    if up_axis is None:
+        up_axis = up_axis_assumed(records, options, findings, source.name)
+        if up_axis == "Y" and options.up_axis is None:
+            findings.warn(
+                f"{source.name}: states no up_axis, and its cameras are upright along y, not "
+                "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
+                "[capture.up-axis]"
+            )
     return scan_of(
         records,
         lambda: geometry_from_file(
@@ -80,7 +82,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         encoding=_encoding(capture),
         radiometric=_radiometric(capture),
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
-        up_axis=up_axis or "Z",
+        up_axis=up_axis,
     )
 
 
