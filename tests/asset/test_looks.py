@@ -224,3 +224,55 @@ def test_what_the_artist_overrides_survives_all_stages_run_again(built):
     shader = surface_of(bound(fresh, built.prims[0]))
     assert shader.GetInput("roughness").Get() == 0.125
     assert shader.GetInput("ior").Get() == pytest.approx(1.5)
+
+
+def materials_in(stage):
+    prims = stage.TraverseAll()
+    return {str(p.GetPath()) for p in prims if p.GetTypeName() == "Material" and p.IsDefined()}
+
+
+@pytest.mark.parametrize("look", sorted(LOOKS["material"]))
+def test_only_what_is_worn_is_composed(built, look):
+    """Beside the measured materials, which an artist's look may bind."""
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    select(stage, look)
+    worn = {str(bound(stage, path).GetPath()) for path in built.prims}
+    identifiers = ("Stuhl_No_1", "wall", "lamp")
+    assert materials_in(stage) == worn | {f"/room/geo/{i}/mtl/{i}" for i in identifiers}
+
+
+def test_what_is_said_of_a_look_holds_in_it_and_defines_nothing_in_others(built):
+    """At the path that it has always had; also of an artist's look with a measured material."""
+    edits = Sdf.Layer.FindOrOpen(str(built.asset.edits_layer))
+    shader = Sdf.CreatePrimInLayer(edits, "/room/geo/Stuhl_No_1/looks/lit/AovTexture")
+    scale = Sdf.AttributeSpec(shader, "inputs:scale", Sdf.ValueTypeNames.Float4)
+    scale.default = (2, 2, 2, 1)
+    mine = Sdf.CreatePrimInLayer(edits, "/room{look=mine}geo/lamp/lamp")
+    binding = Sdf.RelationshipSpec(mine, "material:binding", custom=False)
+    binding.targetPathList.explicitItems = [Sdf.Path("/room/geo/wall/mtl/wall")]
+    edits.Save()
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    assert "/room/geo/Stuhl_No_1/looks/lit" not in materials_in(stage)
+    assert not stage.GetPrimAtPath("/room/geo/Stuhl_No_1/looks/lit").IsDefined()
+    select(stage, "lit")
+    texture = source_of(surface_of(bound(stage, built.prims[0])), "emissiveColor")
+    assert texture.GetInput("scale").Get() == (2, 2, 2, 1)
+    select(stage, "mine")
+    assert bound(stage, built.prims[2]).GetPath() == "/room/geo/wall/mtl/wall"
+
+
+def test_a_look_stands_in_its_variant_alone_in_every_layer(built):
+    """Targets are told as they are in the stage."""
+    for role in ROLES:
+        layer, places, targets = Sdf.Layer.FindOrOpen(str(built.asset.layer(role))), [], []
+
+        def visit(path, layer=layer, places=places, targets=targets):
+            spec = layer.GetObjectAtPath(path)
+            if isinstance(spec, Sdf.PrimSpec) and path.name == "looks":
+                places.append(path)
+            if isinstance(spec, Sdf.AttributeSpec):
+                targets.extend(spec.connectionPathList.explicitItems)
+
+        layer.Traverse("/", visit)
+        assert all(path.ContainsPrimVariantSelection() for path in places)
+        assert not any(path.ContainsPrimVariantSelection() for path in targets)

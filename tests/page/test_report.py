@@ -6,6 +6,7 @@ import base64
 import gzip
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from tests.page.conftest import data_of
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
 from usdbrdf.page import views
-from usdbrdf.page.pictures import part_around
+from usdbrdf.page.pictures import _BACKGROUND, SurfaceMap, part_around, pictures_of_map
 from usdbrdf.page.report import page, report
 
 
@@ -148,3 +149,25 @@ def test_the_camera_of_a_part_sees_what_the_photograph_has_there(room, page_file
     points -= 9 * camera.world_from_camera[:3, 2]
     inside = (camera.project(points) - [left, top]) * shrink
     assert np.allclose(part.camera.project(points), inside, atol=0.02 * part.camera.width)
+
+
+def test_the_texture_of_a_map_is_made_once_for_all_cameras():
+    made = []
+    values = np.full((4, 3), 0.5, np.float32)
+
+    class Texture:
+        def showing(self, _texels, shown):
+            made.append(shown)
+            return self
+
+        def at(self, face, _u, _v):
+            return np.where(face[:, None] >= 0, np.float32(0.5), np.float32(0)).repeat(3, axis=1)
+
+    lit = SimpleNamespace(radiance=Texture(), texels=None)
+    shown = SurfaceMap(name="lit", title="", legend="", values=values, direct=True)
+    seen = [SimpleNamespace(face=np.array([0, -1]), u=None, v=None)] * 3
+    pictures = list(pictures_of_map(lit, shown, seen, [(1, 2), (2, 1), (1, 2)]))
+    assert len(made) == 1
+    assert [picture.shape for picture in pictures] == [(1, 2, 3), (2, 1, 3), (1, 2, 3)]
+    assert all((picture.reshape(2, 3)[0] == 128).all() for picture in pictures)
+    assert all((picture.reshape(2, 3)[1] == _BACKGROUND).all() for picture in pictures)

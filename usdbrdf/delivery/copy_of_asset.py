@@ -13,6 +13,7 @@ from pathlib import Path
 from pxr import Sdf
 
 from usdbrdf.asset.layers.lights_layer import LIGHTS
+from usdbrdf.asset.layers.looks import VARIANT_SET as LOOKS
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.delivery.collection import (
@@ -61,12 +62,14 @@ def write_copy(
     for one in asset.in_each_lighting:
         stage = open_edited(one)
         if space != WORKING_SPACE:
-            # Lamps that glow and lights that shine are not there at once.
+            # Lamps that glow and lights that shine are not there at once, nor are the looks.
             stage.SetEditTarget(stage.GetSessionLayer())
-            lights = stage.GetDefaultPrim().GetVariantSet(LIGHTS)
-            for chosen in lights.GetVariantNames() or [""]:
-                lights.SetVariantSelection(chosen)
-                textures.look_at(stage, space)
+            textures.look_at(stage, space)
+            for name in (LIGHTS, LOOKS):
+                choice = stage.GetDefaultPrim().GetVariantSet(name)
+                for chosen in choice.GetVariantNames():
+                    choice.SetVariantSelection(chosen)
+                    textures.look_at(stage, space)
     found = collected(asset, root, photographs=photographs)
     for file in found.named_by:
         accept(file)

@@ -140,6 +140,9 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
         if info.get("version") == UNPUBLISHED:
             info.pop("version")
         prim.SetMetadata("assetInfo", info) if info else prim.ClearMetadata("assetInfo")
+    # What is said of materials of other looks, which are not there.
+    for path in [prim.GetPath() for prim in flat.TraverseAll() if not prim.IsDefined()]:
+        flat.RemovePrim(path)
     _keep_bound_materials(flat)
     for prim in flat.TraverseAll():
         for name in [*prim.GetAuthoredPropertyNames()]:

@@ -205,15 +205,18 @@ def _thrice(numbers: Float) -> Float:
     return np.repeat(np.asarray(numbers, np.float32)[:, None], 3, axis=1)
 
 
-def picture_of_map(lit: LitScene, shown: SurfaceMap, hits: Hits, height: int, width: int) -> Byte:
-    """A map as the camera of ``hits`` sees it."""
+def pictures_of_map(
+    lit: LitScene, shown: SurfaceMap, seen: Sequence[Hits], sizes: Sequence[tuple[int, int]]
+) -> Iterator[Byte]:
+    """A map as the cameras of ``seen`` see it, in pictures of these heights and widths."""
     texture = lit.radiance.showing(lit.texels, np.nan_to_num(shown.values).astype(np.float32))
-    values = texture.at(hits.face, hits.u, hits.v).reshape(height, width, 3)
-    there: Bool = (hits.face >= 0).reshape(height, width)
-    if shown.top is not None:
-        picture = magma(values[..., 0] / np.float32(shown.top), there)
-    elif shown.direct:
-        picture = as_bytes(values)
-    else:
-        picture = to_display_srgb8(values, exposure_scale=shown.exposure)
-    return np.where(there[..., None], picture, _BACKGROUND)
+    for hits, (height, width) in zip(seen, sizes, strict=True):
+        values = texture.at(hits.face, hits.u, hits.v).reshape(height, width, 3)
+        there: Bool = (hits.face >= 0).reshape(height, width)
+        if shown.top is not None:
+            picture = magma(values[..., 0] / np.float32(shown.top), there)
+        elif shown.direct:
+            picture = as_bytes(values)
+        else:
+            picture = to_display_srgb8(values, exposure_scale=shown.exposure)
+        yield np.where(there[..., None], picture, _BACKGROUND)

@@ -33,7 +33,7 @@ from usdbrdf.page.objects import object_rows
 from usdbrdf.page.pictures import (
     data_uri,
     objects_in_frames,
-    picture_of_map,
+    pictures_of_map,
     status_of,
     surface_maps,
 )
@@ -221,8 +221,10 @@ def _maps(
             "title": shown.title,
             "legend": shown.legend,
             "pictures": [
-                data_uri(picture_of_map(seen.lit, shown, one, camera.height, camera.width))
-                for one, camera in zip(hits, small, strict=True)
+                data_uri(picture)
+                for picture in pictures_of_map(
+                    seen.lit, shown, hits, [(camera.height, camera.width) for camera in small]
+                )
             ],
         }
         for shown in surface_maps(atlas, fits)

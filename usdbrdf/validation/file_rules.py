@@ -7,6 +7,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 from pxr import Ar, Sdf, Usd
@@ -201,7 +202,9 @@ def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site]]]:
     """Files that are not there, where the composed stage, or a variant, names them; but for the
     photographs of a capture's camera."""
     missing: dict[Path, list[Site]] = defaultdict(list)
-    prims = scene.stage.Traverse() if scene.asset else ()
+    prims: list[Usd.Prim] = []
+    if scene.asset:
+        prims = [*scene.stage.Traverse(), *chain.from_iterable(scene.only_in_other_looks())]
     for prim in (prim for prim in prims if prim not in scene.cameras):
         for attribute in prim.GetAuthoredAttributes():
             if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset:

@@ -14,8 +14,9 @@ from typing import Any, TypeAlias
 from pxr import Ar, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.header import Scopes
+from usdbrdf.asset.layers.looks import VARIANT_SET
 from usdbrdf.asset.layout import ROLES, Asset
-from usdbrdf.asset.readers.compose import named_files
+from usdbrdf.asset.readers.compose import named_files, with_variant
 from usdbrdf.asset.readers.scene import authored
 
 # Before the name of a rule of ours, where it stands among those of others.
@@ -119,19 +120,73 @@ class AssetStage:
         layers = (*self.layers, *reached)
         return tuple((layer, *found) for layer in layers for found in _asset_paths(layer))
 
+    @cached_property
+    def identifiers(self) -> tuple[str, ...]:
+        """Those of the objects that can be names of prims."""
+        names = (str(authored(item, "usdBrdf:identifier") or "") for item in self.objects)
+        return tuple(name for name in names if self.scopes and Sdf.Path.IsValidIdentifier(name))
+
+    @cached_property
+    def looks(self) -> Mapping[str, Usd.Stage]:
+        """The stage in each of its looks, the selected one first: what objects wear in a look is
+        composed in it alone. The other stages hold as long as this does, and edit what the stage
+        edits. A look whose variant has no material, as in an asset by an earlier version, shows no
+        more than the stage does, and is not composed once more."""
+        root = self.root_prim
+        if not root:
+            return {"": self.stage}
+        chosen = root.GetVariantSet(VARIANT_SET)
+        found = {str(chosen.GetVariantSelection()): self.stage}
+        for look in chosen.GetVariantNames():
+            if look not in found:
+                found[look] = self.stage
+                if self._is_dressed(look):
+                    found[look] = with_variant(self.stage, root, VARIANT_SET, look)
+        return found
+
+    def _is_dressed(self, look: str) -> bool:
+        root = Sdf.Path(self.scopes.root if self.scopes else "/")
+        variant = root.AppendVariantSelection(VARIANT_SET, look)
+        layers = [layer for layer in self.stage.GetUsedLayers() if layer.GetPrimAtPath(variant)]
+        return any(
+            layer.GetPrimAtPath(place.ReplacePrefix(root, variant))
+            for place in self._wardrobes(of_looks=True)
+            for layer in layers
+        )
+
+    def _wardrobes(self, *, of_looks: bool) -> Iterator[Sdf.Path]:
+        """The scopes of the objects' materials, or of what they wear in the looks of maps."""
+        if scopes := self.scopes:
+            for name in self.identifiers:
+                one = scopes.look(name, "x") if of_looks else scopes.material(name)
+                yield Sdf.Path(one).GetParentPath()
+
+    def _worn(self, *, of_looks: bool) -> Iterator[Usd.Prim]:
+        """The prims below these scopes; of what is worn in the looks, of all, each path once."""
+        seen: set[Sdf.Path] = set()
+        stages = dict.fromkeys(self.looks.values()) if of_looks else [self.stage]
+        for stage in stages:
+            prims = map(stage.GetPrimAtPath, self._wardrobes(of_looks=of_looks))
+            for below in (each for prim in prims if prim for each in Usd.PrimRange(prim)):
+                if below.GetPath() not in seen:
+                    seen.add(below.GetPath())
+                    yield below
+
     def shaders(self, identifier: str, *, of_looks: bool) -> Iterator[UsdShade.Shader]:
         """The shaders with an ``info:id`` of the objects' materials, or of what they wear in the
-        looks that show maps."""
-        prims = []
-        for item in self.objects if self.scopes else ():
-            name = str(authored(item, "usdBrdf:identifier") or "")
-            if self.scopes and Sdf.Path.IsValidIdentifier(name):
-                one = self.scopes.look(name, "x") if of_looks else self.scopes.material(name)
-                prims.append(self.stage.GetPrimAtPath(Sdf.Path(one).GetParentPath()))
-        for below in (each for prim in prims if prim for each in Usd.PrimRange(prim)):
-            shader = UsdShade.Shader(below)
+        looks that show maps; of all looks, each path once."""
+        for prim in self._worn(of_looks=of_looks):
+            shader = UsdShade.Shader(prim)
             if shader and shader.GetShaderId() == identifier:
                 yield shader
+
+    def only_in_other_looks(self) -> list[list[Usd.Prim]]:
+        """What is worn in looks that are not selected, one list for each."""
+        found: dict[Usd.Stage, list[Usd.Prim]] = {}
+        for prim in self._worn(of_looks=True):
+            if prim.GetStage() != self.stage:
+                found.setdefault(prim.GetStage(), []).append(prim)
+        return list(found.values())
 
     def surface_of(self, item: Usd.Prim) -> UsdShade.Shader | None:
         """The UsdPreviewSurface of an object's measured material; None where there is none."""

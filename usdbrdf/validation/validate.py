@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import in_one_line, try_in_child
+from usdbrdf.asset.readers.compose import in_one_line, no_warnings, try_in_child
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.job.ownership import reading
@@ -74,12 +75,15 @@ def validate(root_layer: Path) -> list[Finding]:
         opened = open_or_finding(root_layer)
         if isinstance(opened, Finding):
             return [opened]
-        return [*own_findings(opened), *standard_findings(opened)]
+        scene = AssetStage(opened)
+        others = map(standard_findings, scene.only_in_other_looks())
+        found = [*standard_findings(opened), *chain.from_iterable(others)]
+        return [*own_findings(scene), *found]
 
 
-def own_findings(stage: Usd.Stage) -> list[Finding]:
+def own_findings(subject: Usd.Stage | AssetStage) -> list[Finding]:
     """Findings of our rules about any stage, once each."""
-    scene = AssetStage(stage)
+    scene = subject if isinstance(subject, AssetStage) else AssetStage(subject)
     found = (finding_of(rule, fault) for rule in RULES for fault in rule.check(scene))
     return list(dict.fromkeys(found))
 
@@ -110,7 +114,7 @@ def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
     crashes on them."""
     try_in_child(root_layer, composes=False)
     try:
-        with _no_warnings():
+        with no_warnings():
             stage = Usd.Stage.Open(str(root_layer))
             for layer in stage.GetUsedLayers():
                 # Another stage of this process may hold a layer from before it was written anew.
@@ -121,14 +125,16 @@ def open_or_finding(root_layer: Path) -> Usd.Stage | Finding:
     return stage
 
 
-def standard_findings(stage: Usd.Stage) -> Iterator[Finding]:
-    """What usd-core's validators find; errors of composition are among it."""
+def standard_findings(subject: Usd.Stage | Sequence[Usd.Prim]) -> Iterator[Finding]:
+    """What usd-core's validators find in a stage, errors of composition among it; or in prims of a
+    stage alone."""
+    stage = subject if isinstance(subject, Usd.Stage) else subject[0].GetStage()
     registry = UsdValidation.ValidationRegistry()
     names = [metadata.name for metadata in _built_in()]
     context = UsdValidation.ValidationContext(validators=registry.GetOrLoadValidatorsByName(names))
     try:
-        with _no_warnings():
-            errors = context.Validate(stage)
+        with no_warnings():
+            errors = context.Validate(subject)
     except Tf.ErrorException as failure:
         # A validator opened a layer itself, and the stage's own open had passed over it.
         unreadable = {}
@@ -184,20 +190,6 @@ def _is_materialx_unknown(error: UsdValidation.ValidationError) -> bool:
         return False
     prims = [(s.GetProperty() if s.IsProperty() else s).GetPrim() for s in error.GetSites()]
     return all(str(UsdShade.Shader(prim).GetShaderId()).startswith("ND_") for prim in prims)
-
-
-@contextmanager
-def _no_warnings() -> Iterator[None]:
-    """USD prints its warnings as it goes; what they are about, the findings name.
-
-    Versions of usd-core without a trap for them print them still.
-    """
-    with getattr(Tf, "DiagnosticTrap", nullcontext)() as trap:
-        try:
-            yield
-        finally:
-            if trap is not None:
-                trap.ClearWarnings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,11 +249,12 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         stage.GetSessionLayer().subLayerPaths.insert(0, cures.identifier)
         stage.SetEditTarget(Usd.EditTarget(cures))
         # In words before any cure: it may change which layer's opinion wins.
-        before = list(_curable(stage))
+        scene = AssetStage(stage)
+        before = list(_curable(scene))
         applied = dict.fromkeys(found for cure, site, found in before if cure.apply(site))
         # The same complaint, whichever layer it is that has the opinion.
         complaint = attrgetter("rule", "site", "message")
-        after = {complaint(found) for _, _, found in _curable(stage)}
+        after = {complaint(found) for _, _, found in _curable(AssetStage(stage))}
         cured = tuple(found for found in applied if complaint(found) not in after)
         if cured:
             with _on_disk(path):
@@ -286,8 +279,8 @@ def _publish_new(written: Path, path: Path, taken: str) -> None:
         raise
 
 
-def _curable(stage: Usd.Stage) -> Iterator[tuple[Cure, Site, Finding]]:
-    scene = AssetStage(stage)
+def _curable(scene: AssetStage) -> Iterator[tuple[Cure, Site, Finding]]:
+    """Sites hold as long as the scene does."""
     for rule in RULES:
         if rule.cure:
             for fault in rule.check(scene):

@@ -65,9 +65,10 @@ def look_incomplete(scene: AssetStage) -> Iterator[Fault]:
             if bound is None:
                 yield Fault(item, f"the look {look} binds no material to this object.")
                 continue
+            stage = scene.looks.get(look, scene.stage)
             for inner in bound.targetPathList.GetAddedOrExplicitItems():
                 target = inner.ReplacePrefix(variant, root)
-                if target.IsPrimPath() and not UsdShade.Material(scene.stage.GetPrimAtPath(target)):
+                if target.IsPrimPath() and not UsdShade.Material(stage.GetPrimAtPath(target)):
                     yield Fault(item, f"the look {look} binds <{target}>, which is not a material.")
 
 

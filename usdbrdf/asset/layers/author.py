@@ -39,6 +39,11 @@ def define(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
     return prim
 
 
+def inside(variant: Sdf.Path, path: str) -> str:
+    """The path of a prim as a variant of a prim above it has it."""
+    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
+
+
 def apply_schema(prim: Sdf.PrimSpec, *names: str) -> None:
     """Append applied API schemas to the prim's own list, each once."""
     present = prim.GetInfo("apiSchemas").prependedItems if prim.HasInfo("apiSchemas") else []
@@ -118,7 +123,7 @@ def relationship(prim: Sdf.PrimSpec, name: str, *targets: str) -> Sdf.Relationsh
     """A relationship to these targets; without any it has no opinion about them."""
     spec = prim.relationships.get(name) or Sdf.RelationshipSpec(prim, name, custom=False)
     if targets:
-        spec.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
+        spec.targetPathList.explicitItems = [_composed(target) for target in targets]
     return spec
 
 
@@ -127,8 +132,13 @@ def connect(
 ) -> Sdf.AttributeSpec:
     """An attribute that takes its value from the output at path ``source``."""
     spec = attribute(prim, name, type_name)
-    spec.connectionPathList.explicitItems = [Sdf.Path(source)]
+    spec.connectionPathList.explicitItems = [_composed(source)]
     return spec
+
+
+def _composed(target: str) -> Sdf.Path:
+    """A target as layers state it: where it is in the stage, though in a variant."""
+    return Sdf.Path(target).StripAllVariantSelections()
 
 
 def author_inputs(prim: Sdf.PrimSpec, type_name: Sdf.ValueTypeName, **values: Any) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.header import Draft, StageHeader
-from usdbrdf.asset.layers.author import attribute, author_inputs, define, export, over
+from usdbrdf.asset.layers.author import attribute, author_inputs, define, export, inside, over
 from usdbrdf.asset.layers.looks import EMISSION_TEXTURE
 from usdbrdf.asset.layout import path_in_layer
 from usdbrdf.asset.properties import Colour, LightFromOutside
@@ -72,22 +72,22 @@ def write_lights_layer(
         )
         over(layer, str(emissive))
         layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE if lamps else USDLUX
-        define(layer, _within(usdlux, scopes.path("lights")), "Scope")
+        define(layer, inside(usdlux, scopes.path("lights")), "Scope")
         if outside:
-            _author_outside(layer, _within(usdlux, scopes.path("lights")), outside, draft.header,
+            _author_outside(layer, inside(usdlux, scopes.path("lights")), outside, draft.header,
                             world_from_root)  # fmt: skip
         for lamp in shaped:
-            lights = _within(usdlux, scopes.path("lights", lamp.identifier))
+            lights = inside(usdlux, scopes.path("lights", lamp.identifier))
             define(layer, lights, "Scope")
             for number, shape in enumerate(lamp.shapes, start=1):
                 prim = define(layer, f"{lights}/light_{number}", _TYPES[shape.kind])
                 _author_light(prim, shape, world_from_root, draft.header.meters_per_unit)
             # The lamp itself must not shine beside them.
             texture = scopes.material(lamp.identifier, EMISSION_TEXTURE)
-            prim = over(layer, _within(usdlux, texture))
+            prim = over(layer, inside(usdlux, texture))
             author_inputs(prim, Types.Float4, scale=Gf.Vec4f(0, 0, 0, 1))
             if lamp.shapes[0].kind == "sphere":
-                hidden = over(layer, _within(usdlux, lamp.prim_path))
+                hidden = over(layer, inside(usdlux, lamp.prim_path))
                 attribute(hidden, "visibility", Types.Token, UsdGeom.Tokens.invisible)
     export(layer, path, folder=path.parent)
 
@@ -139,10 +139,6 @@ def world_from_root(stage: Usd.Stage) -> Double:
     """(4, 4) of column vectors: what an input file does to the default prim, in its units."""
     cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     return np.array(cache.GetLocalToWorldTransform(stage.GetDefaultPrim()), np.float64).T
-
-
-def _within(variant: Sdf.Path, path: str) -> str:
-    return str(Sdf.Path(path).ReplacePrefix(variant.GetPrimPath(), variant))
 
 
 def _author_light(

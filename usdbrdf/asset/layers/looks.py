@@ -2,7 +2,10 @@
 lit, as measured maps, or with their materials.
 
 Bindings live inside the variants and nowhere else. A binding beside them would be a local opinion,
-and local opinions beat variants: every look would show the same material."""
+and local opinions beat variants: every look would show the same material. So do the materials that
+show maps: beside them all would be composed in every look, eight times the prims that it shows,
+over which every tool that reads the stage goes. The measured material is the object's own, and is
+there in every look: an artist's look may bind it too."""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from usdbrdf.asset.layers.author import (
     author_inputs,
     connect,
     define,
+    inside,
     over,
     relationship,
 )
@@ -39,6 +43,11 @@ Shown = Aov | Colour | None
 SURFACE = "PreviewSurface"
 # Texture nodes of the materials; that of the emission has no scale of its own.
 ALBEDO_TEXTURE, EMISSION_TEXTURE = "AlbedoTexture", "EmissionTexture"
+
+
+def look_variant(scopes: Scopes, look: str) -> Sdf.Path:
+    """Where layers say what holds in a look."""
+    return Sdf.Path(scopes.root).AppendVariantSelection(VARIANT_SET, look)
 
 
 def surface(
@@ -118,12 +127,12 @@ def author_looks(
     input file binds otherwise than by the mesh is bound in every look too."""
     root, competing = Sdf.Path(draft.scopes.root), recorded_bindings(draft.asset)
     for look, bindings in looks.items():
-        variant = root.AppendVariantSelection(VARIANT_SET, look)
+        variant = look_variant(draft.scopes, look)
         over(layer, str(variant))
         for prim_path, material in bindings.items():
             also = competing.get(prim_path, {})
             for binding, collection in {f"{prim_path}.{BINDING}": "", **also}.items():
-                path = Sdf.Path(binding).ReplacePrefix(root, variant)
+                path = Sdf.Path(inside(variant, binding))
                 prim = over(layer, str(path.GetParentPath()))
                 apply_schema(prim, "MaterialBindingAPI")
                 targets = [collection, material] if collection else [material]
@@ -142,10 +151,11 @@ def author_look_materials(
     about: one per object, which has its place in ``shown``; and how they are bound. A map of one
     channel shows as grey: applications repeat it over red, green and blue. An object of which there
     is nothing to show has one material that says so in all looks."""
-    bindings = {}
+    bindings, variant = {}, look_variant(scopes, look)
     for item, glow in zip(objects, shown, strict=True):
         name = NO_DATA if glow is None else look
-        material = bindings[item.prim_path] = scopes.look(item.identifier, name)
+        bindings[item.prim_path] = scopes.look(item.identifier, name)
+        material = inside(variant, bindings[item.prim_path])
         define(layer, str(Sdf.Path(material).GetParentPath()), "Scope")
         shader = surface(layer, material)
         if isinstance(glow, Aov):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,36 @@ def _in_lighting(stage: Usd.Stage, asset: Asset) -> Usd.Stage:
             choice.AddVariant(asset.lighting)
             choice.SetVariantSelection(asset.lighting)
     return stage
+
+
+@contextmanager
+def no_warnings() -> Iterator[None]:
+    """USD prints its warnings as it goes; what they are about, findings name.
+
+    Versions of usd-core without a trap for them print them still.
+    """
+    with getattr(Tf, "DiagnosticTrap", nullcontext)() as trap:
+        try:
+            yield
+        finally:
+            if trap is not None:
+                trap.ClearWarnings()
+
+
+def with_variant(stage: Usd.Stage, prim: Usd.Prim, choice: str, variant: str) -> Usd.Stage:
+    """Another stage of the same layers, in which a prim is in another variant of a set; what is
+    authored on it goes where it goes on ``stage``."""
+    session = Sdf.Layer.CreateAnonymous(".usda")
+    if stage.GetSessionLayer():
+        session.subLayerPaths = [stage.GetSessionLayer().identifier]
+    spec = Sdf.CreatePrimInLayer(session, prim.GetPath())
+    spec.variantSelections[choice] = variant
+    with no_warnings():  # which ``stage`` gave already
+        opened = Usd.Stage.Open(stage.GetRootLayer(), session, stage.GetPathResolverContext())
+        opened.SetLoadRules(stage.GetLoadRules())
+        opened.MuteAndUnmuteLayers(stage.GetMutedLayers(), [])
+    opened.SetEditTarget(stage.GetEditTarget())
+    return opened
 
 
 def warn_of_edits(asset: Asset) -> None:
