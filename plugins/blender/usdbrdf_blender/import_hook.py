@@ -47,7 +47,9 @@ class UsdBrdfImport(bpy.types.USDHook):
 def _name_as_object(item, prim):
     """A mesh has its component's name, which Blender allows but once: the mesh is to have it."""
     name, above = prim.GetName(), item.parent
-    if item.type == "MESH" and above and above.type == "EMPTY" and above.name == name:
+    if item.type != "MESH" or not above or above.type != "EMPTY":
+        return
+    if prim.GetParent().GetName() == name:
         above.name = f"{name}_component"
         item.name = name
 

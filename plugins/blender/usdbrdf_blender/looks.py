@@ -1,5 +1,8 @@
 """Showing another look of what was imported: the same objects with other materials."""
 
+import tempfile
+from pathlib import Path
+
 import bpy
 
 from . import usd_asset
@@ -15,7 +18,7 @@ def show_look(file, root, look):
     wanted = usd_asset.materials_in_look(file, root, look)
     missing = {path for worn in wanted.values() for path, _ in worn} - _materials_of(file).keys()
     if missing:
-        _import_materials(file, missing)
+        _import_materials(file, root, look, missing)
     materials = _materials_of(file)
     for item in objects_of(file, root):
         item[SHOWN] = look
@@ -48,20 +51,27 @@ def _wear(mesh, worn):
     mesh.update()
 
 
-def _import_materials(file, paths):
-    """Materials alone; the importer also makes empties for the prims above, which go again."""
+def _import_materials(file, root, look, paths):
+    """Materials of a look alone, which exists while the look is selected; the importer also makes
+    empties for the prims above, which go again."""
     before, active = set(bpy.data.objects), bpy.context.view_layer.objects.active
-    selected = list(bpy.context.selected_objects)
-    bpy.ops.wm.usd_import(
-        filepath=file,
-        prim_path_mask=",".join(sorted(paths)),
-        import_all_materials=True,
-        import_meshes=False,
-        import_cameras=False,
-        import_lights=False,
-        create_world_material=False,
-        set_frame_range=False,
-    )
+    selected, known = list(bpy.context.selected_objects), set(bpy.data.materials)
+    with tempfile.TemporaryDirectory(dir=bpy.app.tempdir) as folder:
+        shown = str(Path(folder, "look.usda").resolve())
+        usd_asset.write_selection(shown, file, root, look)
+        bpy.ops.wm.usd_import(
+            filepath=shown,
+            prim_path_mask=",".join(sorted(paths)),
+            import_all_materials=True,
+            import_meshes=False,
+            import_cameras=False,
+            import_lights=False,
+            create_world_material=False,
+            set_frame_range=False,
+        )
+    for material in set(bpy.data.materials) - known:
+        if material.get(FILE) == shown:
+            material[FILE] = file
     for item in set(bpy.data.objects) - before:
         bpy.data.objects.remove(item)
     for item in selected:

@@ -65,6 +65,14 @@ def materials_in_look(file, root, look):
     return found
 
 
+def write_selection(path, file, root, look):
+    """A layer over ``file`` in which the prim ``root`` shows ``look``."""
+    layer = Sdf.Layer.CreateNew(path)
+    layer.subLayerPaths.append(file)
+    Sdf.CreatePrimInLayer(layer, root).variantSelections[LOOK] = look
+    layer.Save()
+
+
 def _worn(mesh):
     subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
     worn = []
