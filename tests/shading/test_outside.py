@@ -72,9 +72,8 @@ def sunny(yard):
 def _seen(which) -> Surroundings:
     """The directions ``which`` (H, W) of SKY."""
     radiance = np.where(which[..., None], SKY, 0).reshape(-1, 3)
-    return Surroundings(
-        radiance=radiance, coverage=CoverageMap.of(which.ravel(), 0 * which.ravel() > 0)
-    )
+    none = 0 * which.ravel() > 0
+    return Surroundings(radiance=radiance, coverage=CoverageMap.of(which.ravel(), none), dark=none)
 
 
 def _of_upper_half(image) -> np.ndarray:

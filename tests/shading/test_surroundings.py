@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,38 @@ def test_directions_have_the_radiance_that_frames_show(painted):
     assert not found.radiance[unseen].any()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_that_nothing_is_there_is_measured(painted, noise):
+    """By its noise; what is exactly zero was cut out, and nothing is known of it."""
+    rays, frames = painted
+    random = np.random.default_rng(5)
+    folder = frames.image_paths[0].parent.parent / f"dark_{noise}"
+    paths = []
+    for i, path in enumerate(frames.image_paths):
+        camera = frames.camera(i)
+        miss = rays.closest(*camera.rays(camera.pixels())).face < 0
+        picture = read_exr(path).reshape(-1, 3)
+        dark = np.maximum(random.normal(0, noise, picture.shape), 0) if noise else 0 * picture
+        picture[miss] = np.float32(dark)[miss]
+        paths.append(folder / path.name)
+        folder.mkdir(exist_ok=True)
+        write_exr(paths[-1], picture.reshape(camera.height, camera.width, 3))
+    floor = np.full(len(frames), 3 * max(noise, 0.01), np.float32)
+    dark = replace(frames, image_paths=tuple(paths), noise_floor_radiance=floor)
+    seen = surroundings_from_frames(rays, frames, z_up=True).coverage.observed
+    found = surroundings_from_frames(rays, dark, z_up=True)
+    if not noise:
+        assert not found.coverage.observed.any()
+        assert not found.dark.any()
+        return
+    assert (found.dark == seen).mean() > 0.99
+    assert found.coverage.measured[found.dark].all()
+    assert np.median(found.radiance[found.dark]) < noise
+    # Nothing else than darkness was seen: so it goes on.
+    assert found.median().max() < noise
+    assert found.trend(True).max() < noise
+
+
 def test_a_closed_room_shows_no_surroundings(tmp_path):
     made = make_capture(tmp_path / "capture")
     rays = RayScene(made.points, made.triangles)
@@ -79,7 +113,7 @@ def _seen_through_a_window(sky):
     seen = above & (directions[:, 0] > np.cos(np.pi / 4) * np.hypot(*directions[:, :2].T))
     radiance = np.where(seen[:, None], sky, 0).astype(np.float32)
     none = np.zeros_like(seen)
-    return Surroundings(radiance=radiance, coverage=CoverageMap.of(seen, none))
+    return Surroundings(radiance=radiance, coverage=CoverageMap.of(seen, none), dark=none)
 
 
 # Gradation a, b and indicatrix c, d, e of two of the CIE's standard skies (S 011).
@@ -122,5 +156,6 @@ def test_of_next_to_nothing_seen_no_trend_is_told():
     np.testing.assert_array_equal(none.trend(True), 0)
     one = np.zeros((HEIGHT * WIDTH, 3), np.float32)
     one[1000:1040] = np.linspace(1, 3, 40)[:, None]
-    seen = Surroundings(radiance=one, coverage=CoverageMap.of(one[:, 0] > 0, one[:, 0] < 0))
+    coverage = CoverageMap.of(one[:, 0] > 0, one[:, 0] < 0)
+    seen = Surroundings(radiance=one, coverage=coverage, dark=coverage.clipped)
     np.testing.assert_allclose(seen.trend(True), 2, rtol=1e-6)

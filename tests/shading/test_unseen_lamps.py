@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.clipped_light import estimate_clipped_light
+from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
@@ -142,6 +144,33 @@ def test_so_is_a_lamp_that_clips(hall, tmp_path: Path, monkeypatch: pytest.Monke
     every = off("every")
     assert closely < 0.1
     assert every > 2 * closely
+
+
+def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
+    # Both shine; of the shelf, which frames show, a quarter of its radiance is known.
+    surface, lit, _ = _photographed(hall, RADIANCE, LAMP)
+    _, by_shelf, _ = _photographed(hall, RADIANCE, SHELF)
+    owner = surface.texels.object_index()
+    seen, clipped = ~np.isin(owner, (LAMP, SHELF)), owner == SHELF
+    shown = np.where(seen[:, None], lit + by_shelf, lit)
+    shown[clipped] = RADIANCE.max() / 4
+    found = lamps_that_explain(surface, shown, CoverageMap.of(seen, clipped), FRAMES, 0)
+    assert found.object.tolist() == [LAMP]
+    np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.25)
+
+
+def test_light_from_outside_that_is_inferred_and_such_lamps_are_not_told_apart(hall, monkeypatch):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    monkeypatch.setattr("usdbrdf.shading.unseen_lamps._MOST_OPEN", -1.0)
+
+    def found(outside: Outside | None) -> list[int]:
+        lamps = lamps_that_explain(surface, lit, coverage, FRAMES, 0, outside=outside)
+        return [int(index) for index in lamps.object]
+
+    known = Outside.given(black_environment())
+    assert found(None) == []
+    assert found(replace(known, open_share=0.1, sky_error=0.3)) == []
+    assert found(known) == [LAMP]
 
 
 def test_what_only_reflects_is_none(hall):

@@ -7,7 +7,7 @@ traced, since L_d holds it; and segments (facings of objects) count by how much 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +23,8 @@ from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
 _SEED = 0x1A3
-# How roughly what a lamp brings tells even light from shadows' edges.
-_ROUGHLY = Sampling(standard_error=0, max_rays=32)
+# How roughly what a lamp brings tells even light from shadows' edges, and which may be one.
+ROUGHLY = Sampling(standard_error=0, max_rays=32)
 # Texels from one to those beside it; by what share of the lamps' light and of all other light these
 # may differ.
 _AROUND = 2
@@ -43,7 +43,7 @@ class Lamps(NamedTuple):
 
 class Strengths(NamedTuple):
     """Radiance (K, 3) of the lamps, W/(m^2 sr), its relative error (K,), S (K,) of the texels that
-    they light, each as much as it does, and what part of all light is theirs, (K,)."""
+    they light, each as much as it does, and what part of that is theirs, (K,)."""
 
     radiance: Double
     error: Double
@@ -65,19 +65,18 @@ def looked_at_closely(
     are sent to them, to texels that lie evenly in their light, and what surfaces mirror of it and
     of all other light. strength (K,): the lamps' radiance so far."""
     asked = beside_lamps(surface, lit, outside, asked, lamps, seed)
-    alone = [_alone(lamps.of == k) for k in range(len(lamps.mean))]
-    lights = [Shining.of(surface, light) for light in alone]
-    asked = asked.of(_evenly_lit(surface, asked, lights, strength, seed))
+    asked = asked.of(_evenly_lit(surface, asked, lamps, strength, seed))
     texel, seed = asked.texel, seed ^ _SEED
-    share = [_brought(surface, light, texel, seed + k) for k, light in enumerate(lights)]
+    share = brought(surface, lamps, texel, seed)
     rest = _without(lit, lamps)
     asked = asked._replace(
         mirrored=np.pi * mirrored_to_frames(surface, rest, outside, frames, texel, seed)
     )
     sent_on = [
-        mirrored_irradiance(surface, light, texel, seed + k)[:, 0] for k, light in enumerate(alone)
+        mirrored_irradiance(surface, light, texel, seed + k)[:, 0]
+        for k, light in enumerate(_alone(lamps))
     ]
-    sources = sources_of(lamps, np.stack(share))
+    sources = sources_of(lamps, share)
     return strengths(asked, gloss_of_scene(asked, sources, np.stack(sent_on)))
 
 
@@ -109,22 +108,37 @@ def strengths(asked: Asked, sources: Sources) -> Strengths:
     error = jackknife(asked, sources, found).max(axis=1)
     light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
     radiance = np.exp(found.log_radiance)
-    part = (sources.share * radiance.mean(axis=1)[:, None] / light).mean(axis=1)
-    near = (sources.share @ light) / np.maximum(sources.share.sum(axis=1), 1e-12)
+    lights = np.maximum(sources.share.sum(axis=1), 1e-12)
+    near = (sources.share @ light) / lights
+    part = radiance.mean(axis=1) * (sources.share**2 / light).sum(axis=1) / lights
     return Strengths(radiance, np.asarray(error), np.asarray(near), np.asarray(part))
+
+
+def brought(
+    surface: TexturedScene, lamps: Lamps, texel: Long, seed: int, sampling: Sampling = CLOSELY
+) -> Double:
+    """(K, N) W/m^2: what each of the lamps brings to texels (N,) with a radiance of 1, by rays that
+    are sent to it."""
+    return np.stack(
+        [
+            _brought(surface, Shining.of(surface, light), texel, seed + k, sampling)
+            for k, light in enumerate(_alone(lamps))
+        ]
+    )
+
+
+def _alone(lamps: Lamps) -> Iterator[Float]:
+    """(T, 3): each of the lamps with a radiance of 1, in the dark."""
+    for k in range(len(lamps.mean)):
+        yield np.repeat((lamps.of == k)[:, None].astype(np.float32), 3, axis=1)
 
 
 def _without(lit: Float, lamps: Lamps) -> Float:
     return np.where((lamps.of >= 0)[:, None], np.float32(0), lit)
 
 
-def _alone(own: Bool) -> Float:
-    """(T, 3): a lamp of radiance 1 in the dark."""
-    return np.repeat(own[:, None].astype(np.float32), 3, axis=1)
-
-
 def _brought(
-    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling = CLOSELY
+    surface: TexturedScene, light: Shining, texel: Long, seed: int, sampling: Sampling
 ) -> Double:
     """(N,) W/m^2: what grey ``light`` brings, by rays that are sent to it."""
     found = irradiance_of_texels(surface, light, black_environment(), texel, seed, sampling)
@@ -132,19 +146,20 @@ def _brought(
 
 
 def _evenly_lit(
-    surface: TexturedScene, asked: Asked, lights: Sequence[Shining], strength: Double, seed: int
+    surface: TexturedScene, asked: Asked, lamps: Lamps, strength: Double, seed: int
 ) -> Bool:
     """Which of the texels asked, (N,), lie among others that are as much lit: a pixel beside a
     shadow's edge mixes light and shadow, and a lamp that casts mixed ones comes out too dim.
     Segments of which few are measured leave; if too few were left in all, all stay."""
     total, most = np.zeros(len(asked.texel)), np.zeros(len(asked.texel))
-    for light, radiance in zip(lights, strength, strict=True):
+    for alone, radiance in zip(_alone(lamps), strength, strict=True):
+        light = Shining.of(surface, alone)
         # The same rays from each, so that their noise is the same.
-        own = _brought(surface, light, asked.texel, seed, _ROUGHLY)
+        own = _brought(surface, light, asked.texel, seed, ROUGHLY)
         total += radiance * own
         uneven = np.zeros(len(own))
         for beside in surface.texels.around(asked.texel, _AROUND):
-            other = _brought(surface, light, beside, seed, _ROUGHLY)
+            other = _brought(surface, light, beside, seed, ROUGHLY)
             uneven = np.maximum(uneven, np.abs(other - own))
         most += radiance * uneven
     even = most <= _UNEVEN * total + _OF_OTHER_LIGHT * asked.irradiance.mean(axis=1)

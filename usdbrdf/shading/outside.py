@@ -56,6 +56,7 @@ _BANDS = (
 )  # fmt: skip
 _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
+_HIDDEN_BY_NIGHT = calibration.number("outside.hidden_by_night")
 # Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
 _SLIT = calibration.number("outside.slit")
 _MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
@@ -94,6 +95,11 @@ class Outside:
     def is_estimated(self) -> bool:
         """Not told by a file."""
         return not math.isnan(self.open_share)
+
+    @property
+    def is_inferred(self) -> bool:
+        """More than what a file tells or frames show."""
+        return not (math.isnan(self.sky_error) and math.isnan(self.sun_error))
 
     def arrays(self) -> dict[str, Array]:
         """All of it."""
@@ -159,9 +165,17 @@ def light_from_outside(
         share, open_share = _shares(surface, asked, unseen, z_up, seed, rays)
         if open_share < _LEAST_OPEN:
             return None
+    say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
+    hidden = float(share.mean(axis=1).sum()) / np.pi
+    night = seen.dark.any() and not (measured & ~seen.dark).any() and not clipped.any()
+    if hidden < (_HIDDEN_BY_NIGHT * open_share if night else _LEAST_OPEN):
+        # Frames show where they lead; or that all they show is dark, as then the rest is.
+        radiance = _picture(seen, patches, np.zeros(0, np.int64), np.zeros((0, 3)), z_up)
+        confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
+        environment = Environment(radiance, z_up)
+        return Outside(environment=environment, confidence=confidence, open_share=open_share)
     asked = _under_what_was_seen(surface, lit, asked, seen, z_up, seed)
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
-    say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     sky = _sky(asked, seen, patches, share, used, z_up)
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.

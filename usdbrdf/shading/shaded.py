@@ -333,11 +333,9 @@ def shade_surface(
     """
     dark = [i for i, shines in said.items() if not shines]
     environment = outside.environment if outside else black_environment()
-    # In the light of what it may be that no frame shows; not both that and an open scan's.
-    unseen = (
-        UnseenLamps.none()
-        if outside
-        else estimate_unseen_lamps(run, surface, lit, coverage, frames, sampling.seed, dark)
+    # In the light of what it may be that no frame shows.
+    unseen = estimate_unseen_lamps(
+        run, surface, lit, coverage, frames, outside, sampling.seed, dark
     )
     lit = unseen.with_light(surface.texels, lit)
     light = estimate_clipped_light(

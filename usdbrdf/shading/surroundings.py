@@ -1,10 +1,12 @@
 """What the frames show of the far surroundings: rays that miss the mesh measure them, direction by
-direction, as rays that meet it measure its texels."""
+direction, as rays that meet it measure its texels. That nothing is there is measured too, unless
+all of it is exactly zero: then somebody cut the surroundings out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -27,6 +29,7 @@ HEIGHT, WIDTH = 256, 512
 # Pixels between the rays that look whether a frame shows anything but the mesh.
 _STRIDE = 8
 _LEAST_OUTSIDE = calibration.number("outside.least_seen")
+_BLANK = calibration.number("outside.blank")
 _QUANTILE = 0.5
 _LEAST_SKY = calibration.number("outside.least_sky")
 _SLOPE = calibration.pair("outside.sky_slope")
@@ -37,17 +40,18 @@ _STEPS = 3
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
     """Of D = HEIGHT x WIDTH directions: radiance (D, 3) float32, W/(m^2 sr), the median of what
-    frames measured, what saturates them where all clip, 0 elsewhere; and the coverage."""
+    frames measured, the mean where all are too dark for that, what saturates them where all clip, 0
+    elsewhere; the coverage; and dark (D,), where they measured that hardly anything is there."""
 
     radiance: Float
     coverage: CoverageMap
+    dark: Bool
 
     @classmethod
     def unseen(cls) -> Surroundings:
         none = np.zeros(HEIGHT * WIDTH, np.bool_)
-        return cls(
-            radiance=np.zeros((HEIGHT * WIDTH, 3), np.float32), coverage=CoverageMap.of(none, none)
-        )
+        radiance = np.zeros((HEIGHT * WIDTH, 3), np.float32)
+        return cls(radiance=radiance, coverage=CoverageMap.of(none, none), dark=none)
 
     def trend(self, z_up: bool) -> Double:
         """(D, 3): what the other directions are likely to show: of what was measured above the
@@ -60,7 +64,8 @@ class Surroundings:
         usual = self.median()
         flat = directions.copy()
         flat[:, up] = np.maximum(flat[:, up], 0)
-        sky = self.coverage.measured & (directions[:, up] > 0) & (self.radiance > 0).all(axis=1)
+        sky = self.coverage.measured & ~self.dark & (directions[:, up] > 0)
+        sky &= (self.radiance > 0).all(axis=1)
         solid = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[sky]
         if solid.sum() < _LEAST_SKY:
             return np.tile(usual, (len(sky), 1))
@@ -81,9 +86,13 @@ class Surroundings:
         return np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
 
     def median(self) -> Double:
-        """(3,) of what was measured, 0 without any."""
-        known = self.radiance[self.coverage.measured].astype(np.float64)
-        return np.median(known, axis=0) if len(known) else np.zeros(3)
+        """(3,) of what was measured and is not dark, or of what is; 0 without any."""
+        known = self.coverage.measured
+        shines = known & ~self.dark
+        known = shines if shines.any() else known
+        if not known.any():
+            return np.zeros(3)
+        return np.asarray(np.median(self.radiance[known].astype(np.float64), axis=0))
 
 
 def share_outside(rays: RayScene, frames: Frames) -> Float:
@@ -103,44 +112,70 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
         return Surroundings.unseen()
     state = QuantileState.empty(HEIGHT * WIDTH)
     saturates = np.zeros(HEIGHT * WIDTH, np.float32)
+    darkness, weight = np.zeros((HEIGHT * WIDTH, 3)), np.zeros(HEIGHT * WIDTH)
+    num_dark, num_blank = 0, 0
     looking = np.flatnonzero(shares > 0).tolist()
     images = read_frames(partial(read_frame, frames), looking)
     for i, pixels in progress(images, total=len(looking), label="shade: outside", unit="frames"):
-        direction, radiance, clipped = _seen_in_frame(rays, frames.camera(i), pixels, z_up)
-        psquare.update(state, direction, radiance, _QUANTILE)
+        seen = _seen_in_frame(rays, frames.camera(i), pixels, z_up)
+        psquare.update(state, seen.direction, seen.radiance, _QUANTILE)
         limit = np.float32(frames.saturation_radiance[i])
-        saturates[clipped] = np.maximum(saturates[clipped], limit)
+        saturates[seen.clipped] = np.maximum(saturates[seen.clipped], limit)
+        own = float(frames.noise_floor_radiance[i]) ** -2.0 if len(seen.dark) else 0.0
+        darkness[seen.dark] += own * seen.darkness
+        weight[seen.dark] += own
+        num_dark += len(seen.dark)
+        num_blank += int((seen.darkness == 0).all(axis=1).sum())
     measured = state.samples > 0
-    found = np.where(
-        measured[:, None], psquare.quantile(state, _QUANTILE), saturates[:, None]
-    ).astype(np.float32)
+    dark = ~measured & (weight > 0) & (num_blank < _BLANK * num_dark)
+    found = np.where(measured[:, None], psquare.quantile(state, _QUANTILE), saturates[:, None])
+    found[dark] = darkness[dark] / weight[dark, None]
+    measured |= dark
     return Surroundings(
-        radiance=found, coverage=CoverageMap.of(measured, ~measured & (saturates > 0))
+        radiance=found.astype(np.float32),
+        coverage=CoverageMap.of(measured, ~measured & (saturates > 0)),
+        dark=dark,
     )
 
 
-def _seen_in_frame(
-    rays: RayScene, camera: Camera, pixels: FramePixels, z_up: bool
-) -> tuple[Array, Float, Long]:
-    """Directions of which one frame shows all valid pixels, (M,) int32, and their mean (M, 3);
-    and those of which it shows saturated ones alone, (K,)."""
+class _SeenInFrame(NamedTuple):
+    """Directions of which a frame shows all valid pixels, (M,) int32, and their mean (M, 3); those
+    of which it shows saturated ones alone, (K,); and those with pixels that are too dark, (L,), and
+    what they show all the same (L, 3)."""
+
+    direction: Array
+    radiance: Float
+    clipped: Long
+    dark: Long
+    darkness: Float
+
+
+def _seen_in_frame(rays: RayScene, camera: Camera, pixels: FramePixels, z_up: bool) -> _SeenInFrame:
     # Four pixels to a direction's side are enough.
     step = max(1, int(camera.intrinsics[0] * np.pi / HEIGHT / 4))
     _, towards = camera.rays(camera.pixels(step))
-    valid, clipped = pixels.valid[::step, ::step], pixels.clipped[::step, ::step]
-    shown = pixels.radiance[::step, ::step]
+    part = np.s_[::step, ::step]
+    valid, shown = pixels.valid[part], pixels.radiance[part]
+    kinds = valid, pixels.clipped[part], pixels.dark[part] & ~pixels.clipped[part]
     faces = rays.closest(camera.eye[None].astype(np.float32), towards).face
     miss = (faces < 0).reshape(valid.shape)
     # A pixel beside the mesh shows some of it.
     alone: Bool = ndimage.binary_erosion(miss, np.ones((3, 3)))
     which = np.flatnonzero(alone)
     place = pixels_of_directions(towards[which], HEIGHT, WIDTH, z_up)
-    count, num_valid, num_clipped = (
+    count, num_valid, num_clipped, num_dark = (
         np.bincount(place, weights, HEIGHT * WIDTH)
-        for weights in (None, valid.ravel()[which], clipped.ravel()[which])
+        for weights in (None, *(kind.ravel()[which] for kind in kinds))
     )
-    whole = np.flatnonzero((count > 0) & (num_valid == count))
     brought = np.nan_to_num(shown.reshape(-1, 3)[which])
-    sums = [np.bincount(place, brought[:, c], HEIGHT * WIDTH)[whole] for c in range(3)]
-    mean = (np.stack(sums, axis=-1) / count[whole, None]).astype(np.float32)
-    return whole.astype(np.int32), mean, np.flatnonzero((count > 0) & (num_clipped == count))
+    sums = [np.bincount(place, brought[:, c], HEIGHT * WIDTH) for c in range(3)]
+    mean = (np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]).astype(np.float32)
+    whole = np.flatnonzero((count > 0) & (num_valid == count))
+    dark = np.flatnonzero((num_dark > 0) & (num_valid + num_dark == count))
+    return _SeenInFrame(
+        direction=whole.astype(np.int32),
+        radiance=mean[whole],
+        clipped=np.flatnonzero((count > 0) & (num_clipped == count)),
+        dark=dark,
+        darkness=mean[dark],
+    )

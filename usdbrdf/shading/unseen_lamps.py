@@ -3,7 +3,9 @@
 Objects of which frames show nothing are sources of unknown strength. As for light from outside,
 what texels reflect tells it: pi L_d = albedo (S_seen + sum_k g_k B_k), by least squares on the
 logarithms with one albedo for each facing of an object. What comes out much brighter than anything
-that only reflects could be where it is shines by itself; the others keep what was filled in.
+that only reflects could be where it is shines by itself; the others keep what was filled in. Lamps
+that clip are unknown as well meanwhile. Light from outside that is inferred likewise is not told
+from lamps that no frame shows.
 """
 
 from __future__ import annotations
@@ -20,7 +22,18 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels, looked_around
-from usdbrdf.shading.lamp_light import Lamps, beside_lamps, looked_at_closely, sources_of, strengths
+from usdbrdf.shading.clipped_emitters import LAMP_PRIOR
+from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
+from usdbrdf.shading.lamp_light import (
+    ROUGHLY,
+    Lamps,
+    beside_lamps,
+    brought,
+    looked_at_closely,
+    sources_of,
+    strengths,
+)
+from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -32,8 +45,9 @@ _LEAST_PART = calibration.number("unseen.least_part")
 _DEVIATION = calibration.number("unseen.deviation")
 _MOST_OPEN = calibration.number("unseen.most_open")
 _MOST_ERROR = calibration.number("unseen.most_error")
-# Rays from each texel that is asked, objects that may shine, and those whose light is traced.
-_RAYS, _CANDIDATES, _TRACED = 256, 32, 8
+# Rays from each texel that is asked, objects that may shine, and those whose light is traced; of
+# lamps that clip, those with the most light.
+_RAYS, _CANDIDATES, _TRACED, _CLIPPED = 256, 32, 8, 4
 _SEED = 0x1A3
 
 
@@ -75,13 +89,16 @@ def estimate_unseen_lamps(
     lit: Float,
     coverage: CoverageMap,
     frames: Frames,
+    outside: Outside | None,
     seed: int,
     dark: Sequence[int] = (),
 ) -> UnseenLamps:
-    """Of a closed scan with the radiance ``lit`` (T, 3); the objects ``dark`` are none."""
+    """Of a scan with the radiance ``lit`` (T, 3), before what is known of what lies ``outside``;
+    the objects ``dark`` are none."""
 
     def compute() -> dict[str, Array]:
-        return dict(vars(lamps_that_explain(surface, lit, coverage, frames, seed, dark)))
+        found = lamps_that_explain(surface, lit, coverage, frames, seed, dark, outside)
+        return dict(vars(found))
 
     found = UnseenLamps(**run.checkpoint("unseen", compute))
     if len(found.object):
@@ -96,6 +113,7 @@ def lamps_that_explain(
     frames: Frames,
     seed: int,
     dark: Sequence[int] = (),
+    outside: Outside | None = None,
 ) -> UnseenLamps:
     """The unseen objects that must shine for plain surfaces to be plain, without those that are
     known to be ``dark``."""
@@ -111,33 +129,39 @@ def lamps_that_explain(
     if asked is None or not (seen < _UNSEEN).any():
         return UnseenLamps.none()
     share, open_share = _shares(surface, asked, seen < _UNSEEN, seed)
-    if open_share > _MOST_OPEN:
+    if open_share > _MOST_OPEN and (outside is None or outside.is_inferred):
         return UnseenLamps.none()
     brings = share.mean(axis=1)
     candidates = np.argsort(-brings, kind="stable")[:_CANDIDATES]
     candidates = candidates[brings[candidates] > _LEAST_SHARE * np.pi]
     if not len(candidates):
         return UnseenLamps.none()
-    # Few rays meet a lamp, and errors of what it brings draw its strength to nothing: they only
-    # say which of the objects may be one.
-    dark_outside, lamps = black_environment(), _unknown(surface.texels, asked, candidates)
-    asked = beside_lamps(surface, lit, dark_outside, asked, lamps, seed)
-    found, _, near, part = strengths(asked, sources_of(lamps, share[candidates]))
-    likely = np.where(np.pi * found.mean(axis=1) > near, part, 0)
+    groups = clipped_groups(texels, lit, coverage)
+    asked = asked.of(~_is_lamp(groups)[asked.texel])
+    environment = outside.environment if outside else black_environment()
+    lamps = _unknown(texels, asked, candidates, groups)
+    asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
+    roughly = brought(surface, lamps, asked.texel, seed, ROUGHLY)
+    # Errors of what a lamp brings draw its strength to nothing: this only says which may be one.
+    found, error, near, part = strengths(asked, sources_of(lamps, roughly))
+    likely = np.where((np.pi * found.mean(axis=1) > near) & (error < 1), part, 0)
+    likely = likely[: len(candidates)]
     likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
-    likeliest = likeliest[likely[likeliest] > _LEAST_PART / 4]
-    candidates, strength = candidates[likeliest], found[likeliest].mean(axis=1)
-    while len(candidates):
-        lamps = _unknown(surface.texels, asked, candidates)
+    kept = likeliest[likely[likeliest] > _LEAST_PART / 2]
+    while len(kept):
+        strength = np.append(found[kept], found[len(candidates) :], axis=0).mean(axis=1)
+        candidates = candidates[kept]
+        lamps = _unknown(texels, asked, candidates, groups)
         found, error, near, part = looked_at_closely(
-            surface, lit, dark_outside, frames, asked, lamps, strength, seed
+            surface, lit, environment, frames, asked, lamps, strength, seed
         )
+        own = slice(len(candidates))
         # Clearly brighter than what only reflects: even with as much light as the texels that see
         # it receive.
-        brightness = np.log(np.pi * found.mean(axis=1) / near)
-        lamp = (brightness > np.log(_BRIGHTER)) & (part > _LEAST_PART)
+        brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
+        lamp = (brightness > np.log(_BRIGHTER)) & (part[own] > _LEAST_PART)
         if lamp.all():  # none of the others blurs what these are any more
-            lamp = (brightness > 2 * error) & (error < _MOST_ERROR)
+            lamp = (brightness > 2 * error[own]) & (error[own] < _MOST_ERROR)
         if lamp.all():
             order = np.argsort(candidates)
             return UnseenLamps(
@@ -145,7 +169,7 @@ def lamps_that_explain(
                 radiance=found[order].astype(np.float32),
                 error=error[order].astype(np.float32),
             )
-        candidates, strength = candidates[lamp], found[lamp].mean(axis=1)
+        kept = np.flatnonzero(lamp)
     return UnseenLamps.none()
 
 
@@ -162,11 +186,24 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tu
     return brought, float((face < 0).mean())
 
 
-def _unknown(texels: Texels, asked: Asked, objects: Long) -> Lamps:
-    """Objects (K,) that may be lamps, of which nothing else is known."""
-    usual, count = np.log(np.median(asked.reflected, axis=0) / np.pi), len(objects)
+def _is_lamp(groups: ClippedGroups) -> Bool:
+    """(T,): texels of a lamp that clips."""
+    return np.asarray(np.append(groups.lamp, False)[groups.group], np.bool_)
+
+
+def _unknown(texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups) -> Lamps:
+    """Objects (K,) that may be lamps, of which nothing else is known, and after them those that
+    clip."""
+    usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
+    clips = np.flatnonzero(groups.lamp)[:_CLIPPED]
     number = np.full(len(texels.resolution), -1, np.int32)
-    number[objects] = np.arange(count)
+    number[objects] = np.arange(len(objects))
+    number_of_group = np.full(len(groups) + 1, -1, np.int32)
+    number_of_group[clips] = len(objects) + np.arange(len(clips))
+    clipped = number_of_group[groups.group]
+    at_least = np.tile(np.log(groups.bound[clips].astype(np.float64))[:, None], (1, 3))
     return Lamps(
-        number[texels.object_index()], np.tile(usual, (count, 1)), np.full(count, _DEVIATION)
+        np.where(clipped >= 0, clipped, number[texels.object_index()]),
+        np.concatenate([np.tile(usual, (len(objects), 1)), at_least + LAMP_PRIOR[0]]),
+        np.repeat([_DEVIATION, LAMP_PRIOR[1]], [len(objects), len(clips)]),
     )
