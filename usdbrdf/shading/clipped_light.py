@@ -206,10 +206,9 @@ def _told_by_even_light(
     first: EstimatedRadiance,
     seed: int,
 ) -> EstimatedRadiance:
-    """The estimate with its lamps looked at closely, those as well that were not determined: what
-    others seem to send may be theirs. Where that says too little of a lamp, or that it is darker
-    than its bound, the ``first`` one."""
-    lamps = np.flatnonzero(groups.lamp)[:_CLOSELY]
+    """The estimate with those of its lamps that are determined looked at closely; where these say
+    too little of a lamp, or that it is darker than its bound, the ``first`` one."""
+    lamps = np.flatnonzero(groups.lamp & first.determined)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if not len(lamps) or asked is None:
         return first
@@ -236,15 +235,11 @@ def _told_by_even_light(
     brightest = multiplier.max(axis=1)
     better = (error <= MAX_ERROR) & (np.log(brightest) > -2 * error)
     estimate = replace(
-        first,
-        multiplier=first.multiplier.copy(),
-        standard_error=first.standard_error.copy(),
-        determined=first.determined.copy(),
+        first, multiplier=first.multiplier.copy(), standard_error=first.standard_error.copy()
     )
     held = multiplier / np.minimum(brightest, 1)[:, None]
     estimate.multiplier[lamps[better]] = held[better]
     estimate.standard_error[lamps[better]] = error[better, None]
-    estimate.determined[lamps[better]] = True
     return estimate
 
 

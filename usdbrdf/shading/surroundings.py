@@ -1,6 +1,6 @@
 """What the frames show of the far surroundings: rays that miss the mesh measure them, direction by
 direction, as rays that meet it measure its texels. That nothing is there is measured too, unless
-all of it is exactly zero: then somebody cut the surroundings out."""
+nearly all of it is exactly zero: then somebody cut the surroundings out."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
         num_dark += len(seen.dark)
         num_blank += int((seen.darkness == 0).all(axis=1).sum())
     measured = state.samples > 0
-    dark = ~measured & (weight > 0) & (num_blank < _BLANK * num_dark)
+    dark = ~measured & (weight > 0) & (saturates == 0) & (num_blank < _BLANK * num_dark)
     found = np.where(measured[:, None], psquare.quantile(state, _QUANTILE), saturates[:, None])
     found[dark] = darkness[dark] / weight[dark, None]
     measured |= dark
