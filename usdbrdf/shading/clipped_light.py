@@ -70,6 +70,18 @@ class ClippedGroups:
     def __len__(self) -> int:
         return len(self.object)
 
+    def texels_of(self, which: Bool) -> Bool:
+        """(T,): the texels of those of the groups (K,)."""
+        return np.asarray(np.append(which, False)[self.group], np.bool_)
+
+    def as_lamps(self, which: Long) -> Lamps:
+        """The groups with the numbers ``which`` (N,), as what is known of lamps that clip."""
+        number = np.full(len(self) + 1, -1, np.int32)
+        number[which] = np.arange(len(which))
+        bound = np.log(self.bound[which].astype(np.float64))
+        before = np.tile(bound[:, None] + LAMP_PRIOR[0], (1, 3))
+        return Lamps(number[self.group], before, np.full(len(which), LAMP_PRIOR[1]))
+
 
 def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
@@ -134,8 +146,7 @@ class ClippedLight:
 
     def may_shine(self, clipped: Bool) -> Bool:
         """(T,): the clipped texels but those that are clearly part of a bright wall."""
-        wall = np.concatenate([~self.groups.lamp, [False]])
-        return np.asarray(clipped & ~wall[self.groups.group], np.bool_)
+        return np.asarray(clipped & ~self.groups.texels_of(~self.groups.lamp), np.bool_)
 
     def error_of_object(self, index: int) -> float:
         """Relative standard error of the object's estimate; NaN if it has none."""
@@ -216,17 +227,14 @@ def _told_by_even_light(
     # An object of which a part shines mirrors a lamp there, or glows: so may the rest of it.
     without_glow = plain & ~np.isin(asked.owner, groups.object[groups.lamp])
     asked = asked.of(without_glow if 2 * without_glow.sum() > plain.sum() else plain)
-    number = np.full(len(groups) + 1, -1, np.int32)
-    number[lamps] = np.arange(len(lamps))
     bound = groups.bound[lamps].astype(np.float64)
-    before = np.tile(np.log(bound)[:, None] + LAMP_PRIOR[0], (1, 3))
     found = looked_at_closely(
         surface,
         _with_estimates(lit, groups, first),
         environment,
         frames,
         asked,
-        Lamps(number[groups.group], before, np.full(len(lamps), LAMP_PRIOR[1])),
+        groups.as_lamps(lamps),
         bound * first.multiplier[lamps].mean(axis=1),
         seed,
     )

@@ -128,7 +128,8 @@ def brought(
 
 
 def _alone(lamps: Lamps) -> Iterator[Float]:
-    """(T, 3): each of the lamps with a radiance of 1, in the dark."""
+    """(T, 3): each of the lamps with a radiance of 1, in the dark; one after the other, since each
+    takes as much memory as the scene's textures."""
     for k in range(len(lamps.mean)):
         yield np.repeat((lamps.of == k)[:, None].astype(np.float32), 3, axis=1)
 

@@ -22,7 +22,6 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels, looked_around
-from usdbrdf.shading.clipped_emitters import LAMP_PRIOR
 from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_light import (
     ROUGHLY,
@@ -137,7 +136,7 @@ def lamps_that_explain(
     if not len(candidates):
         return UnseenLamps.none()
     groups = clipped_groups(texels, lit, coverage)
-    asked = asked.of(~_is_lamp(groups)[asked.texel])
+    asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     environment = outside.environment if outside else black_environment()
     lamps = _unknown(texels, asked, candidates, groups)
     asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
@@ -186,24 +185,15 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tu
     return brought, float((face < 0).mean())
 
 
-def _is_lamp(groups: ClippedGroups) -> Bool:
-    """(T,): texels of a lamp that clips."""
-    return np.asarray(np.append(groups.lamp, False)[groups.group], np.bool_)
-
-
 def _unknown(texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups) -> Lamps:
     """Objects (K,) that may be lamps, of which nothing else is known, and after them those that
     clip."""
     usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
-    clips = np.flatnonzero(groups.lamp)[:_CLIPPED]
     number = np.full(len(texels.resolution), -1, np.int32)
     number[objects] = np.arange(len(objects))
-    number_of_group = np.full(len(groups) + 1, -1, np.int32)
-    number_of_group[clips] = len(objects) + np.arange(len(clips))
-    clipped = number_of_group[groups.group]
-    at_least = np.tile(np.log(groups.bound[clips].astype(np.float64))[:, None], (1, 3))
+    clipped = groups.as_lamps(np.flatnonzero(groups.lamp)[:_CLIPPED])
     return Lamps(
-        np.where(clipped >= 0, clipped, number[texels.object_index()]),
-        np.concatenate([np.tile(usual, (len(objects), 1)), at_least + LAMP_PRIOR[0]]),
-        np.repeat([_DEVIATION, LAMP_PRIOR[1]], [len(objects), len(clips)]),
+        np.where(clipped.of >= 0, clipped.of + len(objects), number[texels.object_index()]),
+        np.concatenate([np.tile(usual, (len(objects), 1)), clipped.mean]),
+        np.concatenate([np.full(len(objects), _DEVIATION), clipped.deviation]),
     )
