@@ -263,10 +263,11 @@ def test_what_is_said_of_a_look_holds_in_it_and_defines_nothing_in_others(built)
 
 def test_a_look_stands_in_its_variant_alone_in_every_layer(built):
     """Targets are told as they are in the stage."""
+    places, targets = [], []
     for role in ROLES:
-        layer, places, targets = Sdf.Layer.FindOrOpen(str(built.asset.layer(role))), [], []
+        layer = Sdf.Layer.FindOrOpen(str(built.asset.layer(role)))
 
-        def visit(path, layer=layer, places=places, targets=targets):
+        def visit(path, layer=layer):
             spec = layer.GetObjectAtPath(path)
             if isinstance(spec, Sdf.PrimSpec) and path.name == "looks":
                 places.append(path)
@@ -274,5 +275,7 @@ def test_a_look_stands_in_its_variant_alone_in_every_layer(built):
                 targets.extend(spec.connectionPathList.explicitItems)
 
         layer.Traverse("/", visit)
-        assert all(path.ContainsPrimVariantSelection() for path in places)
-        assert not any(path.ContainsPrimVariantSelection() for path in targets)
+    assert places
+    assert all(path.ContainsPrimVariantSelection() for path in places)
+    assert targets
+    assert not any(path.ContainsPrimVariantSelection() for path in targets)

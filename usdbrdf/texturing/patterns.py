@@ -72,8 +72,8 @@ class Equations(NamedTuple):
         return cls(halves, np.zeros((2, num_texels, 3), np.float32), zeros(), zeros())
 
 
-# Bytes per texel of these, and of the iteration's vectors.
-BYTES_OF_EQUATIONS = 8 * (len(_BESIDE) + 4) + 176
+# Bytes per texel of these, of the sum of both halves, and of the iteration's vectors.
+BYTES_OF_EQUATIONS = 4 * (3 * (len(_BESIDE) + 3) + 2) + 208
 
 
 def add(
@@ -160,10 +160,11 @@ def steps(
     sums = coupled(coupling, np.concatenate([np.ones_like(sign), sign], axis=1))
     # All couplings are positive, so these bound the eigenvalues by 1.
     bound = (sums[:, :1] + ridge).astype(np.float32)
-    found = _solved(
-        lambda x: (coupled(coupling, x) + ridge * x) / bound,
-        np.concatenate([pull, sums[:, 1:]], axis=1) / bound,
-    )
+
+    def scaled(values: Float) -> Float:
+        return np.asarray((coupled(coupling, values) + ridge * values) / bound)
+
+    found = _solved(scaled, np.concatenate([pull, sums[:, 1:]], axis=1) / bound)
     step = np.ascontiguousarray(found[:, :3])
     explained = (step * pull).mean(axis=1)
     again = (step * coupled(coupling, step)).mean(axis=1)
@@ -173,7 +174,7 @@ def steps(
     equal = part_of_half * (1 - part_of_half)
     apart = (equations.pull[0] - half[:, :3]) / np.sqrt(np.maximum(equal, _LEAST_EQUAL))
     apart = np.where(equal > _LEAST_EQUAL, apart, 0).astype(np.float32)
-    noise = _solved(lambda x: (coupled(coupling, x) + ridge * x) / bound, apart / bound)
+    noise = _solved(scaled, apart / bound)
     told = [
         explained,
         (apart * noise).mean(axis=1),
