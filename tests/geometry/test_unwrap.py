@@ -17,7 +17,13 @@ from tests.physics.surfaces import quad, sphere, world_of
 from usdbrdf.errors import CrashedChild, InputRefused
 from usdbrdf.geometry import unwrap as module
 from usdbrdf.geometry.texels import texels_from_atlas
-from usdbrdf.geometry.unwrap import PADDING, TexelSizes, pack_triangles_singly, unwrap
+from usdbrdf.geometry.unwrap import (
+    PADDING,
+    TexelSizes,
+    beside_neighbours,
+    pack_triangles_singly,
+    unwrap,
+)
 from usdbrdf.model.scene import Scene, SceneObject
 
 
@@ -104,6 +110,26 @@ def test_no_two_triangles_share_a_texel_centre(unwrapped):
             v = (a[0] * (y - p[0, 1]) - a[1] * (x - p[0, 0])) / det
             taken += (u > 1e-6) & (v > 1e-6) & (u + v < 1 - 1e-6)
         assert taken.max() == 1
+
+
+@pytest.mark.parametrize("nonsense", [25.9, -0.5, np.nan])
+def test_a_sliver_that_xatlas_lost_lies_at_its_neighbour(nonsense):
+    corners = np.float32([
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        [[1, 1, 0], [1, 1.0002, 0], [1, 0, 0]],
+    ])  # fmt: skip
+    uv = corners[..., :2] * 0.5
+    uv[2, 1] = nonsense
+    mended = beside_neighbours(uv, corners)
+    np.testing.assert_array_equal(mended[:2], uv[:2])
+    np.testing.assert_array_equal(mended[2], np.broadcast_to(uv[1, 1], (3, 2)))
+
+
+def test_no_triangle_that_holds_texels_may_be_lost():
+    corners = np.float32([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]])
+    uv = corners[..., :2] * 0.5
+    uv[1] = 25.9
+    assert beside_neighbours(uv, corners) is None
 
 
 @pytest.mark.fault("G7")

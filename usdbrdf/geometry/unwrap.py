@@ -13,6 +13,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused, LateChild
 from usdbrdf.job.child import child
@@ -35,6 +36,8 @@ _FACES_OF_CHILD = 2000
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
+# The share of an object's area that may go without texels of its own.
+_MAX_LOST = 1e-3
 
 
 def atlas_side(corner_uv: Float, corners: Float, texel_size: float) -> int | None:
@@ -283,12 +286,33 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
     if corners.shape == triangles.shape and (sizes.side != finest).any():
         atlas, corners, uv = _at_own_densities(atlas, points, triangles, sizes, options)
     width, height = int(atlas.width), int(atlas.height)
-    if corners.shape == triangles.shape and np.isfinite(uv).all() and min(width, height) > 0:
-        corner_uv = uv[corners]
-        corner_uv[..., 1] = 1 - corner_uv[..., 1]
-        if corner_uv.min() >= 0 and corner_uv.max() <= 1:
-            return corner_uv.astype(np.float32), (width, height)
+    if corners.shape == triangles.shape and min(width, height) > 0:
+        corner_uv = beside_neighbours(uv[corners], points[triangles])
+        if corner_uv is not None:
+            corner_uv[..., 1] = 1 - corner_uv[..., 1]
+            return corner_uv, (width, height)
     return pack_triangles_singly(points[triangles], finest)
+
+
+def beside_neighbours(corner_uv: Float, corners: Float) -> Float | None:
+    """The coordinates with those of lost triangles, which lie outside [0, 1], shrunk to a point of
+    the nearest triangle that has its own; None where more than slivers are lost.
+
+    xatlas drops single triangles thinner than its tolerance, and leaves nonsense in their place.
+
+    corner_uv (F, 3, 2); corners (F, 3, 3), metres
+    """
+    kept = (np.isfinite(corner_uv) & (corner_uv >= 0) & (corner_uv <= 1)).all(axis=(1, 2))
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    if area[~kept].sum() > _MAX_LOST * area.sum() or not kept.any():
+        return None
+    mended = corner_uv.astype(np.float32)
+    if not kept.all():
+        _, nearest = cKDTree(corners[kept].reshape(-1, 3)).query(corners[~kept].mean(axis=1))
+        mended[~kept] = corner_uv[kept].reshape(-1, 2)[nearest][:, None]
+    return mended
 
 
 def _at_own_densities(
