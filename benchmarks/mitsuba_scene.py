@@ -30,6 +30,8 @@ SOLID = {"diffuse", "plastic", "roughplastic", "conductor", "roughconductor"}
 def load(path: Path) -> tuple[mi.Scene, Double]:
     """The scene and where its own camera stands, in its units."""
     root = ET.parse(path).getroot()
+    for part in root.iter():
+        mend_parameters(part)
     for parent in list(root.iter()):
         for child in list(parent):
             mend(path.parent, parent, child)
@@ -46,6 +48,19 @@ def load(path: Path) -> tuple[mi.Scene, Double]:
             root.remove(default)
     # Not optimised: objects stay apart and in the order of the file.
     return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False), eye
+
+
+def mend_parameters(part: ET.Element) -> None:
+    """Colours and distributions of 0.6 as version 3 has them."""
+    value = part.get("value", "")
+    if part.tag == "rgb" and value.startswith("#"):  # linear
+        part.set("value", ", ".join(f"{number / 255:.5f}" for number in bytes.fromhex(value[1:])))
+    smooth = part.tag == "bsdf" and part.get("type") in ("conductor", "plastic", "dielectric")
+    for child in list(part):
+        if smooth and child.get("name") in ("distribution", "alpha"):
+            part.remove(child)
+        elif child.get("name") == "distribution" and child.get("value") in ("phong", "as"):
+            child.set("value", "beckmann")  # 0.6 makes its alpha one of the same width
 
 
 def mend(folder: Path, parent: ET.Element, child: ET.Element) -> None:
