@@ -239,6 +239,7 @@ ENGINEERING: dict[str, str] = {
     "_LEAK": "geometry: texels that pixels may mix",
     "_LEAST": "numerics",
     "_LEAST_EQUAL": "numerics: of a quotient",
+    "_LEAST_FLOOR": "numerics: of a quotient",
     "_LEAST_OF_SEGMENT": "time: how many are asked",
     "_LEVELS": "steps of a search",
     "_LEVEL_1": "discretisation of the search",

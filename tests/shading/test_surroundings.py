@@ -98,6 +98,25 @@ def test_that_nothing_is_there_is_measured(painted, noise):
     assert found.trend(True).max() < noise
 
 
+def test_what_is_too_dark_in_one_channel_shines_in_the_others(painted):
+    rays, frames = painted
+    blue = np.float32([0.001, 0.002, 1.5])
+    folder = frames.image_paths[0].parent.parent / "blue"
+    folder.mkdir()
+    for i, path in enumerate(frames.image_paths):
+        camera = frames.camera(i)
+        picture = read_exr(path).reshape(-1, 3)
+        picture[rays.closest(*camera.rays(camera.pixels())).face < 0] = blue
+        write_exr(folder / path.name, picture.reshape(camera.height, camera.width, 3))
+    paths = tuple(folder / path.name for path in frames.image_paths)
+    floor = np.full(len(frames), 0.01, np.float32)
+    frames = replace(frames, image_paths=paths, noise_floor_radiance=floor)
+    found = surroundings_from_frames(rays, frames, z_up=True)
+    assert found.coverage.measured.any()
+    assert not found.dark.any()
+    np.testing.assert_allclose(found.median(), blue, rtol=1e-3)
+
+
 def test_a_closed_room_shows_no_surroundings(tmp_path):
     made = make_capture(tmp_path / "capture")
     rays = RayScene(made.points, made.triangles)

@@ -13,7 +13,7 @@ from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.clipped_light import estimate_clipped_light
+from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
@@ -157,6 +157,16 @@ def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
     found = lamps_that_explain(surface, shown, CoverageMap.of(seen, clipped), FRAMES, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.25)
+
+
+def test_what_a_person_says_of_an_object_holds(hall):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    assert not len(lamps_that_explain(surface, lit, coverage, FRAMES, 0, {LAMP: False}).object)
+    clipped = surface.texels.object_index() == SHELF
+    coverage = CoverageMap.of(coverage.observed & ~clipped, clipped)
+    for shines in (True, False):
+        groups = clipped_groups(surface.texels, lit, coverage, {SHELF: shines})
+        assert groups.lamp.tolist() == [shines]
 
 
 def test_light_from_outside_that_is_inferred_and_such_lamps_are_not_told_apart(hall, monkeypatch):

@@ -83,11 +83,17 @@ class ClippedGroups:
         return Lamps(number[self.group], before, np.full(len(which), LAMP_PRIOR[1]))
 
 
-def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> ClippedGroups:
+def clipped_groups(
+    texels: Texels,
+    radiance: Float,
+    coverage: CoverageMap,
+    said: Mapping[int, bool] = MappingProxyType({}),
+) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
     of it; on others each connected part is one.
 
-    radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped.
+    radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
+    said     of objects whether they are lamps, where that is known
     """
     found: list[tuple[float, int, float, bool, Long]] = []
     measured, clipped = coverage.measured, coverage.clipped
@@ -107,6 +113,7 @@ def clipped_groups(texels: Texels, radiance: Float, coverage: CoverageMap) -> Cl
                 distance, _ = cKDTree(texels.position[part]).query(texels.position[around])
                 near = bright[around[distance < reach]]
                 lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
+            lamp = said.get(i, lamp)
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
     found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]
     group = np.full(len(texels), -1, np.int32)
@@ -173,9 +180,7 @@ def estimate_clipped_light(
 ) -> ClippedLight:
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known."""
-    groups = clipped_groups(surface.texels, lit, coverage)
-    known = [said.get(i, lamp) for i, lamp in zip(groups.object.tolist(), groups.lamp, strict=True)]
-    groups = replace(groups, lamp=np.array(known, np.bool_))
+    groups = clipped_groups(surface.texels, lit, coverage, said)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")

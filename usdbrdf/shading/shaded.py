@@ -331,11 +331,10 @@ def shade_surface(
     outside  the light from outside; None for none
     said     of objects, by number, whether they are lamps, where a person says so
     """
-    dark = [i for i, shines in said.items() if not shines]
     environment = outside.environment if outside else black_environment()
     # In the light of what it may be that no frame shows.
     unseen = estimate_unseen_lamps(
-        run, surface, lit, coverage, frames, outside, sampling.seed, dark
+        run, surface, lit, coverage, frames, outside, sampling.seed, said
     )
     lit = unseen.with_light(surface.texels, lit)
     light = estimate_clipped_light(

@@ -31,6 +31,8 @@ _STRIDE = 8
 _LEAST_OUTSIDE = calibration.number("outside.least_seen")
 _BLANK = calibration.number("outside.blank")
 _QUANTILE = 0.5
+_CLEARLY = 2.0  # times the noise floor; it is some deviations of the noise already
+_LEAST_FLOOR = 1e-12  # W/(m^2 sr), so that frames without noise weigh something finite
 _LEAST_SKY = calibration.number("outside.least_sky")
 _SLOPE = calibration.pair("outside.sky_slope")
 _SCATTER = calibration.number("outside.sky_scatter")
@@ -40,8 +42,9 @@ _STEPS = 3
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
     """Of D = HEIGHT x WIDTH directions: radiance (D, 3) float32, W/(m^2 sr), the median of what
-    frames measured, the mean where all are too dark for that, what saturates them where all clip, 0
-    elsewhere; the coverage; and dark (D,), where they measured that hardly anything is there."""
+    frames measured, the mean where all are too dark for that in some channel, what saturates them
+    where all clip, 0 elsewhere; the coverage; and dark (D,), where they measured that hardly
+    anything is there."""
 
     radiance: Float
     coverage: CoverageMap
@@ -113,6 +116,7 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
     state = QuantileState.empty(HEIGHT * WIDTH)
     saturates = np.zeros(HEIGHT * WIDTH, np.float32)
     darkness, weight = np.zeros((HEIGHT * WIDTH, 3)), np.zeros(HEIGHT * WIDTH)
+    floor = np.zeros(HEIGHT * WIDTH)
     num_dark, num_blank = 0, 0
     looking = np.flatnonzero(shares > 0).tolist()
     images = read_frames(partial(read_frame, frames), looking)
@@ -121,7 +125,8 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
         psquare.update(state, seen.direction, seen.radiance, _QUANTILE)
         limit = np.float32(frames.saturation_radiance[i])
         saturates[seen.clipped] = np.maximum(saturates[seen.clipped], limit)
-        own = float(frames.noise_floor_radiance[i]) ** -2.0 if len(seen.dark) else 0.0
+        floor[seen.dark] = np.maximum(floor[seen.dark], frames.noise_floor_radiance[i])
+        own = max(float(frames.noise_floor_radiance[i]), _LEAST_FLOOR) ** -2.0
         darkness[seen.dark] += own * seen.darkness
         weight[seen.dark] += own
         num_dark += len(seen.dark)
@@ -129,8 +134,10 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
     measured = state.samples > 0
     dark = ~measured & (weight > 0) & (saturates == 0) & (num_blank < _BLANK * num_dark)
     found = np.where(measured[:, None], psquare.quantile(state, _QUANTILE), saturates[:, None])
-    found[dark] = darkness[dark] / weight[dark, None]
+    found[dark] = np.maximum(darkness[dark] / weight[dark, None], 0)
     measured |= dark
+    # Where only some channels are too dark, as in a deep blue, it shines.
+    dark &= found.max(axis=1) < _CLEARLY * floor
     return Surroundings(
         radiance=found.astype(np.float32),
         coverage=CoverageMap.of(measured, ~measured & (saturates > 0)),

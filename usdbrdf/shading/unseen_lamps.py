@@ -10,8 +10,9 @@ from lamps that no frame shows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -90,13 +91,13 @@ def estimate_unseen_lamps(
     frames: Frames,
     outside: Outside | None,
     seed: int,
-    dark: Sequence[int] = (),
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> UnseenLamps:
-    """Of a scan with the radiance ``lit`` (T, 3), before what is known of what lies ``outside``;
-    the objects ``dark`` are none."""
+    """Of a scan with the radiance ``lit`` (T, 3), before what is known of what lies ``outside``.
+    said: of objects whether they are lamps, where that is known."""
 
     def compute() -> dict[str, Array]:
-        found = lamps_that_explain(surface, lit, coverage, frames, seed, dark, outside)
+        found = lamps_that_explain(surface, lit, coverage, frames, seed, said, outside)
         return dict(vars(found))
 
     found = UnseenLamps(**run.checkpoint("unseen", compute))
@@ -111,11 +112,11 @@ def lamps_that_explain(
     coverage: CoverageMap,
     frames: Frames,
     seed: int,
-    dark: Sequence[int] = (),
+    said: Mapping[int, bool] = MappingProxyType({}),
     outside: Outside | None = None,
 ) -> UnseenLamps:
     """The unseen objects that must shine for plain surfaces to be plain, without those that are
-    known to be ``dark``."""
+    said to be none."""
     texels = surface.texels
     owner = texels.object_index()
     area, observed = (
@@ -123,7 +124,7 @@ def lamps_that_explain(
         for weights in (texels.area, texels.area * coverage.observed)
     )
     seen = observed / np.maximum(area, 1e-12)
-    seen[list(dark)] = 1.0
+    seen[[i for i, shines in said.items() if not shines]] = 1.0
     asked = asked_texels(texels, lit, coverage, seed)
     if asked is None or not (seen < _UNSEEN).any():
         return UnseenLamps.none()
@@ -135,7 +136,7 @@ def lamps_that_explain(
     candidates = candidates[brings[candidates] > _LEAST_SHARE * np.pi]
     if not len(candidates):
         return UnseenLamps.none()
-    groups = clipped_groups(texels, lit, coverage)
+    groups = clipped_groups(texels, lit, coverage, said)
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     environment = outside.environment if outside else black_environment()
     lamps = _unknown(texels, asked, candidates, groups)

@@ -44,6 +44,9 @@ _MARGIN = calibration.number("patterns.margin")
 _STEPS, _SMALLEST = 16, 1 / 64
 # Halves of the frames of which one has less than a twentieth of the weight say nothing of noise.
 _LEAST_EQUAL = 0.05 * 0.95
+# Frames are dealt to the halves by multiples of the golden ratio: no exposures or cameras of a rig
+# that take turns go along with these.
+_GOLDEN = (1 + 5**0.5) / 2
 # Rows of texels beside a group that what becomes of it depends on, of whose steps again what both
 # halves of the frames contradict each other on.
 ROWS_BESIDE = _APART * (2 * _STEPS + 2)
@@ -52,8 +55,8 @@ ROWS_BESIDE = _APART * (2 * _STEPS + 2)
 class Equations(NamedTuple):
     """Least squares for T texels, of all pixels so far.
 
-    coupling  (2, T, 41) float32, B^T W B of each texel and those of _BESIDE: of every other frame
-              and of the frames between them
+    coupling  (2, T, 41) float32, B^T W B of each texel and those of _BESIDE: of either half of
+              the frames
     pull      (2, T, 3) float32, B^T W r
     squares   (T,) float32, sum w r^2, mean of the channels; pixels (T,), how many
     """
@@ -262,7 +265,7 @@ def with_patterns(
         whole = with_rows_beside(texels, part, ROWS_BESIDE)
         equations = Equations.empty(whole.stop - whole.start)
         for frame, some in enumerate(pixels()):
-            add(equations, whole.start, surface, some, frame % 2)
+            add(equations, whole.start, surface, some, int(_GOLDEN * frame) % 2)
         found = steps(equations, whole, surface, level[whole], seed)
         inner = slice(part.start - whole.start, part.stop - whole.start)
         return {name: array[inner].copy() for name, array in found.items()}
