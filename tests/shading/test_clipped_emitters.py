@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.shading.clipped_emitters import LAMP_PRIOR, Evidence, estimate_clipped_emitters
+from usdbrdf.shading.clipped_emitters import (
+    LAMP_PRIOR,
+    EstimatedRadiance,
+    Evidence,
+    estimate_clipped_emitters,
+)
 
 ROOM = np.array([4.0, 3.0, 2.5])
 LAMPS = np.array([[1.0, 1.0, 2.0], [3.2, 2.2, 1.6]])
@@ -66,6 +71,7 @@ def _evidence(
         segment=wall,
         object=wall,
         prior=np.array([LAMP_PRIOR] * len(lamps)),
+        shines=np.ones(len(lamps), np.bool_),
     )
 
 
@@ -73,7 +79,9 @@ def test_exact_light_gives_the_exact_lamps():
     found = estimate_clipped_emitters(_evidence())
     np.testing.assert_allclose(found.multiplier, MULTIPLIER, rtol=0.005)
     assert found.determined.all()
-    assert found.standard_error.max() < 0.06
+    # One wall tells most of the first one; nothing but the stated error of such a lamp is left.
+    assert found.standard_error.max() < 0.16
+    assert found.standard_error.min() < 0.06
 
 
 @pytest.mark.parametrize(
@@ -121,6 +129,34 @@ def test_lamps_at_one_place_are_not_told_apart():
     assert not found.determined.any()
     # Their sum is known all the same.
     np.testing.assert_allclose(found.multiplier.sum(axis=0), MULTIPLIER.sum(axis=0), rtol=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_wall_alone_tells_a_spot_lamp(seed):
+    """That without this wall nothing is known is no error of it; a surface that may be lit so is
+    held to what the others say."""
+    evidence = _evidence(seed, noise=0.03, lamps=LAMPS[:1])
+    of_wall = (evidence.object == 0)[None, :, None]
+    cast = np.where(of_wall, evidence.lamp_irradiance, 1e-4 * evidence.lamp_irradiance)
+    before = evidence.irradiance + MULTIPLIER[0] * evidence.lamp_irradiance[0]
+    radiance = evidence.radiance * (evidence.irradiance + 60 * cast[0]) / before
+    spot = replace(evidence, lamp_irradiance=np.float32(cast), radiance=np.float32(radiance))
+    found = estimate_clipped_emitters(spot)
+    assert found.determined.all()
+    assert (np.abs(np.log(found.multiplier / 60)) < 2 * found.standard_error).all()
+    assert (found.standard_error > 0.15).all()
+    wall = estimate_clipped_emitters(replace(spot, shines=np.zeros(1, np.bool_)))
+    assert not wall.determined.any()
+
+
+def test_an_uncertain_lamp_exceeds_what_is_one_error_below():
+    found = EstimatedRadiance(
+        multiplier=np.array([[80.0, 60.0, 40.0], [4.0, 3.0, 2.0], [5.0, 5.0, 5.0]]),
+        standard_error=np.array([[1.0, 1.0, 1.0], [1.5, 1.5, 1.5], [np.inf] * 3]),
+        determined=np.zeros(3, np.bool_),
+    )
+    expected = np.array([[80 / np.e, 60 / np.e, 40 / np.e], [1, 1, 1], [1, 1, 1]])
+    np.testing.assert_allclose(found.least(), expected)
 
 
 def test_a_lamp_darker_than_its_bound_is_not_believed():

@@ -123,6 +123,7 @@ class Evidence:
     segment         (N,) int32, equal where the albedo may be taken as alike
     object          (N,) int32, equal where errors may agree beyond the segment
     prior           (K, 2) float64, mean and standard deviation of log g_k before the evidence
+    shines          (K,) bool: it is a lamp for certain, and no surface that is lit brightly
     """
 
     radiance: Float
@@ -132,6 +133,7 @@ class Evidence:
     segment: Int
     object: Int
     prior: Double
+    shines: Bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +224,7 @@ MAX_ERROR = calibration.number("lamps.max_error")
 LEAST_ERROR = calibration.number("lamps.least_error")
 _FEW_OBJECTS = calibration.count("lamps.few_objects")
 _STUDENT_FREEDOM = calibration.number("lamps.student_freedom")
+ALONE, ERROR_ALONE = calibration.pair("lamps.alone")
 _ROUNDS = 6
 _STEPS = 30
 LAMP_PRIOR = calibration.pair("lamps.prior")
@@ -238,6 +241,16 @@ class EstimatedRadiance:
     multiplier: Double
     standard_error: Double
     determined: Bool
+
+    def least(self) -> Double:
+        """(K, 3): a multiplier that each lamp exceeds by all likelihood, one standard error below
+        the estimate; 1, its bound, where the evidence says no more."""
+        brightest, index = self.multiplier.max(axis=1), self.multiplier.argmax(axis=1)
+        below = np.exp(-self.standard_error[np.arange(len(index)), index])
+        held: Double = np.where(
+            (brightest * below > 1)[:, None], self.multiplier * below[:, None], 1.0
+        )
+        return held
 
 
 def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
@@ -257,7 +270,7 @@ def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
         shape = _likeliest(evidence, segments, shape, log_g)
     weighed = _weighed(segments, shape)
     log_g = _solve(evidence, weighed, log_g)
-    error = _standard_error(evidence, weighed, log_g)
+    error = _standard_error(evidence, weighed, log_g, shape)
     brightest, channel = log_g.max(axis=1), log_g.argmax(axis=1)
     possible = brightest > -2 * error[np.arange(lamps), channel]
     return EstimatedRadiance(
@@ -345,7 +358,9 @@ def _likeliest(evidence: Evidence, segments: list[Segment], shape: Double, log_g
     return np.asarray(found.x)
 
 
-def _standard_error(evidence: Evidence, weighed: list[Weighed], log_g: Double) -> Double:
+def _standard_error(
+    evidence: Evidence, weighed: list[Weighed], log_g: Double, shape: Double
+) -> Double:
     """(K, 3), of log g."""
     segments = [item for item, _ in weighed]
     parts = [normal_equations(evidence, item, weight, log_g) for item, weight in weighed]
@@ -354,18 +369,14 @@ def _standard_error(evidence: Evidence, weighed: list[Weighed], log_g: Double) -
     misfit = np.asarray(sum(part[2] for part in parts)) / max(count - len(log_g), 1)
     inverse = np.linalg.inv(whole)
     curved = np.sqrt(np.einsum("ckk->kc", inverse) * np.maximum(misfit, 1))
-    # And if objects (segments where they are few) err as a whole: without one of these blocks the
-    # solution would move by (H - H_block)^-1 gradient_block.
-    owner = np.array([item.object for item in segments])
-    if len(np.unique(owner)) < _FEW_OBJECTS:
-        owner = np.arange(len(segments))
-    moved, blocks = np.zeros((whole.shape[1], 3)), np.unique(owner)
-    for block in blocks:
-        own = [part for part, number in zip(parts, owner, strict=True) if number == block]
-        curvature = whole - np.asarray(sum(part[0] for part in own))
-        gradient = np.asarray(sum(part[1] for part in own))
-        moved += np.linalg.solve(curvature, gradient[..., None])[..., 0].T ** 2
-    jackknife = np.sqrt((1 - 1 / len(blocks)) * moved)
+    # And if what each block of the evidence brings errs as a whole: without it the solution would
+    # move by (H - H_block)^-1 gradient_block.
+    blocks, alone = _blocks(evidence, segments, parts, log_g, shape)
+    moved = sum(
+        np.linalg.solve(whole - curvature, gradient[..., None])[..., 0].T ** 2
+        for curvature, gradient in blocks
+    )
+    jackknife = np.sqrt((1 - 1 / len(blocks)) * np.asarray(moved))
     # And with more ambient specular light everywhere:
     pull = sum(
         np.einsum("knc,nm,m->ck", lamp_share(evidence, item, log_g), weight, item.ambient)
@@ -373,4 +384,67 @@ def _standard_error(evidence: Evidence, weighed: list[Weighed], log_g: Double) -
     )
     ambient = np.einsum("ckl,cl->kc", inverse, pull)
     whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + LEAST_ERROR**2
+    whole_error += (ERROR_ALONE * alone[:, None]) ** 2
     return np.asarray(np.sqrt(whole_error))
+
+
+def _blocks(
+    evidence: Evidence,
+    segments: list[Segment],
+    parts: list[tuple[Double, Double, Double]],
+    log_g: Double,
+    shape: Double,
+) -> tuple[list[tuple[Double, Double]], Double]:
+    """Curvature (3, K, K) and gradient (3, K) that goes with each object, or with each segment
+    where objects are few. Of one that tells a lamp alone, parts beside each other are blocks:
+    without all of it nothing would be known, which is no measure of how far it errs. And what
+    share of all that is known of these lamps it tells, (K,), 0 of others."""
+    owner = np.array([item.object for item in segments])
+    if len(np.unique(owner)) < _FEW_OBJECTS:
+        owner = np.arange(len(segments))
+    told = np.array([np.einsum("ckk->k", part[0]) for part in parts])
+    share = told / np.maximum(told.sum(axis=0), 1e-300)
+    alone = (share > ALONE) & evidence.shines
+    blocks = []
+    for number in np.unique(owner):
+        own = np.flatnonzero(owner == number)
+        whole = [
+            np.asarray(sum(parts[i][side] for i in own if not alone[i].any())) for side in (0, 1)
+        ]
+        if whole[0].ndim:
+            blocks.append((whole[0], whole[1]))
+        for i in own[alone[own].any(axis=1)]:
+            for kept in _without_parts(evidence.position[segments[i].index]):
+                less = _some_of(segments[i], kept)
+                weight = weight_without_mean(segment_covariance(less, shape))
+                left = normal_equations(evidence, less, weight, log_g)
+                blocks.append((parts[i][0] - left[0], parts[i][1] - left[1]))
+    return blocks, np.asarray((share * alone).sum(axis=0))
+
+
+def _without_parts(position: Float) -> list[Bool]:
+    """Of points (n, 3): those outside of each of eight parts beside each other, which are halved
+    along their widest side three times."""
+    parts = [np.arange(len(position))]
+    for _ in range(3):
+        halves = []
+        for part in parts:
+            along = position[part, int(np.ptp(position[part], axis=0).argmax())]
+            order = part[np.argsort(along, kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        parts = [part for part in halves if len(part)]
+    kept = np.ones((len(parts), len(position)), np.bool_)
+    for own, part in zip(kept, parts, strict=True):
+        own[part] = False
+    return list(kept)
+
+
+def _some_of(item: Segment, kept: Bool) -> Segment:
+    return replace(
+        item,
+        index=item.index[kept],
+        observed=item.observed[kept],
+        ambient=item.ambient[kept],
+        distance=item.distance[np.ix_(kept, kept)],
+        variance=item.variance[kept],
+    )

@@ -80,7 +80,8 @@ class ClippedGroups:
         number[which] = np.arange(len(which))
         bound = np.log(self.bound[which].astype(np.float64))
         before = np.tile(bound[:, None] + LAMP_PRIOR[0], (1, 3))
-        return Lamps(number[self.group], before, np.full(len(which), LAMP_PRIOR[1]))
+        deviation = np.full(len(which), LAMP_PRIOR[1])
+        return Lamps(number[self.group], before, deviation, self.lamp[which])
 
 
 def clipped_groups(
@@ -207,8 +208,10 @@ def estimate_clipped_light(
 
 def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
     lit = lit.copy()
-    for k in np.flatnonzero(estimate.determined):
-        lit[groups.group == k] = groups.bound[k] * estimate.multiplier[k]
+    least = estimate.least()
+    for k in np.flatnonzero(estimate.determined | groups.lamp):
+        told = estimate.multiplier[k] if estimate.determined[k] else least[k]
+        lit[groups.group == k] = groups.bound[k] * told
     return lit
 
 
@@ -222,9 +225,11 @@ def _told_by_even_light(
     first: EstimatedRadiance,
     seed: int,
 ) -> EstimatedRadiance:
-    """The estimate with those of its lamps that are determined looked at closely; where these say
-    too little of a lamp, or that it is darker than its bound, the ``first`` one."""
-    lamps = np.flatnonzero(groups.lamp & first.determined)[:_CLOSELY]
+    """The estimate with those of its lamps looked at closely, all together, that exceed their
+    bounds; where that says too little of a lamp, or that it is darker than its bound, the
+    ``first`` one."""
+    told = first.determined | (first.least() > 1).any(axis=1)
+    lamps = np.flatnonzero(groups.lamp & told)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if not len(lamps) or asked is None:
         return first
@@ -248,11 +253,15 @@ def _told_by_even_light(
     brightest = multiplier.max(axis=1)
     better = (error <= MAX_ERROR) & (np.log(brightest) > -2 * error)
     estimate = replace(
-        first, multiplier=first.multiplier.copy(), standard_error=first.standard_error.copy()
+        first,
+        multiplier=first.multiplier.copy(),
+        standard_error=first.standard_error.copy(),
+        determined=first.determined.copy(),
     )
     held = multiplier / np.minimum(brightest, 1)[:, None]
     estimate.multiplier[lamps[better]] = held[better]
     estimate.standard_error[lamps[better]] = error[better, None]
+    estimate.determined[lamps[better]] = True
     return estimate
 
 
@@ -307,4 +316,5 @@ def _evidence(
         segment=segment,
         object=texels.object_index()[chosen].astype(np.int32),
         prior=np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in groups.lamp]),
+        shines=groups.lamp,
     )

@@ -18,7 +18,14 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import Sampling
 from usdbrdf.shading.asked import CLOSELY, LEAST_OF_SEGMENT, Shining, irradiance_of_texels
 from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
-from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, jackknife, solved
+from usdbrdf.shading.outside_light import (
+    Asked,
+    Sources,
+    gloss_of_scene,
+    jackknife,
+    pull_of_prior,
+    solved,
+)
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -33,12 +40,14 @@ _LEAST_EVEN = calibration.number("unseen.least_even")
 
 
 class Lamps(NamedTuple):
-    """K lamps: of (T,) int32, the number of each texel's, -1 for none; and the logarithm of their
-    radiance before the evidence, mean (K, 3) and deviation (K,)."""
+    """K lamps: of (T,) int32, the number of each texel's, -1 for none; the logarithm of their
+    radiance before the evidence, mean (K, 3) and deviation (K,); and which are lamps for certain,
+    (K,)."""
 
     of: Int
     mean: Double
     deviation: Double
+    certain: Bool
 
 
 class Strengths(NamedTuple):
@@ -77,7 +86,7 @@ def looked_at_closely(
         for k, light in enumerate(_alone(lamps))
     ]
     sources = sources_of(lamps, share)
-    return strengths(asked, gloss_of_scene(asked, sources, np.stack(sent_on)))
+    return strengths(asked, gloss_of_scene(asked, sources, np.stack(sent_on)), lamps.certain)
 
 
 def beside_lamps(
@@ -102,10 +111,12 @@ def sources_of(lamps: Lamps, share: Double) -> Sources:
     )
 
 
-def strengths(asked: Asked, sources: Sources) -> Strengths:
-    """Those that explain best what the texels reflect."""
+def strengths(asked: Asked, sources: Sources, certain: Bool) -> Strengths:
+    """Those that explain best what the texels reflect; ``certain`` (K,) as of ``Lamps``."""
     found = solved(asked, sources)
-    error = jackknife(asked, sources, found).max(axis=1)
+    error = np.hypot(
+        jackknife(asked, sources, found, certain), pull_of_prior(asked, sources, found)
+    ).max(axis=1)
     light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
     radiance = np.exp(found.log_radiance)
     lights = np.maximum(sources.share.sum(axis=1), 1e-12)

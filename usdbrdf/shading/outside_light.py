@@ -22,6 +22,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
+from usdbrdf.shading.clipped_emitters import ALONE, ERROR_ALONE
 
 
 class Asked(NamedTuple):
@@ -299,14 +300,26 @@ def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
 
 _BRIGHTEST, _STEPS, _LAMP = 4.0, 57, 3.0
 _BLOCKS = 10
+# Parts of what tells a source alone.
+_PARTS = 8
 
 
-def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
+def jackknife(
+    asked: Asked, sources: Sources, found: Solution, certain: Bool | None = None
+) -> Double:
     """(K, 3) standard errors of the logarithms, if objects (segments where they are few) err as a
-    whole; infinite where there is but one."""
+    whole; infinite where there is but one.
+
+    certain  (K,): sources that shine for certain, so that only how much is asked. What tells one of
+             these alone errs by parts, and as a whole by lamps.alone
+    """
     few = len(np.unique(asked.owner)) < _BLOCKS
     _, block = np.unique(asked.segment if few else asked.owner, return_inverse=True)
     block %= _BLOCKS
+    error = np.zeros_like(found.log_radiance)
+    if certain is not None and certain.any():
+        block, alone = _in_parts(asked, block, certain[:, None] * _told(asked, sources, found))
+        error += ERROR_ALONE * alone[:, None]
     moved, blocks = np.zeros_like(found.log_radiance), np.unique(block)
     if len(blocks) < 2:
         return np.full_like(found.log_radiance, np.inf)
@@ -316,4 +329,49 @@ def jackknife(asked: Asked, sources: Sources, found: Solution) -> Double:
         start = found._replace(log_albedo=found.log_albedo[numbers], gloss=found.gloss[numbers])
         part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
         moved += (part.log_radiance - found.log_radiance) ** 2
-    return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))
+    return np.hypot(error, np.sqrt((1 - 1 / len(blocks)) * moved))
+
+
+def pull_of_prior(asked: Asked, sources: Sources, found: Solution) -> Double:
+    """(K, 3): how far the logarithms would be off if what was thought of the sources before the
+    evidence were wrong by its own deviation. Next to nothing for what texels tell."""
+    otherwise = sources._replace(mean=sources.mean + sources.deviation[:, None])
+    off: Double = np.abs(solved(asked, otherwise, found, 8).log_radiance - found.log_radiance)
+    return off
+
+
+def _told(asked: Asked, sources: Sources, found: Solution) -> Double:
+    """(K, N): how much each texel adds to what is known of the logarithm of a source's strength,
+    where the albedo of its segment is free."""
+    light = asked.irradiance + sources.irradiance(found.log_radiance)
+    brought = sources.share * np.exp(found.log_radiance).mean(axis=1)[:, None]
+    part = brought / light.mean(axis=1)
+    residual = np.log(asked.reflected / light).mean(axis=1)
+    number = int(asked.segment.max()) + 1
+    size = np.maximum(np.bincount(asked.segment, minlength=number), 1)
+    residual -= (np.bincount(asked.segment, residual, number) / size)[asked.segment]
+    noise = _noise_of_segments(asked, residual, number)
+    precision = np.minimum(1, _INDEPENDENT / size) / noise**2
+    told: Double = np.empty_like(part)
+    for k, own in enumerate(part):
+        mean = np.bincount(asked.segment, own, number) / size
+        told[k] = (own - mean[asked.segment]) ** 2 * precision[asked.segment]
+    return told
+
+
+def _in_parts(asked: Asked, block: Long, told: Double) -> tuple[Long, Double]:
+    """The blocks (N,), of which those that bring most of what is ``told`` (K, N) of a source are
+    taken apart: texels of a segment with numbers next to each other lie together. And what
+    share of a source's that is, (K,), 0 where it is not most."""
+    block, alone = block.copy(), np.zeros(len(told))
+    whole = np.maximum(told.sum(axis=1), 1e-300)
+    for one in np.unique(block):
+        own = np.flatnonzero(block == one)
+        share = told[:, own].sum(axis=1) / whole
+        alone = np.where(share > ALONE, share, alone)
+        if (share > ALONE).any():
+            order = own[np.lexsort((asked.texel[own], asked.segment[own]))]
+            size = np.bincount(asked.segment[order], minlength=int(asked.segment.max()) + 1)
+            place = np.arange(len(order)) - (np.cumsum(size) - size)[asked.segment[order]]
+            block[order] = block.max() + 1 + place * _PARTS // size[asked.segment[order]]
+    return block, alone

@@ -143,7 +143,7 @@ def lamps_that_explain(
     asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
     roughly = brought(surface, lamps, asked.texel, seed, ROUGHLY)
     # Errors of what a lamp brings draw its strength to nothing: this only says which may be one.
-    found, error, near, part = strengths(asked, sources_of(lamps, roughly))
+    found, error, near, part = strengths(asked, sources_of(lamps, roughly), lamps.certain)
     likely = np.where((np.pi * found.mean(axis=1) > near) & (error < 1), part, 0)
     likely = likely[: len(candidates)]
     likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
@@ -197,4 +197,5 @@ def _unknown(texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups)
         np.where(clipped.of >= 0, clipped.of + len(objects), number[texels.object_index()]),
         np.concatenate([np.tile(usual, (len(objects), 1)), clipped.mean]),
         np.concatenate([np.full(len(objects), _DEVIATION), clipped.deviation]),
+        np.concatenate([np.zeros(len(objects), np.bool_), clipped.certain]),
     )
