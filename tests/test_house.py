@@ -239,6 +239,7 @@ ENGINEERING: dict[str, str] = {
     "_LEAK": "geometry: texels that pixels may mix",
     "_LEAST": "numerics",
     "_LEAST_EQUAL": "numerics: of a quotient",
+    "_ABOVE_FLOOR": "engineering: deviations of the noise that no direction exceeds by chance",
     "_LEAST_FLOOR": "numerics: of a quotient",
     "_LEAST_OF_SEGMENT": "time: how many are asked",
     "_LEVELS": "steps of a search",

@@ -112,6 +112,11 @@ def test_no_two_triangles_share_a_texel_centre(unwrapped):
         assert taken.max() == 1
 
 
+def _separate(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and triangles of corners (F, 3, 3)."""
+    return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+
+
 @pytest.mark.parametrize("nonsense", [25.9, -0.5, np.nan])
 def test_a_sliver_that_xatlas_lost_lies_at_its_neighbour(nonsense):
     corners = np.float32([
@@ -120,7 +125,7 @@ def test_a_sliver_that_xatlas_lost_lies_at_its_neighbour(nonsense):
     ])  # fmt: skip
     uv = corners[..., :2] * 0.5
     uv[2, 1] = nonsense
-    mended = beside_neighbours(uv, corners)
+    mended = beside_neighbours(uv, *_separate(corners))
     np.testing.assert_array_equal(mended[:2], uv[:2])
     np.testing.assert_array_equal(mended[2], np.broadcast_to(uv[1, 1], (3, 2)))
 
@@ -129,7 +134,7 @@ def test_no_triangle_that_holds_texels_may_be_lost():
     corners = np.float32([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]])
     uv = corners[..., :2] * 0.5
     uv[1] = 25.9
-    assert beside_neighbours(uv, corners) is None
+    assert beside_neighbours(uv, *_separate(corners)) is None
 
 
 @pytest.mark.fault("G7")

@@ -287,29 +287,28 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
         atlas, corners, uv = _at_own_densities(atlas, points, triangles, sizes, options)
     width, height = int(atlas.width), int(atlas.height)
     if corners.shape == triangles.shape and min(width, height) > 0:
-        corner_uv = beside_neighbours(uv[corners], points[triangles])
+        corner_uv = beside_neighbours(uv[corners], points, triangles)
         if corner_uv is not None:
             corner_uv[..., 1] = 1 - corner_uv[..., 1]
             return corner_uv, (width, height)
     return pack_triangles_singly(points[triangles], finest)
 
 
-def beside_neighbours(corner_uv: Float, corners: Float) -> Float | None:
+def beside_neighbours(corner_uv: Float, points: Float, triangles: Int) -> Float | None:
     """The coordinates with those of lost triangles, which lie outside [0, 1], shrunk to a point of
     the nearest triangle that has its own; None where more than slivers are lost.
 
     xatlas drops single triangles thinner than its tolerance, and leaves nonsense in their place.
 
-    corner_uv (F, 3, 2); corners (F, 3, 3), metres
+    corner_uv (F, 3, 2); points (P, 3), metres; triangles (F, 3)
     """
     kept = (np.isfinite(corner_uv) & (corner_uv >= 0) & (corner_uv <= 1)).all(axis=(1, 2))
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = doubled_areas(points, triangles)
     if area[~kept].sum() > _MAX_LOST * area.sum() or not kept.any():
         return None
     mended = corner_uv.astype(np.float32)
     if not kept.all():
+        corners = points[triangles]
         _, nearest = cKDTree(corners[kept].reshape(-1, 3)).query(corners[~kept].mean(axis=1))
         mended[~kept] = corner_uv[kept].reshape(-1, 2)[nearest][:, None]
     return mended

@@ -225,9 +225,9 @@ def _told_by_even_light(
     first: EstimatedRadiance,
     seed: int,
 ) -> EstimatedRadiance:
-    """The estimate with those of its lamps looked at closely, all together, that exceed their
-    bounds; where that says too little of a lamp, or that it is darker than its bound, the
-    ``first`` one."""
+    """The estimate with those of its lamps looked at closely, all together, that are
+    determined or exceed their bounds; where that says too little of a lamp, or that it is darker
+    than its bound, the ``first`` one."""
     told = first.determined | (first.least() > 1).any(axis=1)
     lamps = np.flatnonzero(groups.lamp & told)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)

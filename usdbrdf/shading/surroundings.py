@@ -31,7 +31,7 @@ _STRIDE = 8
 _LEAST_OUTSIDE = calibration.number("outside.least_seen")
 _BLANK = calibration.number("outside.blank")
 _QUANTILE = 0.5
-_CLEARLY = 2.0  # times the noise floor; it is some deviations of the noise already
+_ABOVE_FLOOR = 2.0  # times the noise floor; it is some deviations of the noise already
 _LEAST_FLOOR = 1e-12  # W/(m^2 sr), so that frames without noise weigh something finite
 _LEAST_SKY = calibration.number("outside.least_sky")
 _SLOPE = calibration.pair("outside.sky_slope")
@@ -137,7 +137,7 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
     found[dark] = np.maximum(darkness[dark] / weight[dark, None], 0)
     measured |= dark
     # Where only some channels are too dark, as in a deep blue, it shines.
-    dark &= found.max(axis=1) < _CLEARLY * floor
+    dark &= found.max(axis=1) < _ABOVE_FLOOR * floor
     return Surroundings(
         radiance=found.astype(np.float32),
         coverage=CoverageMap.of(measured, ~measured & (saturates > 0)),

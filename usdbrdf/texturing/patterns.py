@@ -44,8 +44,9 @@ _MARGIN = calibration.number("patterns.margin")
 _STEPS, _SMALLEST = 16, 1 / 64
 # Halves of the frames of which one has less than a twentieth of the weight say nothing of noise.
 _LEAST_EQUAL = 0.05 * 0.95
-# Frames are dealt to the halves by multiples of the golden ratio: no exposures or cameras of a rig
-# that take turns go along with these.
+# Frames are dealt to the halves by multiples of the golden ratio: two exposures or cameras of a rig
+# that take turns do not go along with these, as they do with every other frame; of five cameras
+# some lie mostly in one half.
 _GOLDEN = (1 + 5**0.5) / 2
 # Rows of texels beside a group that what becomes of it depends on, of whose steps again what both
 # halves of the frames contradict each other on.
