@@ -117,24 +117,36 @@ def _separate(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
 
 
+_TEXEL = np.full(3, 0.01)
+
+
 @pytest.mark.parametrize("nonsense", [25.9, -0.5, np.nan])
 def test_a_sliver_that_xatlas_lost_lies_at_its_neighbour(nonsense):
     corners = np.float32([
         [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]],
         [[1, 1, 0], [1, 1.0002, 0], [1, 0, 0]],
     ])  # fmt: skip
-    uv = corners[..., :2] * 0.5
+    uv = corners[..., :2] * 0.5 + 0.1
     uv[2, 1] = nonsense
-    mended = beside_neighbours(uv, *_separate(corners))
+    mended = beside_neighbours(uv, *_separate(corners), _TEXEL)
     np.testing.assert_array_equal(mended[:2], uv[:2])
     np.testing.assert_array_equal(mended[2], np.broadcast_to(uv[1, 1], (3, 2)))
+    # Neither do all of its corners lie at the origin.
+    uv[2] = 0
+    np.testing.assert_array_equal(beside_neighbours(uv, *_separate(corners), _TEXEL), mended)
 
 
 def test_no_triangle_that_holds_texels_may_be_lost():
-    corners = np.float32([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]])
-    uv = corners[..., :2] * 0.5
-    uv[1] = 25.9
-    assert beside_neighbours(uv, *_separate(corners)) is None
+    corners = np.float32([
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        [[2, 0, 0], [2.02, 0, 0], [2, 0.02, 0]],
+    ])  # fmt: skip
+    uv = corners[..., :2] * 0.3
+    assert beside_neighbours(uv, *_separate(corners), _TEXEL) is not None
+    for lost in (1, 2):
+        some = uv.copy()
+        some[lost] = 25.9
+        assert beside_neighbours(some, *_separate(corners), _TEXEL) is None
 
 
 @pytest.mark.fault("G7")

@@ -12,7 +12,13 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
+from usdbrdf.shading.clipped_emitters import EstimatedRadiance
+from usdbrdf.shading.clipped_light import (
+    ClippedGroups,
+    ClippedLight,
+    _with_estimates,
+    estimate_clipped_light,
+)
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -95,3 +101,24 @@ def test_light_that_did_not_clip_stays_as_it_is(world: World, truth: np.ndarray,
     assert light.least_of_lamps() == 0
     assert np.isnan(light.error_of_object(6))
     assert not light.may_shine(nothing).any()
+
+
+def test_an_undetermined_lamp_stands_below_its_estimate_or_at_what_was_measured():
+    # Two lamps, and a wall that may be lit so; each of two texels, brighter than the bound or not.
+    group = np.repeat(np.arange(-1, 3, dtype=np.int32), 2)
+    groups = ClippedGroups(
+        group=group,
+        object=np.arange(3, dtype=np.int32),
+        bound=np.full((3, 3), 4.0, np.float32),
+        lamp=np.array([True, True, False]),
+    )
+    estimate = EstimatedRadiance(
+        multiplier=np.array([[60.0] * 3, [3.0] * 3, [60.0] * 3]),
+        standard_error=np.array([[0.9] * 3, [0.9] * 3, [0.9] * 3]),
+        determined=np.zeros(3, np.bool_),
+    )
+    lit = np.tile(np.float32([[4.0] * 3, [4.5] * 3]), (4, 1))
+    found = _with_estimates(lit, groups, estimate)
+    expected = lit.copy()
+    expected[2:4] = 4 * 60 * np.exp(-1.8)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)

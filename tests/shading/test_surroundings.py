@@ -98,10 +98,12 @@ def test_that_nothing_is_there_is_measured(painted, noise):
     assert found.trend(True).max() < noise
 
 
-def test_what_is_too_dark_in_one_channel_shines_in_the_others(painted):
+@pytest.mark.parametrize("floors", [[0.01], [0.01, 0.8]])
+def test_what_is_too_dark_in_one_channel_shines_in_the_others(painted, floors):
+    """Exposures that take turns: what the darker ones do not hold the others do."""
     rays, frames = painted
-    blue = np.float32([0.001, 0.002, 1.5])
-    folder = frames.image_paths[0].parent.parent / "blue"
+    blue = np.float32([0.001, 0.002, 1.5 if len(floors) == 1 else 0.4])
+    folder = frames.image_paths[0].parent.parent / f"blue_{len(floors)}"
     folder.mkdir()
     for i, path in enumerate(frames.image_paths):
         camera = frames.camera(i)
@@ -109,11 +111,14 @@ def test_what_is_too_dark_in_one_channel_shines_in_the_others(painted):
         picture[rays.closest(*camera.rays(camera.pixels())).face < 0] = blue
         write_exr(folder / path.name, picture.reshape(camera.height, camera.width, 3))
     paths = tuple(folder / path.name for path in frames.image_paths)
-    floor = np.full(len(frames), 0.01, np.float32)
+    floor = np.resize(np.float32(floors), len(frames))
     frames = replace(frames, image_paths=paths, noise_floor_radiance=floor)
     found = surroundings_from_frames(rays, frames, z_up=True)
     assert found.coverage.measured.any()
-    assert not found.dark.any()
+    fine = frames.at(np.flatnonzero(floor == np.float32(floors[0])).tolist())
+    seen = surroundings_from_frames(rays, fine, z_up=True).coverage.observed
+    assert seen.any()
+    assert not found.dark[seen].any()
     np.testing.assert_allclose(found.median(), blue, rtol=1e-3)
 
 

@@ -162,6 +162,8 @@ def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
 def test_what_a_person_says_of_an_object_holds(hall):
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
     assert not len(lamps_that_explain(surface, lit, coverage, FRAMES, 0, {LAMP: False}).object)
+    said = lamps_that_explain(surface, lit, coverage, FRAMES, 0, {LAMP: True})
+    assert said.object.tolist() == [LAMP]
     clipped = surface.texels.object_index() == SHELF
     coverage = CoverageMap.of(coverage.observed & ~clipped, clipped)
     for shines in (True, False):

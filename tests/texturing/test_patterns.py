@@ -21,6 +21,7 @@ from usdbrdf.texturing.patterns import (
     Equations,
     _couple,
     add,
+    half_of,
     share_that_is_no_noise,
     steps,
     with_patterns,
@@ -114,6 +115,14 @@ def _off(values: Float, truth: Float) -> float:
 def _seen(pattern: Float, noise: float = 0.01, count: int = 8) -> list[tuple[Camera, Picture]]:
     cameras = _cameras(count)
     return [(camera, _picture(camera, pattern, noise, k)) for k, camera in enumerate(cameras)]
+
+
+@pytest.mark.parametrize("period", range(2, 9))
+def test_halves_of_the_frames_keep_no_rhythm_of_the_capture(period: int):
+    half = np.array([half_of(frame) for frame in range(60)])
+    assert half.sum() == 30
+    for turn in range(period):
+        assert 0.15 <= half[turn::period].mean() <= 0.85
 
 
 def test_stripes_that_pixels_blur_come_back(floor: World, tmp_path: Path):

@@ -270,7 +270,8 @@ class ShadedObject(MeasuredObject):
         # All that versions have authored which knew no estimates.
         Fact(EMITTER, "lowerBound", "bool", False, """True where the emitter was clipped in every
             photograph and the light that it casts does not tell its radiance either: the true
-            radiance is at least the stated one. radianceStatus is lowerBound then.""",
+            radiance is in all likelihood at least the stated one. radianceStatus is lowerBound
+            then.""",
             stored=lambda status: status == "lowerBound",
             read=lambda bound: "lowerBound" if bound else "measured"),
     ]

@@ -36,8 +36,6 @@ _FACES_OF_CHILD = 2000
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
-# The share of an object's area that may go without texels of its own.
-_MAX_LOST = 1e-3
 
 
 def atlas_side(corner_uv: Float, corners: Float, texel_size: float) -> int | None:
@@ -287,28 +285,31 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
         atlas, corners, uv = _at_own_densities(atlas, points, triangles, sizes, options)
     width, height = int(atlas.width), int(atlas.height)
     if corners.shape == triangles.shape and min(width, height) > 0:
-        corner_uv = beside_neighbours(uv[corners], points, triangles)
+        corner_uv = beside_neighbours(uv[corners], points, triangles, sizes.side)
         if corner_uv is not None:
             corner_uv[..., 1] = 1 - corner_uv[..., 1]
             return corner_uv, (width, height)
     return pack_triangles_singly(points[triangles], finest)
 
 
-def beside_neighbours(corner_uv: Float, points: Float, triangles: Int) -> Float | None:
-    """The coordinates with those of lost triangles, which lie outside [0, 1], shrunk to a point of
-    the nearest triangle that has its own; None where more than slivers are lost.
+def beside_neighbours(corner_uv: Float, points: Float, triangles: Int, side: Float) -> Float | None:
+    """The coordinates with those of lost triangles shrunk to a point of one nearby that has its
+    own; None if one is lost that is no sliver, thinner than its texels are wide.
 
-    xatlas drops single triangles thinner than its tolerance, and leaves nonsense in their place.
+    xatlas drops single triangles thinner than its tolerance, and leaves in their place the origin,
+    or after it packed charts again what lies outside [0, 1].
 
-    corner_uv (F, 3, 2); points (P, 3), metres; triangles (F, 3)
+    corner_uv (F, 3, 2); points (P, 3) and side (F,) of the texels, metres; triangles (F, 3)
     """
-    kept = (np.isfinite(corner_uv) & (corner_uv >= 0) & (corner_uv <= 1)).all(axis=(1, 2))
-    area = doubled_areas(points, triangles)
-    if area[~kept].sum() > _MAX_LOST * area.sum() or not kept.any():
+    fits = (np.isfinite(corner_uv) & (corner_uv >= 0) & (corner_uv <= 1)).all(axis=(1, 2))
+    corners = points[triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    sliver = doubled_areas(points, triangles) <= longest * side
+    kept = fits & corner_uv.any(axis=(1, 2))
+    if not (fits | sliver).all() or not kept.any():
         return None
     mended = corner_uv.astype(np.float32)
     if not kept.all():
-        corners = points[triangles]
         _, nearest = cKDTree(corners[kept].reshape(-1, 3)).query(corners[~kept].mean(axis=1))
         mended[~kept] = corner_uv[kept].reshape(-1, 2)[nearest][:, None]
     return mended

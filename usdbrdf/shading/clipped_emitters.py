@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from usdbrdf import calibration
 from usdbrdf.kernel import kernel
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 
 
 @kernel
@@ -243,10 +243,10 @@ class EstimatedRadiance:
     determined: Bool
 
     def least(self) -> Double:
-        """(K, 3): a multiplier that each lamp exceeds by all likelihood, one standard error below
+        """(K, 3): a multiplier that each lamp exceeds by all likelihood, two standard errors below
         the estimate; 1, its bound, where the evidence says no more."""
         brightest, index = self.multiplier.max(axis=1), self.multiplier.argmax(axis=1)
-        below = np.exp(-self.standard_error[np.arange(len(index)), index])
+        below = np.exp(-2 * self.standard_error[np.arange(len(index)), index])
         held: Double = np.where(
             (brightest * below > 1)[:, None], self.multiplier * below[:, None], 1.0
         )
@@ -256,7 +256,8 @@ class EstimatedRadiance:
 def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
     """Multipliers g_k of the lamps' lower bounds, with honest errors.
 
-    The standard error is the larger of the curvature's and of a jackknife over the objects. A
+    The standard error is the larger of the curvature's and of a jackknife over the objects, or over
+    parts of one that tells a lamp alone; and what is not in these, see docs/equations.md. A
     channel in which a lamp did not clip may come out below 1; its brightest one cannot.
     """
     segments, lamps = segments_of(evidence), len(evidence.prior)
@@ -369,14 +370,23 @@ def _standard_error(
     misfit = np.asarray(sum(part[2] for part in parts)) / max(count - len(log_g), 1)
     inverse = np.linalg.inv(whole)
     curved = np.sqrt(np.einsum("ckk->kc", inverse) * np.maximum(misfit, 1))
-    # And if what each block of the evidence brings errs as a whole: without it the solution would
-    # move by (H - H_block)^-1 gradient_block.
-    blocks, alone = _blocks(evidence, segments, parts, log_g, shape)
-    moved = sum(
-        np.linalg.solve(whole - curvature, gradient[..., None])[..., 0].T ** 2
-        for curvature, gradient in blocks
-    )
-    jackknife = np.sqrt((1 - 1 / len(blocks)) * np.asarray(moved))
+    # And if what each object brings (segments where they are few) errs as a whole; but of what
+    # tells a lamp alone parts do, and all of it by as much as is stated.
+    owner = np.array([item.object for item in segments])
+    if len(np.unique(owner)) < _FEW_OBJECTS:
+        owner = np.arange(len(segments))
+    brought = [(part[0], part[1]) for part in parts]
+    jackknife = _without_each(whole, _summed(brought, owner))
+    told = np.array([np.einsum("ckk->k", part[0]) for part in parts])
+    known = told.sum(axis=0) > 3 * evidence.prior[:, 1] ** -2
+    alone = (told > ALONE * told.sum(axis=0)) & evidence.shines & known
+    for k in np.flatnonzero(alone.any(axis=0)):
+        i = int(alone[:, k].argmax())
+        others = np.arange(len(segments)) != i
+        blocks = _summed([brought[n] for n in np.flatnonzero(others)], owner[others])
+        blocks += _parts_of(evidence, segments[i], brought[i], log_g, shape)
+        share = told[i, k] / told[:, k].sum()
+        jackknife[k] = np.hypot(_without_each(whole, blocks)[k], ERROR_ALONE * share)
     # And with more ambient specular light everywhere:
     pull = sum(
         np.einsum("knc,nm,m->ck", lamp_share(evidence, item, log_g), weight, item.ambient)
@@ -384,42 +394,51 @@ def _standard_error(
     )
     ambient = np.einsum("ckl,cl->kc", inverse, pull)
     whole_error = np.maximum(curved, jackknife) ** 2 + ambient**2 + LEAST_ERROR**2
-    whole_error += (ERROR_ALONE * alone[:, None]) ** 2
     return np.asarray(np.sqrt(whole_error))
 
 
-def _blocks(
-    evidence: Evidence,
-    segments: list[Segment],
-    parts: list[tuple[Double, Double, Double]],
-    log_g: Double,
-    shape: Double,
-) -> tuple[list[tuple[Double, Double]], Double]:
-    """Curvature (3, K, K) and gradient (3, K) that goes with each object, or with each segment
-    where objects are few. Of one that tells a lamp alone, parts beside each other are blocks:
-    without all of it nothing would be known, which is no measure of how far it errs. And what
-    share of all that is known of these lamps it tells, (K,), 0 of others."""
-    owner = np.array([item.object for item in segments])
-    if len(np.unique(owner)) < _FEW_OBJECTS:
-        owner = np.arange(len(segments))
-    told = np.array([np.einsum("ckk->k", part[0]) for part in parts])
-    share = told / np.maximum(told.sum(axis=0), 1e-300)
-    alone = (share > ALONE) & evidence.shines
-    blocks = []
-    for number in np.unique(owner):
-        own = np.flatnonzero(owner == number)
-        whole = [
-            np.asarray(sum(parts[i][side] for i in own if not alone[i].any())) for side in (0, 1)
-        ]
-        if whole[0].ndim:
-            blocks.append((whole[0], whole[1]))
-        for i in own[alone[own].any(axis=1)]:
-            for kept in _without_parts(evidence.position[segments[i].index]):
-                less = _some_of(segments[i], kept)
-                weight = weight_without_mean(segment_covariance(less, shape))
-                left = normal_equations(evidence, less, weight, log_g)
-                blocks.append((parts[i][0] - left[0], parts[i][1] - left[1]))
-    return blocks, np.asarray((share * alone).sum(axis=0))
+Block: TypeAlias = tuple[Double, Double]
+
+
+def _summed(brought: list[Block], owner: Array) -> list[Block]:
+    """Curvature (3, K, K) and gradient (3, K) that go with each owner of segments."""
+    return [
+        (
+            np.sum([brought[i][0] for i in np.flatnonzero(owner == number)], axis=0),
+            np.sum([brought[i][1] for i in np.flatnonzero(owner == number)], axis=0),
+        )
+        for number in np.unique(owner)
+    ]
+
+
+def _without_each(whole: Double, blocks: list[Block]) -> Double:
+    """(K, 3): the jackknife's standard error of log g, of which the solution moves by
+    (H - H_block)^-1 gradient_block without a block; infinite where there is but one."""
+    if len(blocks) < 2:
+        return np.full((whole.shape[1], 3), np.inf)
+    moved = np.sum(
+        [
+            np.linalg.solve(whole - curvature, gradient[..., None])[..., 0].T ** 2
+            for curvature, gradient in blocks
+        ],
+        axis=0,
+    )
+    error: Double = np.sqrt((1 - 1 / len(blocks)) * moved)
+    return error
+
+
+def _parts_of(
+    evidence: Evidence, item: Segment, brought: Block, log_g: Double, shape: Double
+) -> list[Block]:
+    """What goes with parts of a segment that lie beside each other: without all of what tells a
+    lamp alone nothing would be known, which is no measure of how far it errs."""
+    parts = []
+    for kept in _without_parts(evidence.position[item.index]):
+        less = _some_of(item, kept)
+        weight = weight_without_mean(segment_covariance(less, shape))
+        left = normal_equations(evidence, less, weight, log_g)
+        parts.append((brought[0] - left[0], brought[1] - left[1]))
+    return parts
 
 
 def _without_parts(position: Float) -> list[Bool]:

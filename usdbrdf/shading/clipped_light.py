@@ -209,7 +209,8 @@ def estimate_clipped_light(
 def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
     lit = lit.copy()
     least = estimate.least()
-    for k in np.flatnonzero(estimate.determined | groups.lamp):
+    brighter = groups.lamp & (least != 1).any(axis=1)
+    for k in np.flatnonzero(estimate.determined | brighter):
         told = estimate.multiplier[k] if estimate.determined[k] else least[k]
         lit[groups.group == k] = groups.bound[k] * told
     return lit
@@ -225,9 +226,9 @@ def _told_by_even_light(
     first: EstimatedRadiance,
     seed: int,
 ) -> EstimatedRadiance:
-    """The estimate with those of its lamps looked at closely, all together, that are
-    determined or exceed their bounds; where that says too little of a lamp, or that it is darker
-    than its bound, the ``first`` one."""
+    """The estimate with those of its lamps looked at closely, all together, that are determined
+    or exceed their bounds; where that says too little of a lamp, or that it is darker than its
+    bound, the ``first`` one."""
     told = first.determined | (first.least() > 1).any(axis=1)
     lamps = np.flatnonzero(groups.lamp & told)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)

@@ -314,12 +314,23 @@ def jackknife(
              these alone errs by parts, and as a whole by lamps.alone
     """
     few = len(np.unique(asked.owner)) < _BLOCKS
-    _, block = np.unique(asked.segment if few else asked.owner, return_inverse=True)
-    block %= _BLOCKS
-    error = np.zeros_like(found.log_radiance)
-    if certain is not None and certain.any():
-        block, alone = _in_parts(asked, block, certain[:, None] * _told(asked, sources, found))
-        error += ERROR_ALONE * alone[:, None]
+    _, whole = np.unique(asked.segment if few else asked.owner, return_inverse=True)
+    error = _without_each(asked, sources, found, whole % _BLOCKS)
+    if certain is None or not certain.any():
+        return error
+    told = _told(asked, sources, found)
+    for k in np.flatnonzero(certain):
+        of_whole = np.bincount(whole, told[k])
+        one, total = int(of_whole.argmax()), of_whole.sum()
+        share = of_whole[one] / max(total, 1e-300)
+        if share > ALONE and total > sources.deviation[k] ** -2:
+            parts = _without_each(asked, sources, found, _in_parts(asked, whole, one))[k]
+            error[k] = np.hypot(parts, ERROR_ALONE * share)
+    return error
+
+
+def _without_each(asked: Asked, sources: Sources, found: Solution, block: Long) -> Double:
+    """(K, 3): how far the logarithms move without each of the blocks (N,), as standard errors."""
     moved, blocks = np.zeros_like(found.log_radiance), np.unique(block)
     if len(blocks) < 2:
         return np.full_like(found.log_radiance, np.inf)
@@ -329,7 +340,7 @@ def jackknife(
         start = found._replace(log_albedo=found.log_albedo[numbers], gloss=found.gloss[numbers])
         part = solved(some, sources._replace(share=sources.share[:, kept]), start, 8)
         moved += (part.log_radiance - found.log_radiance) ** 2
-    return np.hypot(error, np.sqrt((1 - 1 / len(blocks)) * moved))
+    return np.asarray(np.sqrt((1 - 1 / len(blocks)) * moved))
 
 
 def pull_of_prior(asked: Asked, sources: Sources, found: Solution) -> Double:
@@ -359,19 +370,13 @@ def _told(asked: Asked, sources: Sources, found: Solution) -> Double:
     return told
 
 
-def _in_parts(asked: Asked, block: Long, told: Double) -> tuple[Long, Double]:
-    """The blocks (N,), of which those that bring most of what is ``told`` (K, N) of a source are
-    taken apart: texels of a segment with numbers next to each other lie together. And what
-    share of a source's that is, (K,), 0 where it is not most."""
-    block, alone = block.copy(), np.zeros(len(told))
-    whole = np.maximum(told.sum(axis=1), 1e-300)
-    for one in np.unique(block):
-        own = np.flatnonzero(block == one)
-        share = told[:, own].sum(axis=1) / whole
-        alone = np.where(share > ALONE, share, alone)
-        if (share > ALONE).any():
-            order = own[np.lexsort((asked.texel[own], asked.segment[own]))]
-            size = np.bincount(asked.segment[order], minlength=int(asked.segment.max()) + 1)
-            place = np.arange(len(order)) - (np.cumsum(size) - size)[asked.segment[order]]
-            block[order] = block.max() + 1 + place * _PARTS // size[asked.segment[order]]
-    return block, alone
+def _in_parts(asked: Asked, whole: Long, one: int) -> Long:
+    """Blocks (N,) of the objects, ten in all, but of the ``one`` its parts: texels of a segment
+    with numbers next to each other lie together."""
+    own = np.flatnonzero(whole == one)
+    order = own[np.lexsort((asked.texel[own], asked.segment[own]))]
+    size = np.bincount(asked.segment[order], minlength=int(asked.segment.max()) + 1)
+    place = np.arange(len(order)) - (np.cumsum(size) - size)[asked.segment[order]]
+    block = whole % _BLOCKS
+    block[order] = _BLOCKS + place * _PARTS // size[asked.segment[order]]
+    return block

@@ -116,7 +116,7 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
     state = QuantileState.empty(HEIGHT * WIDTH)
     saturates = np.zeros(HEIGHT * WIDTH, np.float32)
     darkness, weight = np.zeros((HEIGHT * WIDTH, 3)), np.zeros(HEIGHT * WIDTH)
-    floor = np.zeros(HEIGHT * WIDTH)
+    floor = np.full(HEIGHT * WIDTH, np.inf)
     num_dark, num_blank = 0, 0
     looking = np.flatnonzero(shares > 0).tolist()
     images = read_frames(partial(read_frame, frames), looking)
@@ -125,7 +125,7 @@ def surroundings_from_frames(rays: RayScene, frames: Frames, z_up: bool) -> Surr
         psquare.update(state, seen.direction, seen.radiance, _QUANTILE)
         limit = np.float32(frames.saturation_radiance[i])
         saturates[seen.clipped] = np.maximum(saturates[seen.clipped], limit)
-        floor[seen.dark] = np.maximum(floor[seen.dark], frames.noise_floor_radiance[i])
+        floor[seen.dark] = np.minimum(floor[seen.dark], frames.noise_floor_radiance[i])
         own = max(float(frames.noise_floor_radiance[i]), _LEAST_FLOOR) ** -2.0
         darkness[seen.dark] += own * seen.darkness
         weight[seen.dark] += own

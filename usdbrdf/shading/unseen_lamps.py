@@ -139,7 +139,7 @@ def lamps_that_explain(
     groups = clipped_groups(texels, lit, coverage, said)
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     environment = outside.environment if outside else black_environment()
-    lamps = _unknown(texels, asked, candidates, groups)
+    lamps = _unknown(texels, asked, candidates, groups, said)
     asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
     roughly = brought(surface, lamps, asked.texel, seed, ROUGHLY)
     # Errors of what a lamp brings draw its strength to nothing: this only says which may be one.
@@ -151,7 +151,7 @@ def lamps_that_explain(
     while len(kept):
         strength = np.append(found[kept], found[len(candidates) :], axis=0).mean(axis=1)
         candidates = candidates[kept]
-        lamps = _unknown(texels, asked, candidates, groups)
+        lamps = _unknown(texels, asked, candidates, groups, said)
         found, error, near, part = looked_at_closely(
             surface, lit, environment, frames, asked, lamps, strength, seed
         )
@@ -186,7 +186,9 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tu
     return brought, float((face < 0).mean())
 
 
-def _unknown(texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups) -> Lamps:
+def _unknown(
+    texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups, said: Mapping[int, bool]
+) -> Lamps:
     """Objects (K,) that may be lamps, of which nothing else is known, and after them those that
     clip."""
     usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
@@ -197,5 +199,5 @@ def _unknown(texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups)
         np.where(clipped.of >= 0, clipped.of + len(objects), number[texels.object_index()]),
         np.concatenate([np.tile(usual, (len(objects), 1)), clipped.mean]),
         np.concatenate([np.full(len(objects), _DEVIATION), clipped.deviation]),
-        np.concatenate([np.zeros(len(objects), np.bool_), clipped.certain]),
+        np.array([*(said.get(int(i), False) for i in objects), *clipped.certain], np.bool_),
     )

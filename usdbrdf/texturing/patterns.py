@@ -44,9 +44,6 @@ _MARGIN = calibration.number("patterns.margin")
 _STEPS, _SMALLEST = 16, 1 / 64
 # Halves of the frames of which one has less than a twentieth of the weight say nothing of noise.
 _LEAST_EQUAL = 0.05 * 0.95
-# Frames are dealt to the halves by multiples of the golden ratio: two exposures or cameras of a rig
-# that take turns do not go along with these, as they do with every other frame; of five cameras
-# some lie mostly in one half.
 _GOLDEN = (1 + 5**0.5) / 2
 # Rows of texels beside a group that what becomes of it depends on, of whose steps again what both
 # halves of the frames contradict each other on.
@@ -246,6 +243,14 @@ def share_that_is_no_noise(texels: Texels, told: Float, footprint: Float) -> Flo
     return np.where((explained > 0) & (free > 0), share, 0).astype(np.float32)
 
 
+def half_of(frame: int) -> int:
+    """0 or 1: of two frames in a row one goes to each. Which one, squares times the golden ratio
+    tell, whose whole parts are as often odd as even along every rhythm (Weyl 1916) that exposures
+    or the cameras of a rig may take turns in."""
+    turn = int(_GOLDEN * (frame // 2) ** 2) % 2
+    return turn ^ (frame & 1)
+
+
 def with_patterns(
     run: TaskRun,
     surface: PatternedSurface,
@@ -266,7 +271,7 @@ def with_patterns(
         whole = with_rows_beside(texels, part, ROWS_BESIDE)
         equations = Equations.empty(whole.stop - whole.start)
         for frame, some in enumerate(pixels()):
-            add(equations, whole.start, surface, some, int(_GOLDEN * frame) % 2)
+            add(equations, whole.start, surface, some, half_of(frame))
         found = steps(equations, whole, surface, level[whole], seed)
         inner = slice(part.start - whole.start, part.stop - whole.start)
         return {name: array[inner].copy() for name, array in found.items()}

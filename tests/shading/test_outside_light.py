@@ -1,0 +1,74 @@
+"""How well the strengths of sources are said to be known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, pull_of_prior, solved
+
+WALLS, EACH = 12, 60
+STRENGTH = np.array([40.0, 15.0])
+
+
+def _walls(alone: bool) -> tuple[Asked, Sources, Solution]:
+    """Twelve evenly lit walls and two lamps, which light the first wall only or all of them."""
+    random = np.random.default_rng(2)
+    segment = np.repeat(np.arange(WALLS, dtype=np.int32), EACH)
+    share = random.uniform(0.005, 0.1, (2, len(segment)))
+    share[:, segment > 0] *= 1e-4 if alone else 1
+    albedo = random.uniform(0.2, 0.7, (WALLS, 1))[segment]
+    light = 1 + (STRENGTH[:, None] * share).sum(axis=0)[:, None]
+    texture = np.exp(0.1 * random.standard_normal((len(segment), 1)))
+    asked = Asked(
+        texel=np.arange(len(segment)),
+        segment=segment,
+        owner=segment,
+        reflected=np.tile(albedo * light * texture, 3),
+        clipped=np.zeros(len(segment), np.bool_),
+        irradiance=np.ones((len(segment), 3)),
+        mirrored=np.zeros((len(segment), 3)),
+    )
+    sources = Sources(
+        share=share,
+        mean=np.zeros((2, 3)),
+        deviation=np.array([3.0, 3.0]),
+        bound=np.zeros(2, np.bool_),
+        pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
+    )
+    return asked, sources, solved(asked, sources)
+
+
+def test_only_of_a_lamp_for_certain_is_what_tells_it_alone_left_out_by_parts():
+    asked, sources, found = _walls(alone=True)
+    whole = jackknife(asked, sources, found)
+    assert (whole > 1).all()
+    error = jackknife(asked, sources, found, np.array([True, False]))
+    assert (error[0] < 0.5).all()
+    assert (error[0] > 0.15).all()
+    assert (np.abs(found.log_radiance[0] - np.log(STRENGTH[0])) < 2 * error[0]).all()
+    np.testing.assert_array_equal(error[1], whole[1])
+
+
+def test_where_all_walls_tell_a_lamp_they_are_left_out_one_by_one():
+    asked, sources, found = _walls(alone=False)
+    whole = jackknife(asked, sources, found)
+    assert (whole < 0.15).all()
+    np.testing.assert_array_equal(jackknife(asked, sources, found, np.array([True, True])), whole)
+
+
+def test_one_object_says_nothing_of_its_own_error():
+    asked, sources, _ = _walls(alone=True)
+    first = asked.segment == 0
+    asked, sources = asked.of(first), sources._replace(share=sources.share[:, first])
+    assert np.isinf(jackknife(asked, sources, solved(asked, sources))).all()
+
+
+def test_a_wrong_prior_pulls_what_texels_do_not_tell():
+    asked, sources, found = _walls(alone=False)
+    assert (pull_of_prior(asked, sources, found) < 0.05).all()
+    # The second lamp's light is as even as all the rest: only what is usual of albedos holds it.
+    even = sources.share.copy()
+    even[1] = 1e-3
+    sources = sources._replace(share=even)
+    assert (pull_of_prior(asked, sources, solved(asked, sources))[1] > 1).all()
