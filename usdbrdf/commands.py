@@ -166,6 +166,7 @@ class Texture(_RunOnAsset):
     """Project the frames: lit diffuse radiance L_d per texel."""
 
     texture: options.TextureOptions
+    cluster: ClusterOptions
 
 
 class Shade(_RunOnAsset):

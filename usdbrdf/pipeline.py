@@ -85,7 +85,7 @@ def convert(
     with working as asset, compiling_beside(), workers_of(cluster, client) as workers:
         return {
             "ingest": ingest([*map(Path, paths)], asset, chosen.ingest, adapter, plugins=plugins),
-            "texture": texture(asset, chosen.texture),
+            "texture": texture(asset, chosen.texture, workers),
             "shade": shade(asset, chosen.shade, workers),
             "fit": fit(asset, chosen.fit, workers),
         }
@@ -151,10 +151,10 @@ def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
     return run
 
 
-def _texture(asset: Asset, options: TextureOptions) -> TaskResult:
+def _texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> TaskResult:
     if not asset.lightings:
-        return texture_task(asset, options)
-    shared, found = unwrap(asset, options), in_each_lighting(texture_task, asset, options)
+        return texture_task(asset, options, workers)
+    shared, found = unwrap(asset, options), in_each_lighting(texture_task, asset, options, workers)
     return replace(found, reran=shared.reran or found.reran)
 
 

@@ -8,18 +8,22 @@ import signal
 import socket
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
+import usdbrdf.job.task as task_module
 import usdbrdf.shading.shaded
+import usdbrdf.texturing.passes
 from tests.scenes import make_capture
 from usdbrdf import pipeline
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cluster.options import ClusterOptions
-from usdbrdf.cluster.session import workers_of
+from usdbrdf.cluster.session import _Session, workers_of
 from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.job.task import TaskRun
@@ -27,6 +31,7 @@ from usdbrdf.options import FitOptions, IngestOptions, Sampling, ShadeOptions, T
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
+TEXTURE = TextureOptions(texel_size=0.15)
 SHADE = ShadeOptions(sampling=Sampling(max_rays=64), denoise="none")
 FIT = FitOptions(max_pixels=60)
 
@@ -35,16 +40,23 @@ FIT = FitOptions(max_pixels=60)
 def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Enough units for something to happen in between."""
     monkeypatch.setattr(usdbrdf.shading.shaded, "_TILE", 128)
+    monkeypatch.setattr(usdbrdf.texturing.passes, "_SMALLEST_SHARE", 128)
 
 
 @pytest.fixture(scope="module")
-def textured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("cluster")
+def ingested(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ingested")
     capture = make_capture(folder / "capture", frames=8)
     with pipeline.working_on(folder / "room") as asset:
         pipeline.ingest([capture.folder], asset, IngestOptions())
-        pipeline.texture(asset, TextureOptions(texel_size=0.15))
     return folder / "room"
+
+
+@pytest.fixture(scope="module")
+def textured(ingested: Path) -> Path:
+    asset = copied(ingested, ingested.parent.with_name("textured"))
+    pipeline.texture(asset, TEXTURE)
+    return asset.folder
 
 
 def contents(asset: Path) -> dict[str, str]:
@@ -111,12 +123,61 @@ def test_the_bytes_are_the_same_though_workers_die_and_hang(
         assert len(pids) == 2
         monkeypatch.undo()
         monkeypatch.setattr(usdbrdf.shading.shaded, "_TILE", 128)
+        monkeypatch.setattr(usdbrdf.texturing.passes, "_SMALLEST_SHARE", 128)
         strike(monkeypatch, 1, lambda: os.kill(pids[0], signal.SIGSTOP))
         pipeline.fit(copy, FIT, workers)
     assert contents(copy.folder) == alone
     assert "[cluster.hangs]" in capfd.readouterr().err
     assert not workers_on_this_machine()
     assert not list(copy.folder.glob(".usdbrdf/work/*"))
+
+
+def test_all_that_is_done_texel_by_texel_is_shared_out_and_gives_the_same_bytes(
+    ingested: Path, alone: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asset, done = copied(ingested, tmp_path / "copy"), Counter[str]()
+    save = TaskRun.save
+
+    def counted(self: TaskRun, key: str, *given: Any, **named: Any) -> None:
+        if "-from-" in key or key.startswith("steps"):
+            done[key.split("-")[0]] += 1
+        save(self, key, *given, **named)
+
+    monkeypatch.setattr(TaskRun, "save", counted)
+    with workers_of(ClusterOptions(workers=3)) as workers:
+        pipeline.texture(asset, TEXTURE, workers)
+        pipeline.shade(asset, SHADE, workers)
+        pipeline.fit(asset, FIT, workers)
+    assert contents(asset.folder) == alone
+    assert done == {"frames": 3, "refined": 3, "steps": 3}
+
+
+def test_workers_go_on_where_this_process_was_interrupted(
+    ingested: Path, textured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asset = copied(ingested, tmp_path / "copy")
+    monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
+    monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    # The charts, then frame after frame.
+    strike(monkeypatch, 4, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.texture(asset, TEXTURE)
+    begun: list[int] = []
+    results = _Session.results
+
+    def noted(self: Any, unit: Any, shared: Any, pieces: Any, *rest: Any) -> Any:
+        begun.extend(start for _, start, _ in pieces.values())
+        return results(self, unit, shared, pieces, *rest)
+
+    monkeypatch.setattr(_Session, "results", noted)
+    with workers_of(ClusterOptions(workers=2)) as workers:
+        pipeline.texture(asset, TEXTURE, workers)
+    assert begun == [3, 3]
+    assert contents(asset.folder) == contents(textured)
 
 
 def test_workers_of_other_code_are_refused_in_a_sentence(

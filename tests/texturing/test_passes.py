@@ -18,6 +18,7 @@ from usdbrdf.texturing.passes import (
     BytesPerTexel,
     by_parts,
     groups_of_texels,
+    shares_of,
     smallest_groups,
 )
 
@@ -111,3 +112,19 @@ def test_parts_make_the_whole():
     for name, values in whole.items():
         np.testing.assert_array_equal(found[name], values)
         assert found[name].dtype == values.dtype
+
+
+@pytest.mark.parametrize(
+    ("workers", "count"), [(1, 1), (2, 2), (3, 3), (400, 13), (1, 10)], ids=str
+)
+def test_shares_are_even_about_as_large_as_is_worth_it_and_none_too_large(
+    monkeypatch, workers: int, count: int
+):
+    if count == 10:
+        monkeypatch.setattr(passes, "_LARGEST_SHARE", 5000)
+    shares = shares_of(slice(1000, 51_000), workers)
+    assert len(shares) == count
+    assert [shares[0].start, shares[-1].stop] == [1000, 51_000]
+    assert all(one.stop == other.start for one, other in pairwise(shares))
+    sizes = [share.stop - share.start for share in shares]
+    assert max(sizes) - min(sizes) <= 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +12,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tests.physics.surfaces import World, quad, world_of
 from tests.scenes import camera_at, look_at
-from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import SAMPLE_BLUR, blurred
+from usdbrdf.texturing.passes import by_parts
 from usdbrdf.texturing.pattern_pixels import Covering, PatternedSurface, pixels_of_frame
 from usdbrdf.texturing.patterns import (
     Equations,
@@ -24,6 +24,7 @@ from usdbrdf.texturing.patterns import (
     half_of,
     share_that_is_no_noise,
     steps,
+    steps_of,
     with_patterns,
 )
 from usdbrdf.texturing.samples import Picture
@@ -89,14 +90,21 @@ def _found(
     floor: World,
     surface: PatternedSurface,
     pictures: Sequence[tuple[Camera, Picture]],
-    folder: Path,
     groups: Sequence[slice] = (slice(0, SIDE * SIDE),),
 ) -> Float:
     def pixels() -> list[Covering]:
         return [pixels_of_frame(surface, shown, camera, 1e-4, ERROR) for camera, shown in pictures]
 
-    run = TaskRun(folder, "fit", folder / "work")
-    return with_patterns(run, surface, lambda: iter(pixels()), _footprint(floor), groups, 1)
+    return _together(surface, pixels(), _footprint(floor), groups)
+
+
+def _together(
+    surface: PatternedSurface, pixels: Sequence[Covering], footprint: Float, groups: Sequence[slice]
+) -> Float:
+    def steps_by(level: Float) -> dict[str, Array]:
+        return by_parts(groups, lambda part: steps_of(surface, enumerate(pixels), part, level, 1))
+
+    return with_patterns(surface, footprint, steps_by)
 
 
 def _footprint(floor: World) -> Float:
@@ -125,16 +133,16 @@ def test_halves_of_the_frames_keep_no_rhythm_of_the_capture(period: int):
         assert 0.15 <= half[turn::period].mean() <= 0.85
 
 
-def test_stripes_that_pixels_blur_come_back(floor: World, tmp_path: Path):
+def test_stripes_that_pixels_blur_come_back(floor: World):
     truth = _stripes().reshape(-1, 3)
     mean = blurred(floor.texels, truth, SAMPLE_BLUR**2 * _footprint(floor))
-    found = _found(floor, _surface(floor, mean), _seen(_stripes()), tmp_path)
+    found = _found(floor, _surface(floor, mean), _seen(_stripes()))
     assert _off(mean, truth) > 0.15
     assert _off(found, truth) < 0.35 * _off(mean, truth)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.7, 1.2])
-def test_a_plain_floor_stays_plain(floor: World, tmp_path: Path, spread: float):
+def test_a_plain_floor_stays_plain(floor: World, spread: float):
     # What was denoised or interpolated has noise that neighbours share.
     plain = np.ones((SIDE, SIDE, 3), np.float32)
     pictures = []
@@ -143,17 +151,17 @@ def test_a_plain_floor_stays_plain(floor: World, tmp_path: Path, spread: float):
         noise = gaussian_filter(noise, (spread, spread, 0))
         noisy = shown.radiance + np.float32(0.03 / noise.std()) * noise.astype(np.float32)
         pictures.append((camera, shown._replace(radiance=noisy)))
-    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures, tmp_path)
+    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures)
     assert _off(found, plain.reshape(-1, 3)) < 0.3 * 0.03
 
 
-def test_what_is_there_already_is_not_exaggerated(floor: World, tmp_path: Path):
+def test_what_is_there_already_is_not_exaggerated(floor: World):
     truth = _stripes().reshape(-1, 3)
-    found = _found(floor, _surface(floor, truth), _seen(_stripes()), tmp_path)
+    found = _found(floor, _surface(floor, truth), _seen(_stripes()))
     assert _off(found, truth) < 0.02
 
 
-def test_highlights_of_single_frames_are_no_pattern(floor: World, tmp_path: Path):
+def test_highlights_of_single_frames_are_no_pattern(floor: World):
     plain = np.ones((SIDE, SIDE, 3), np.float32)
     pictures = []
     for k, (camera, shown) in enumerate(_seen(plain, 0.01)):
@@ -163,25 +171,25 @@ def test_highlights_of_single_frames_are_no_pattern(floor: World, tmp_path: Path
             away2 = (row - middle[0]) ** 2 + (column - middle[1]) ** 2
             shown.radiance[...] += (strength * np.exp(-away2 / (2 * size**2)))[..., None]
         pictures.append((camera, shown))
-    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures, tmp_path)
+    found = _found(floor, _surface(floor, plain.reshape(-1, 3)), pictures)
     assert _off(found, plain.reshape(-1, 3)) < 0.02
 
 
-def test_contradicting_frames_change_little(floor: World, tmp_path: Path):
+def test_contradicting_frames_change_little(floor: World):
     # The poses are off: every frame shows the stripes elsewhere.
     shifted = [np.roll(_stripes(), 2 * k, axis=1) for k in range(8)]
     pictures = [_seen(own)[k] for k, own in enumerate(shifted)]
     mean = np.mean(shifted, axis=0).reshape(-1, 3).astype(np.float32)
-    found = _found(floor, _surface(floor, mean), pictures, tmp_path)
+    found = _found(floor, _surface(floor, mean), pictures)
     assert _off(found, mean) < 0.5 * _off(_stripes().reshape(-1, 3), mean)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_the_unit_of_radiance_makes_no_difference(floor: World, tmp_path: Path, scale: float):
+def test_the_unit_of_radiance_makes_no_difference(floor: World, scale: float):
     truth = _stripes().reshape(-1, 3)
     mean = blurred(floor.texels, truth, SAMPLE_BLUR**2 * _footprint(floor))
     pictures = _seen(_stripes())
-    once = _found(floor, _surface(floor, mean), pictures, tmp_path)
+    once = _found(floor, _surface(floor, mean), pictures)
     scaled = [
         (camera, shown._replace(radiance=shown.radiance * np.float32(scale)))
         for camera, shown in pictures
@@ -190,9 +198,7 @@ def test_the_unit_of_radiance_makes_no_difference(floor: World, tmp_path: Path, 
     found = [
         pixels_of_frame(surface, shown, camera, 1e-4 * scale, ERROR) for camera, shown in scaled
     ]
-    run = TaskRun(tmp_path, "fit", tmp_path / "work")
-    whole = [slice(0, SIDE * SIDE)]
-    again = with_patterns(run, surface, lambda: iter(found), _footprint(floor), whole, 1)
+    again = _together(surface, found, _footprint(floor), [slice(0, SIDE * SIDE)])
     np.testing.assert_allclose(again / np.float32(scale), once, rtol=2e-3, atol=2e-3)
 
 
@@ -234,22 +240,18 @@ def _bare(world: World) -> PatternedSurface:
 
 
 @pytest.mark.parametrize("inner", [[2000, 2007], [6400], [6395, 6405, 8560], [8563]])
-def test_what_a_texel_gets_does_not_depend_on_its_group(
-    strips: World, tmp_path: Path, inner: list[int]
-):
+def test_what_a_texel_gets_does_not_depend_on_its_group(strips: World, inner: list[int]):
     surface = _bare(strips)
     count = len(strips.texels)
     pixels = _anywhere(strips, 60_000, surface.own)
     footprint = np.tile(np.float32([1, 0, 1]), (count, 1))
 
-    def found(folder: str, ends: list[int]) -> Float:
-        groups = [slice(a, b) for a, b in pairwise(ends)]
-        run = TaskRun(tmp_path, "fit", tmp_path / folder)
-        return with_patterns(run, surface, lambda: iter([pixels]), footprint, groups, 1)
+    def found(ends: list[int]) -> Float:
+        return _together(surface, [pixels], footprint, [slice(a, b) for a, b in pairwise(ends)])
 
-    whole = found("one", [0, count])
+    whole = found([0, count])
     assert (whole != surface.values).any()
-    np.testing.assert_array_equal(found("several", [0, *inner, count]), whole)
+    np.testing.assert_array_equal(found([0, *inner, count]), whole)
 
 
 def test_couplings_are_those_of_least_squares_and_of_one_object_alone(strips: World):

@@ -13,7 +13,7 @@ import pytest
 from tests.physics.surfaces import Part, World, quad, world_of
 from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf import kernel
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
@@ -114,6 +114,35 @@ def test_every_object_gets_the_radiance_it_was_drawn_with(room: Room):
     np.testing.assert_array_equal(
         observed.lower_bound, np.where(observed.clipped > 0, np.float32(SATURATION), 0)
     )
+
+
+def test_statistics_of_some_texels_are_those_of_all(room: Room):
+    count = len(room.world.texels)
+    whole = _empty(room.world)
+    _observe(room.world, room.frames, whole)
+    for part in (slice(0, 1000), slice(1000, 1003), slice(1003, count)):
+        own = _empty(room.world, part)
+        _observe(room.world, room.frames, own, part=part)
+        for name, values in whole.of(part).arrays().items():
+            np.testing.assert_array_equal(own.arrays()[name], values)
+
+
+def test_frames_before_which_no_texel_lies_are_not_read(room: Room):
+    owner = room.world.texels.object_index()
+    lamp = np.flatnonzero(owner == room.names.index("lamp"))
+    part = slice(int(lamp[0]), int(lamp[-1]) + 1)
+    read = []
+
+    def noted(i: int) -> FramePixels:
+        read.append(i)
+        return read_frame(room.frames, i)
+
+    surface = TexturedScene(room.world.scene, room.world.texels, room.world.rays)
+    found = list(samples_from_frames(surface, room.frames, noted, range(12), part))
+    assert [some.frame for some in found] == list(range(12))
+    assert 0 < len(read) < 12
+    for some in found:
+        assert some.frame in read or not len(some.texel) + len(some.clipped) + len(some.dark)
 
 
 def test_what_is_black_is_known_to_be_dark(room: Room, tmp_path: Path):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, world_of
-from tests.scenes import camera_at, look_at
-from usdbrdf.texturing.observe import blocks_of_texels
+from tests.scenes import camera_at, frames_at, look_at
+from usdbrdf.texturing.observe import blocks_of_texels, frames_in_view
 
 LENS, SIZE, MIN_COSINE = np.array([80.0, 80.0, 40.0, 30.0]), np.array([80, 60], np.int32), 0.1
 
@@ -71,3 +73,45 @@ def test_blocks_of_a_part_are_the_parts(corner: World):
     visible = _visible(corner, pose)
     assert np.isin(visible[(visible >= part.start) & (visible < part.stop)], which).all()
     assert len(which) > 500
+
+
+def test_frames_that_may_have_pixels_on_some_texels(corner: World):
+    """Also where their middles lie beside the image; and few others."""
+    texels, rng = corner.texels, np.random.default_rng(3)
+    poses = [look_at(rng.uniform(0.05, 3, 3), rng.uniform(-1, 4, 3)) for _ in range(60)]
+    frames = replace(frames_at(poses), intrinsics=np.tile(LENS, (60, 1)))
+    frames = replace(frames, resolution=np.tile(SIZE, (60, 1)))
+    # A narrow strip of coarse texels in a corner of the first wall.
+    part = slice(0, 150)
+    found = frames_in_view(texels, part, frames, range(10, 60))
+    assert found == sorted(set(found))
+    assert set(found) <= set(range(10, 60))
+    number = np.full(len(texels.nearest_texel), -1)
+    number[texels.pixel] = np.arange(len(texels))
+    shown = []
+    for i in range(10, 60):
+        camera = frames.camera(i)
+        hits = corner.rays.closest(*camera.rays(camera.pixels()))
+        own = hits.face[hits.face >= 0]
+        first = np.unique(texels.face[part])
+        if np.isin(own, first).any() and len(_visible_any(corner, camera, hits, part, number)):
+            shown.append(i)
+    assert shown
+    assert set(shown) <= set(found)
+    assert len(found) < 1.5 * len(shown) + 10
+
+
+def _visible_any(world: World, camera, hits, part: slice, number: np.ndarray) -> np.ndarray:
+    """Pixels that show a place of a texel of ``part``, its face seen at MIN_COSINE or more."""
+    texels, scene = world.texels, world.scene
+    struck = np.flatnonzero(hits.face >= 0)
+    face, u, v = hits.face[struck], hits.u[struck], hits.v[struck]
+    weights = np.stack([1 - u - v, u, v], axis=-1)
+    place = np.einsum("rc,rcd->rd", weights, texels.corner_pixel[face])
+    owner = scene.face_object[face]
+    row, column = place[:, 1].astype(int), place[:, 0].astype(int)
+    texel = number[texels.first_pixel[owner] + row * texels.resolution[owner, 0] + column]
+    to_eye = np.asarray(camera.eye) - texels.position[texel]
+    cosine = (to_eye * texels.geometric_normal[texel]).sum(axis=1)
+    faces = cosine >= MIN_COSINE * np.linalg.norm(to_eye, axis=1)
+    return np.flatnonzero(faces & (texel >= part.start) & (texel < part.stop))

@@ -48,6 +48,8 @@ def described(value: Any, keep: Callable[[Array], str]) -> Document:
             return {"path": str(value)}
         if isinstance(value, range):
             return {"range": [value.start, value.stop, value.step]}
+        if isinstance(value, slice):
+            return {"slice": [of(value.start), of(value.stop), of(value.step)]}
         if type(value) in (tuple, list):
             return {type(value).__name__: [of(item) for item in value]}
         if isinstance(value, dict | MappingProxyType):
@@ -94,6 +96,8 @@ def restored(
                 return Path(parts)
             case "range":
                 return range(*parts)
+            case "slice":
+                return slice(*map(of, parts))
             case "tuple":
                 return tuple(of(item) for item in parts)
             case "list":

@@ -56,6 +56,10 @@ class DaskWorkers:
         # What each worker had to do at the last look, and since when it gave nothing back.
         self._at_work: dict[str, tuple[frozenset[Any], float]] = {}
 
+    def elsewhere(self) -> int:
+        """See ``job.units.Workers``; waits for workers if there are none."""
+        return self._at_once()
+
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:

@@ -52,16 +52,23 @@ class _Session:
         self._options, self._client, self._stack = options, client, stack
         self._workers: Workers | None = None
 
+    def elsewhere(self) -> int:
+        # Of workers of our own what was asked for, though one may be starting anew.
+        return self._options.workers or self._started().elsewhere()
+
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
+        return self._started().results(unit, shared, pieces, folder, at_a_time)
+
+    def _started(self) -> Workers:
         if self._workers is None:
             from usdbrdf.cluster.engine import DaskWorkers
 
             options = self._options
             client = self._client or self._stack.enter_context(_client(options))
             self._workers = DaskWorkers(client, options.shared_folder, options.unit_limit)
-        return self._workers.results(unit, shared, pieces, folder, at_a_time)
+        return self._workers
 
 
 def _need_dask() -> None:

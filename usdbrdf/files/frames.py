@@ -177,6 +177,10 @@ class FrameReader:
         self._kept: dict[int, FramePixels] = {}
         self._locks = [Lock() for _ in range(self._num_kept)]
 
+    def among(self, workers: int) -> FrameReader:
+        """One for each of so many, who may be on one machine: together they keep as much."""
+        return FrameReader(self.frames, self.most_bytes // workers)
+
     def read(self, i: int) -> FramePixels:
         """Pixels of frame ``i``, not to be written to; from any thread. See ``read_frame``."""
         if i >= self._num_kept:

@@ -163,6 +163,10 @@ class TaskRun:
         self.save(key, arrays)
         return arrays
 
+    def elsewhere(self) -> int:
+        """How many units of work others than this process can do at once; 0 where it does all."""
+        return self._workers.elsewhere()
+
     def units(
         self,
         unit: Unit,

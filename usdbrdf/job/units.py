@@ -21,6 +21,10 @@ Unit: TypeAlias = Callable[[Any, Any], Mapping[str, Array]]
 class Workers(Protocol):
     """Whoever does units of work."""
 
+    def elsewhere(self) -> int:
+        """How many units others than this process can do at once; 0 where it does all itself."""
+        ...
+
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
@@ -35,6 +39,9 @@ class Workers(Protocol):
 
 class ThisProcess:
     """Does all units here."""
+
+    def elsewhere(self) -> int:
+        return 0
 
     def results(
         self, unit: Unit, shared: Any, pieces: Mapping[str, Any], folder: Path, at_a_time: int

@@ -7,7 +7,7 @@ place of the median, and what the pixels blurred is restored where it stands abo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -22,23 +22,25 @@ from usdbrdf.job.progress import progress, warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces, refined_irradiance
 from usdbrdf.material.sample_specular import TILE_SIDE, specular_of_samples
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.base_color import Reflection, base_color_of
 from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
-from usdbrdf.texturing.observe import samples_from_frames, spread_order
+from usdbrdf.texturing.observe import frames_in_view, samples_from_frames, spread_order
 from usdbrdf.texturing.passes import (
     BytesPerTexel,
+    among_workers,
     bytes_for_frames,
     groups_of_texels,
     in_passes,
+    shares_of,
     smallest_groups,
     with_rows_beside,
 )
-from usdbrdf.texturing.pattern_pixels import Covering, PatternedSurface, pixels_of_frame
-from usdbrdf.texturing.patterns import BYTES_OF_EQUATIONS, ROWS_BESIDE, with_patterns
+from usdbrdf.texturing.pattern_pixels import REACH, Covering, PatternedSurface, pixels_of_frame
+from usdbrdf.texturing.patterns import BYTES_OF_EQUATIONS, ROWS_BESIDE, steps_of, with_patterns
 from usdbrdf.texturing.robust_mean import MeanState, RobustMean, robust_mean, update
 from usdbrdf.texturing.samples import MIN_COSINE, Picture
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
@@ -250,46 +252,87 @@ def _means_without_lobes(
     ``_level`` of their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks
     for."""
     _, lit, before, own = lighting
-    frames, texels = reader.frames, lit.texels
-    owner, level, samples = texels.object_index(), _level(before.lit), before.samples
+    shown = _Shown(lit, before.samples, lobes, _level(before.lit), reader, own, seed)
 
-    def means(part: slice) -> dict[str, Float]:
+    def means(part: slice) -> dict[str, Array]:
         """Of some texels, going on from the last saved state of an interrupted run."""
         name = f"refined-{part.start}-{part.stop}"
         saved = run.latest(name)
         start, observed = 0, MeanState.empty(part.stop - part.start)
         if saved is not None:
             start, observed = saved[0] + 1, MeanState(**saved[1])
-        # The mean starts from its first samples, which must not all show one highlight.
-        order = [own.start + i for i in spread_order(len(own))[start:]]
-        whole = with_rows_beside(texels, part, TILE_SIDE)
-        sampled = samples_from_frames(lit, frames, reader.read, order, whole)
-        bar = progress(sampled, total=len(order), label="fit: refine", unit="frames")
-        for done, some in enumerate(bar, start):
-            taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
-            texel, camera = some.texel[taken], frames.camera(some.frame)
-            of_texel = lobes.take(owner[texel])
-            own_seed = seed + len(frames) + some.frame
-            specular = specular_of_samples(
-                lit, of_texel.phi, of_texel.psi, texel, samples[texel], camera.eye, own_seed
-            )
-            within = (texel >= part.start) & (texel < part.stop)
-            covered = footprints(texels, texel, camera)
-            unit = level[texel] * _let_through(lit, of_texel, texel, camera.eye)
-            noise = np.float32(OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
-            of_lobe = _OF_LOBE * np.abs(specular).mean(axis=1) / unit
-            # A wide view of a texel says less of it than its noise tells.
-            wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
-            error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
-            deviation = np.asarray(error * wide, np.float32)
-            values = (some.radiance[taken] - specular) / unit[:, None]
-            own_texel = texel[within] - np.int32(part.start)
-            update(observed, own_texel, values[within], deviation[within], covered[within])
+        if workers := run.elsewhere():
+            shares = shares_of(part, workers)
+            pieces = [
+                (one, start, [v[one.start - part.start : one.stop - part.start] for v in observed])
+                for one in shares
+            ]
+            given = shown._replace(reader=reader.among(workers))
+            name = f"{name}-from-{start}"
+            return among_workers(run, name, shares, _means_of, given, pieces, "fit: refine")
+        frames_left = _with_frames(shown, part, start, observed)
+        total = len(own) - start
+        for done in progress(frames_left, total=total, label="fit: refine", unit="frames"):
             run.save_latest_in_time(name, done, observed._asdict)
         return robust_mean(observed)._asdict()
 
-    groups = _groups(lit, frames.at(own), memory, need)
+    groups = _groups(lit, reader.frames.at(own), memory, need)
     return RobustMean(**in_passes(run, "means", groups, means))
+
+
+class _Shown(NamedTuple):
+    """What the frames ``own`` of a lighting show: a scene with lobes, how many measured each texel,
+    (T,), and the radiance that its samples are relative to, (T,)."""
+
+    lit: LitScene
+    samples: Float
+    lobes: Lobes
+    level: Float
+    reader: FrameReader
+    own: range
+    seed: int
+
+
+def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) -> Iterator[int]:
+    """Add the frames from the place ``start`` on in their order to what was observed of the texels
+    of ``part``, and give the place of each that is in it."""
+    lit, samples, lobes, level, reader, own, seed = shown
+    frames, texels = reader.frames, lit.texels
+    owner = texels.object_index()
+    # The mean starts from its first samples, which must not all show one highlight.
+    order = [own.start + i for i in spread_order(len(own))[start:]]
+    whole = with_rows_beside(texels, part, TILE_SIDE)
+    sampled = samples_from_frames(lit, frames, reader.read, order, whole)
+    for done, some in enumerate(sampled, start):
+        taken = _subsample(some.texel, samples[some.texel], some.frame, seed)
+        texel, camera = some.texel[taken], frames.camera(some.frame)
+        of_texel = lobes.take(owner[texel])
+        own_seed = seed + len(frames) + some.frame
+        specular = specular_of_samples(
+            lit, of_texel.phi, of_texel.psi, texel, samples[texel], camera.eye, own_seed
+        )
+        within = (texel >= part.start) & (texel < part.stop)
+        covered = footprints(texels, texel, camera)
+        unit = level[texel] * _let_through(lit, of_texel, texel, camera.eye)
+        noise = np.float32(OF_NOISE_FLOOR * frames.noise_floor_radiance[some.frame]) / unit
+        of_lobe = _OF_LOBE * np.abs(specular).mean(axis=1) / unit
+        # A wide view of a texel says less of it than its noise tells.
+        wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
+        error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
+        deviation = np.asarray(error * wide, np.float32)
+        values = (some.radiance[taken] - specular) / unit[:, None]
+        own_texel = texel[within] - np.int32(part.start)
+        update(observed, own_texel, values[within], deviation[within], covered[within])
+        yield done
+
+
+def _means_of(shown: _Shown, piece: tuple[slice, int, list[Array]]) -> Mapping[str, Array]:
+    """A unit of work: the means of some texels, from a frame on after earlier ones."""
+    part, start, earlier = piece
+    observed = MeanState._make(values.copy() for values in earlier)
+    for _ in _with_frames(shown, part, start, observed):
+        pass
+    return robust_mean(observed)._asdict()
 
 
 def _groups(
@@ -328,23 +371,71 @@ def _with_patterns(
     texel_of[texels.pixel[known]] = np.flatnonzero(known)
     surface = PatternedSurface(lit.scene, lit.rays, texels, owner, diffuse, texel_of, variance)
 
-    def of_frame(i: int) -> Covering:
-        shown = reader.read(i)
-        noise = OF_NOISE_FLOOR * float(frames.noise_floor_radiance[i])
-        picture, camera = Picture.of(shown), frames.camera(i)
-        found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR)
-        return found.take(_subsample(found.texel, samples[found.texel], i, seed))
+    def steps_by(level: Float) -> dict[str, Array]:
+        seen = _Patterned(surface, samples, level, reader, own, seed)
 
-    def pixels() -> Iterator[Covering]:
-        bar = progress(ahead(of_frame, own), total=len(own), label="fit: patterns", unit="frames")
-        yield from bar
+        def steps(part: slice) -> dict[str, Array]:
+            if workers := run.elsewhere():
+                shares, given = (
+                    shares_of(part, workers),
+                    seen._replace(reader=reader.among(workers)),
+                )
+                return among_workers(
+                    run, "steps", shares, _pattern_of, given, shares, "fit: patterns"
+                )
+            looked_at = _looked_at(seen, part)
+            bar = progress(
+                _pixels(seen, looked_at), total=len(looked_at), label="fit: patterns", unit="frames"
+            )
+            return steps_of(surface, bar, part, level, seed)
+
+        return in_passes(run, "patterns", groups, steps)
 
     # Groups take what lies beside them along.
     beside = min(2 * ROWS_BESIDE * int(texels.resolution[:, 0].max()), len(texels))
     always = _OF_PATTERNS.always + _OF_PATTERNS.grouped * beside // len(texels)
     need = _OF_PATTERNS._replace(always=always)
     groups = _groups(lit, frames.at(own), memory, need, warns=False)
-    return with_patterns(run, surface, pixels, means.footprint, groups, seed)
+    return with_patterns(surface, means.footprint, steps_by)
+
+
+class _Patterned(NamedTuple):
+    """What the frames ``own`` show of a surface; samples, level  (T,): how many measured each
+    texel, and the radiance that contrasts are a share of."""
+
+    surface: PatternedSurface
+    samples: Float
+    level: Float
+    reader: FrameReader
+    own: range
+    seed: int
+
+
+def _looked_at(seen: _Patterned, part: slice) -> list[int]:
+    """The frames whose pixels may tell of the texels of ``part``."""
+    texels = seen.surface.texels
+    whole = with_rows_beside(texels, part, ROWS_BESIDE + REACH)
+    return frames_in_view(texels, whole, seen.reader.frames, seen.own)
+
+
+def _pixels(seen: _Patterned, looked_at: Sequence[int]) -> Iterator[tuple[int, Covering]]:
+    """Of each of these frames its number among all, and what its pixels show."""
+    surface, samples, _, reader, own, seed = seen
+    frames = reader.frames
+
+    def of_frame(i: int) -> tuple[int, Covering]:
+        picture, camera = Picture.of(reader.read(i)), frames.camera(i)
+        noise = OF_NOISE_FLOOR * float(frames.noise_floor_radiance[i])
+        found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR)
+        return i - own.start, found.take(_subsample(found.texel, samples[found.texel], i, seed))
+
+    return ahead(of_frame, looked_at)
+
+
+def _pattern_of(seen: _Patterned, part: slice) -> Mapping[str, Array]:
+    """A unit of work: what the frames tell of some texels."""
+    pixels = _pixels(seen, _looked_at(seen, part))
+    return steps_of(seen.surface, pixels, part, seen.level, seen.seed)
 
 
 def frame_reader(

@@ -18,6 +18,7 @@ from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.progress import progress, say
 from usdbrdf.job.task import TaskResult, TaskRun
+from usdbrdf.job.units import HERE, Workers
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task, warned
 from usdbrdf.tasks.unwrap import charts_of_lightings, new_charts
@@ -27,7 +28,7 @@ from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import RayScene
 
 
-def texture(asset: Asset, options: TextureOptions) -> TaskResult:
+def texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> TaskResult:
     """Unwrap every object, project the frames, write texturing.usda and its EXR maps; of one of
     several lightings, which are unwrapped together before, its own layer and maps."""
     maps = AssetMaps(open_weaker(asset, "texturing"))
@@ -79,7 +80,7 @@ def texture(asset: Asset, options: TextureOptions) -> TaskResult:
             "warnings": doubts + found.contradictions(),
         }
 
-    return task.run(work)
+    return task.run(work, workers)
 
 
 def _write_maps(

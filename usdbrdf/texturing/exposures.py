@@ -61,6 +61,12 @@ class Probes(NamedTuple):
         first, end = -(-start // every), -(-stop // every)
         return cls(every, first, np.full((end - first, num_frames), np.nan, np.float32))
 
+    def of(self, part: slice) -> Probes:
+        """Those of the texels of ``part``, which are among these."""
+        first, end = -(-part.start // self.every), -(-part.stop // self.every)
+        own = self.logarithm[first - self.first : end - self.first]
+        return Probes(self.every, first, own)
+
     def add(self, frame: int, texel: Int, radiance: Float) -> None:
         """Keep what is needed of one frame's samples: texel (M,), radiance (M, 3)."""
         own = np.flatnonzero(texel % self.every == 0)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.exposures import Probes, contradicting_frames
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
-from usdbrdf.texturing.passes import groups_of_texels, in_passes
+from usdbrdf.texturing.passes import among_workers, groups_of_texels, in_passes, shares_of
 from usdbrdf.transport.lit_scene import TexturedScene
 
 # A larger share of unmeasured texels is worth a warning.
@@ -81,31 +82,75 @@ def lit_texture_from_frames(
     Raises InputRefused where no frame shows any surface.
     """
     texels = surface.texels
+    frames = frames.at(going_on.order)
+    shown = _Shown(surface, frames, quantile)
 
     def measured(part: slice) -> dict[str, Array]:
         """Some texels in all frames, going on from the last saved state of an interrupted run, or
         of one with fewer frames."""
         name = going_on.name(f"frames-{part.start}-{part.stop}")
         start, earlier, saved = 0, going_on.statistics(part), run.latest(name)
-        observed = Observation.empty(part, Probes.empty(len(texels), len(frames), part))
+        observed = shown.by_no_frame(part)
         if saved is not None:
             start = saved[0] + 1
             observed.restore(saved[1])
         elif earlier is not None and observed.restore_earlier(earlier[1]):
             start = earlier[0]
             say(f"texture: goes on from the statistics of {start} frames")
-        read, order = partial(read_frame, frames), range(start, len(frames))
-        sampled = samples_from_frames(surface, frames, read, order, part)
-        for some in progress(sampled, total=len(frames) - start, label="texture", unit="frames"):
-            observed.add(some, quantile)
-            run.save_latest_in_time(name, some.frame, observed.arrays)
+        if workers := run.elsewhere():
+            shares = shares_of(part, workers)
+            name = f"{name}-from-{start}"
+            pieces = [(own, start, observed.of(own).arrays() if start else None) for own in shares]
+            observed.restore(
+                among_workers(run, name, shares, _seen_by_frames, shown, pieces, "texture")
+            )
+        else:
+            frames_left = _with_frames(shown, part, start, observed)
+            total = len(frames) - start
+            for frame in progress(frames_left, total=total, label="texture", unit="frames"):
+                run.save_latest_in_time(name, frame, observed.arrays)
         going_on.keep_statistics(part, observed.arrays())
         return observed.measured(quantile)
 
-    frames = frames.at(going_on.order)
     groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
     return _filled_in(texels, found, contradicting_frames(frames, found.probes))
+
+
+class _Shown(NamedTuple):
+    """What is seen by which frames."""
+
+    surface: TexturedScene
+    frames: Frames
+    quantile: float
+
+    def by_no_frame(self, part: slice) -> Observation:
+        """The statistics with which texels begin."""
+        probes = Probes.empty(len(self.surface.texels), len(self.frames), part)
+        return Observation.empty(part, probes)
+
+
+def _with_frames(shown: _Shown, part: slice, start: int, observed: Observation) -> Iterator[int]:
+    """Add the frames from number ``start`` on to what was observed of the texels of ``part``, and
+    give the number of each that is in it."""
+    surface, frames, quantile = shown
+    read, order = partial(read_frame, frames), range(start, len(frames))
+    for some in samples_from_frames(surface, frames, read, order, part):
+        observed.add(some, quantile)
+        yield some.frame
+
+
+def _seen_by_frames(
+    shown: _Shown, piece: tuple[slice, int, dict[str, Array] | None]
+) -> Mapping[str, Array]:
+    """A unit of work: the statistics of some texels, from a frame on after earlier ones."""
+    part, start, earlier = piece
+    observed = shown.by_no_frame(part)
+    if earlier is not None:
+        observed.restore(earlier)
+    for _ in _with_frames(shown, part, start, observed):
+        pass
+    return observed.arrays()
 
 
 def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float]) -> LitTexture:

@@ -158,6 +158,8 @@ def _in_view(
 
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
+# Sides of a texel from its middle to any place of it, at most; charts stretch.
+_BESIDE_MIDDLE = 2.0
 
 
 class FrameSamples(NamedTuple):
@@ -249,6 +251,20 @@ class Observation:
             self.darkness[dark] += share * (seen.darkness - self.darkness[dark])
         self.probes.add(seen.frame, seen.texel, seen.radiance)
 
+    def of(self, part: slice) -> Observation:
+        """The same of the texels of ``part``, which are among these."""
+        own = slice(part.start - self.first, part.stop - self.first)
+        return Observation(
+            first=part.start,
+            quantiles=QuantileState._make(values[own] for values in self.quantiles),
+            clipped=self.clipped[own],
+            lower_bound=self.lower_bound[own],
+            dark=self.dark[own],
+            darkness=self.darkness[own],
+            weight=self.weight[own],
+            probes=self.probes.of(part),
+        )
+
     def arrays(self) -> dict[str, Array]:
         """All of its state."""
         return {
@@ -301,14 +317,17 @@ def samples_from_frames(
     part: slice | None = None,
 ) -> Iterator[FrameSamples]:
     """What the frames of ``order`` show of the texels of ``part`` (None: all), one by one; that of
-    the next ones is found while one is used."""
+    the next ones is found while one is used. Frames before which none of them lie are not read."""
     texels = surface.texels
     owner = texels.object_index()
     blocks = blocks_of_texels(texels, part or slice(0, len(texels)))
 
     def samples(i: int) -> FrameSamples:
-        pixels, camera = read(i), frames.camera(i)
+        camera = frames.camera(i)
         which = blocks.texels_in_view(camera, MIN_COSINE)
+        if not len(which):
+            return _nothing(i)
+        pixels = read(i)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
         picture = Picture.of(pixels)
         kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
@@ -325,6 +344,21 @@ def samples_from_frames(
         )
 
     return ahead(samples, order)
+
+
+def _nothing(frame: int) -> FrameSamples:
+    none, colours = np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
+    return FrameSamples(frame, none, colours, none, 1.0, none, colours, 1.0)
+
+
+def frames_in_view(texels: Texels, part: slice, frames: Frames, own: Sequence[int]) -> list[int]:
+    """Which of the frames ``own`` may have pixels on the texels of ``part``: no others do."""
+    blocks = blocks_of_texels(texels, part)
+    # A pixel shows a texel at any place of it, not its middle alone.
+    side = np.sqrt(texels.area[blocks.order])
+    reach = _BESIDE_MIDDLE * np.maximum.reduceat(side, blocks.first[:-1])
+    blocks = blocks._replace(radius=(blocks.radius + reach).astype(np.float32))
+    return [i for i in own if len(blocks.texels_in_view(frames.camera(i), MIN_COSINE))]
 
 
 def spread_order(count: int) -> list[int]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.memory import GIB, give_back_freed, machine_bytes, resident_bytes
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
+from usdbrdf.job.units import Unit
 from usdbrdf.model.arrays import Array
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene
@@ -31,6 +32,8 @@ _PER_TEXEL = 6000
 _PROCESS = GIB // 2
 # A pass costs reading all frames: smaller groups than this, and more of them, are not worth it.
 _SMALLEST_GROUP, _MOST_PASSES = 250_000, 12
+# What one worker does of a pass at least, and at most, texels.
+_SMALLEST_SHARE, _LARGEST_SHARE = 4096, 1 << 22
 
 
 class BytesPerTexel(NamedTuple):
@@ -66,11 +69,42 @@ def in_passes(
     )
 
 
+def shares_of(part: slice, workers: int) -> list[slice]:
+    """Consecutive texels of the ``part`` for each of so many workers, as many for one as for
+    another; more of them where that would be too much to do twice, when a worker dies."""
+    count = part.stop - part.start
+    most = min(max(-(-count // workers), _SMALLEST_SHARE), _LARGEST_SHARE)
+    return [slice(part.start + own.start, part.start + own.stop) for own in _groups(count, most)]
+
+
+def among_workers(
+    run: TaskRun,
+    name: str,
+    shares: Sequence[slice],
+    unit: Unit,
+    given: Any,
+    pieces: Sequence[Any],
+    label: str,
+) -> dict[str, Array]:
+    """Arrays of consecutive texels, each of the ``shares`` of which is a unit of work, one pass
+    over the frames that show it, with a piece of its own."""
+    named = {
+        f"{name}-{share.start}-{share.stop}": piece
+        for share, piece in zip(shares, pieces, strict=True)
+    }
+    found = run.units(unit, given, named, label=label, noun="groups of texels")
+    return joined(found)
+
+
 def by_parts(
     parts: Iterable[slice], arrays_of: Callable[[slice], Mapping[str, Array]]
 ) -> dict[str, Array]:
     """Arrays of all rows, from the ``arrays_of`` consecutive parts of them."""
-    found = [dict(arrays_of(part)) for part in parts]
+    return joined([dict(arrays_of(part)) for part in parts])
+
+
+def joined(found: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    """Arrays of all rows, from dictionaries of consecutive ones, which are empty afterwards."""
     # One by one, so that no more than one of them is there twice.
     return {name: np.concatenate([some.pop(name) for some in found]) for name in list(found[0])}
 

@@ -16,18 +16,17 @@ noise that the pixels of a frame share, so much as one half of the frames contra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.job.task import TaskRun
 from usdbrdf.kernel import loop, parallel_kernel
 from usdbrdf.model.arrays import Array, Float, Int, Long
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.footprints import around, blurred
-from usdbrdf.texturing.passes import in_passes, with_rows_beside
+from usdbrdf.texturing.passes import with_rows_beside
 from usdbrdf.texturing.pattern_pixels import ACROSS, REACH, Covering, PatternedSurface, covers
 from usdbrdf.transport.warps import shifts_of
 
@@ -251,32 +250,37 @@ def half_of(frame: int) -> int:
     return turn ^ (frame & 1)
 
 
-def with_patterns(
-    run: TaskRun,
+def steps_of(
     surface: PatternedSurface,
-    pixels: Callable[[], Iterator[Covering]],
-    footprint: Float,
-    groups: Sequence[slice],
+    pixels: Iterable[tuple[int, Covering]],
+    part: slice,
+    level: Float,
     seed: int,
+) -> dict[str, Array]:
+    """``steps`` of the texels of ``part``, with what tells of them beside it.
+
+    pixels  of frames, each with its number
+    level   (T,): the radiance of which contrasts are a share
+    """
+    whole = with_rows_beside(surface.texels, part, ROWS_BESIDE)
+    equations = Equations.empty(whole.stop - whole.start)
+    for frame, some in pixels:
+        add(equations, whole.start, surface, some, half_of(frame))
+    found = steps(equations, whole, surface, level[whole], seed)
+    inner = slice(part.start - whole.start, part.stop - whole.start)
+    return {name: array[inner].copy() for name, array in found.items()}
+
+
+def with_patterns(
+    surface: PatternedSurface, footprint: Float, steps_by: Callable[[Float], Mapping[str, Array]]
 ) -> Float:
-    """The ``values`` (T, 3) of the ``surface`` with what ``pixels`` of all frames tell beside them.
+    """The ``values`` (T, 3) of the ``surface`` with what pixels of all frames tell beside them.
 
     footprint  (T, 3): what a pixel covers, see ``blurred``
-    groups     of texels whose equations fit into memory; each is one pass over the frames
+    steps_by   gives ``steps_of`` of all texels by their ``level``
     """
     texels, values = surface.texels, surface.values
-    level = blurred(texels, values, footprint).mean(axis=1)
-
-    def observe(part: slice) -> dict[str, Array]:
-        whole = with_rows_beside(texels, part, ROWS_BESIDE)
-        equations = Equations.empty(whole.stop - whole.start)
-        for frame, some in enumerate(pixels()):
-            add(equations, whole.start, surface, some, half_of(frame))
-        found = steps(equations, whole, surface, level[whole], seed)
-        inner = slice(part.start - whole.start, part.stop - whole.start)
-        return {name: array[inner].copy() for name, array in found.items()}
-
-    found = in_passes(run, "patterns", groups, observe)
+    found = steps_by(blurred(texels, values, footprint).mean(axis=1))
     share = share_that_is_no_noise(texels, found["told"], footprint)
     sharper: Float = np.maximum(values + share[:, None] * found["step"], 0)
     return sharper
