@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -123,6 +125,24 @@ def test_no_sun_is_found_where_none_shines(yard):
         or (found.environment.sun.irradiance * TOWARDS[2] < 0.1 * sun).all()
     )
     np.testing.assert_allclose(sun, _of_upper_half(SKY), rtol=0.35)
+
+
+@pytest.mark.parametrize(("stars", "night"), [(0.0, True), (0.005, True), (0.03, False)])
+def test_where_next_to_nothing_shines_the_rest_is_dark_too(yard, stars: float, night: bool):
+    surface, lit, _ = _lit(yard, Environment(0 * SKY, True).under(SUN))
+    looked_at = _seen(_UP < 0.3)
+    shines = np.random.default_rng(1).random(looked_at.dark.shape) < stars
+    dark = looked_at.coverage.measured & ~shines
+    radiance = np.where(dark[:, None], np.float32(1e-3), looked_at.radiance)
+    seen = replace(looked_at, radiance=radiance, dark=dark)
+    every = np.ones(len(lit), np.bool_)
+    found = light_from_outside(surface, lit, CoverageMap.of(every, ~every), seen, True, seed=3)
+    assert found is not None
+    assert found.is_inferred is not night
+    unseen = ~looked_at.coverage.measured.reshape(HEIGHT, WIDTH)
+    assert (found.environment.image[unseen].max() < 0.01) == night
+    known = found.environment.image[~unseen]
+    np.testing.assert_array_equal(known, radiance.reshape(HEIGHT, WIDTH, 3)[~unseen])
 
 
 def test_a_closed_room_has_no_light_from_outside(yard):

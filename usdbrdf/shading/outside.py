@@ -167,8 +167,9 @@ def light_from_outside(
             return None
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     hidden = float(share.mean(axis=1).sum()) / np.pi
-    night = seen.dark.any() and not (measured & ~seen.dark).any() and not clipped.any()
-    if night and hidden < _HIDDEN_BY_NIGHT * open_share:  # as all that is seen, so the rest
+    if (
+        seen.is_night() and hidden < _HIDDEN_BY_NIGHT * open_share
+    ):  # as all that is seen, so the rest
         radiance = _picture(seen, patches, np.zeros(0, np.int64), np.zeros((0, 3)), z_up)
         confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
         environment = Environment(radiance, z_up)

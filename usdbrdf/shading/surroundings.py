@@ -36,6 +36,7 @@ _LEAST_FLOOR = 1e-12  # W/(m^2 sr), so that frames without noise weigh something
 _LEAST_SKY = calibration.number("outside.least_sky")
 _SLOPE = calibration.pair("outside.sky_slope")
 _SCATTER = calibration.number("outside.sky_scatter")
+_SHINES_AT_NIGHT = calibration.number("outside.shines_at_night")
 _STEPS = 3
 
 
@@ -61,7 +62,7 @@ class Surroundings:
         horizon, the plane through the logarithms of its radiance over the direction's three
         coordinates, as skies darken away from the sun and from the horizon. Below the horizon it
         goes on as at it. The steeper it is for what little was measured, the less it is believed;
-        where nothing was, it is the median of all."""
+        where nothing was, and by night, it is the median of all."""
         directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
         up = 2 if z_up else 1
         usual = self.median()
@@ -70,7 +71,7 @@ class Surroundings:
         sky = self.coverage.measured & ~self.dark & (directions[:, up] > 0)
         sky &= (self.radiance > 0).all(axis=1)
         solid = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[sky]
-        if solid.sum() < _LEAST_SKY:
+        if self.is_night() or solid.sum() < _LEAST_SKY:
             return np.tile(usual, (len(sky), 1))
         log = np.log(self.radiance[sky].astype(np.float64))
         weight = solid / solid.sum()
@@ -88,11 +89,18 @@ class Surroundings:
                 slope[:, c] = np.linalg.solve(spread + noise * np.diag(steep**-2), both[:, c])
         return np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
 
+    def is_night(self) -> bool:
+        """Whether next to nothing shines of what was measured."""
+        if not self.dark.any() or self.coverage.clipped.any():
+            return False
+        solid = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH) * self.coverage.measured
+        return float((solid * ~self.dark).sum()) < _SHINES_AT_NIGHT * float(solid.sum())
+
     def median(self) -> Double:
-        """(3,) of what was measured and is not dark, or of what is; 0 without any."""
+        """(3,) of what was measured and is not dark, or of what is, as by night; 0 without any."""
         known = self.coverage.measured
         shines = known & ~self.dark
-        known = shines if shines.any() else known
+        known = shines if shines.any() and not self.is_night() else known
         if not known.any():
             return np.zeros(3)
         return np.asarray(np.median(self.radiance[known].astype(np.float64), axis=0))
