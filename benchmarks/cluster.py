@@ -1,12 +1,13 @@
 """What other processes change of a conversion: no byte, and how much of its time.
 
-    python benchmarks/cluster.py CAPTURE [-o FOLDER] [--turns 3] [--kills 5] -- --texel-size 0.05
+    python benchmarks/cluster.py CAPTURE [-o FOLDER] [--turns 3] [--kills 20] -- --texel-size 0.05
 
-The capture is ingested and textured once; what follows `--` are more options of `usdbrdf texture`.
-Then `usdbrdf convert` does the rest in fresh copies, in turns: in one process, and on 1, 2 and 4
-workers. Then on 2 workers of which one is killed with SIGKILL every few seconds; with one that is
-stopped (SIGSTOP); and with a scheduler of its own, which is killed, and started for the same
-command once more. Every published file counts.
+The capture is ingested once; what follows `--` are more options of `usdbrdf convert`, which does
+the rest in fresh copies, in turns: in one process, and on 1, 2 and 4 workers. Then on 2 workers of
+which one is killed with SIGKILL every few seconds; with one that is stopped (SIGSTOP); and with a
+scheduler of its own: that is killed, and started for the same command once more; one of its workers
+may write no file of more than 64 KiB, as if its disk were full; and one is in a network of its own
+(root alone may make one), which is cut. Every published file counts.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from usdbrdf.files.atomic import sha256_of
 WORKERS = (1, 2, 4)
 # Seconds: between blows, at least and at most; and that a unit may take where one worker hangs.
 BLOWS, LIMIT = (2.0, 6.0), 30.0
+FULL_DISK, CUT_OFF = "full-disk", "cut-off"
 
 
 def main() -> int:
@@ -43,7 +45,7 @@ def main() -> int:
     parser.add_argument("capture", type=Path)
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--turns", type=int, default=3)
-    parser.add_argument("--kills", type=int, default=5)
+    parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     given = sys.argv[1:]
     end = given.index("--") if "--" in given else len(given)
@@ -63,7 +65,6 @@ class Bench:
         self.capture, self.options = capture, options
         self.made = folder / "made" / "asset"
         run("ingest", str(capture), "-o", str(self.made))
-        run("texture", str(self.made), *options)
 
     def measure(self, turns: int, kills: int) -> dict[str, Any]:
         alone = self.steps("alone-0")
@@ -93,6 +94,10 @@ class Bench:
         count(f"{stopped.struck} stopped", found)
         status, found = self.scheduler_killed()
         count("scheduler killed", found)
+        statuses = {}
+        for name, second in (("full disk", FULL_DISK), ("cut network", CUT_OFF)):
+            statuses[name], found = self.second_worker_fails(second)
+            count(name, found)
         same = [figure(f"{name}: files that differ", n, "", most=0) for name, n in differ.items()]
         of_engine = ratio(spent[2][:turns], spent[0][:turns])
         return {
@@ -101,6 +106,7 @@ class Bench:
             "kills": blows.struck,
             "killed": took._asdict(),
             "scheduler's end": status,
+            "first ends": statuses,
             "figures": [
                 *same,
                 figure("kills", blows.struck, "", least=kills),
@@ -142,14 +148,34 @@ class Bench:
                 time.sleep(0.1)
             process.kill()
 
-        with scheduler() as (address, process):
+        with scheduler() as (address, process, _):
             thread = threading.Thread(target=strike, args=(process,), daemon=True)
             thread.start()
             status = self.convert(asset, "--scheduler", address, check=False)
             thread.join()
-        with scheduler() as (address, _):
+        with scheduler() as (address, *_):
             self.convert(asset, "--scheduler", address)
         return status, contents(asset)
+
+    def second_worker_fails(self, second: str) -> tuple[int, dict[str, str]]:
+        """Exit status where one of two workers fails, and what that or, after a refusal, the same
+        command with good workers published."""
+        asset = self.fresh(second)
+        with scheduler(second) as (address, _, cut):
+            thread = threading.Thread(target=self._cut, args=(asset, cut), daemon=True)
+            thread.start()
+            given = ("--scheduler", address, "--unit-limit", str(LIMIT))
+            status = self.convert(asset, *given, check=False)
+            thread.join()
+        if status:
+            with scheduler() as (address, *_):
+                self.convert(asset, "--scheduler", address)
+        return status, contents(asset)
+
+    def _cut(self, asset: Path, cut: Callable[[], None]) -> None:
+        while not list(asset.glob(".usdbrdf/work/shade-*/checkpoints/tile-*")):
+            time.sleep(0.1)
+        cut()
 
 
 class Blows:
@@ -186,30 +212,68 @@ def run(*arguments: str, during: Blows | None = None, check: bool = True) -> int
 
 
 @contextmanager
-def scheduler() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Address and process of a scheduler on this machine, with two workers."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    address, processes = f"tcp://127.0.0.1:{port}", []
+def scheduler(
+    second: str = "",
+) -> Iterator[tuple[str, subprocess.Popen[bytes], Callable[[], None]]]:
+    """Address and process of a scheduler on this machine, with two workers, the ``second`` of which
+    may be one that fails; and what cuts that one off."""
+    host, prefix, cut = "127.0.0.1", list[str](), lambda: None
+    with ExitStack() as stack:
+        if second == CUT_OFF:
+            host, prefix, cut = stack.enter_context(network())
+        with socket.socket() as free:
+            free.bind((host, 0))
+            port = free.getsockname()[1]
+        address, processes = f"tcp://{host}:{port}", []
 
-    def start(program: str, *words: str) -> None:
-        command = [sys.executable, "-m", f"distributed.cli.{program}", *words, "--no-dashboard"]
-        nowhere = subprocess.DEVNULL
-        one = {"NUMBA_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // 2))}
-        processes.append(
-            subprocess.Popen(command, stdout=nowhere, stderr=nowhere, env=os.environ | one)
-        )
+        def start(program: str, *words: str, before: Sequence[str] = ()) -> None:
+            command = [sys.executable, "-m", f"distributed.cli.{program}", *words, "--no-dashboard"]
+            nowhere = subprocess.DEVNULL
+            one = {"NUMBA_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // 2))}
+            processes.append(
+                subprocess.Popen(
+                    [*before, *command], stdout=nowhere, stderr=nowhere, env=os.environ | one
+                )
+            )
 
-    start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port))
-    for _ in range(2):
-        start("dask_worker", address, "--nthreads", "1", "--no-nanny", "--memory-limit", "0")
+        start("dask_scheduler", "--host", host, "--port", str(port))
+        worker = "dask_worker", address, "--nthreads", "1", "--no-nanny", "--memory-limit", "0"
+        start(*worker)
+        if second == FULL_DISK:
+            prefix = ["prlimit", "--fsize=65536"]
+        start(*worker, before=prefix)
+        try:
+            yield address, processes[0], cut
+        finally:
+            for process in processes:
+                process.kill()
+                process.wait()
+
+
+@contextmanager
+def network() -> Iterator[tuple[str, list[str], Callable[[], None]]]:
+    """This machine's address in a network with one other, what begins a command there, and what
+    cuts that network."""
+    name, inside = "usdbrdf", "usdbrdf-in"
+    own, other = "10.213.7.1", "10.213.7.2"
+
+    def ip(*words: str) -> None:
+        subprocess.run(["ip", *words], check=True)
+
+    ip("netns", "add", name)
     try:
-        yield address, processes[0]
+        ip("link", "add", name, "type", "veth", "peer", "name", inside, "netns", name)
+        ip("address", "add", f"{own}/24", "dev", name)
+        ip("link", "set", name, "up")
+        within = ["ip", "netns", "exec", name]
+        for words in (
+            ("address", "add", f"{other}/24", "dev", inside),
+            ("link", "set", inside, "up"),
+        ):
+            subprocess.run([*within, "ip", *words], check=True)
+        yield own, within, lambda: ip("link", "set", name, "down")
     finally:
-        for process in processes:
-            process.kill()
-            process.wait()
+        ip("netns", "delete", name)
 
 
 def contents(asset: Path) -> dict[str, str]:
