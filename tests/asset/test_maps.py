@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import usdbrdf
-from tests.scenes import make_capture
+from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.asset import maps as module
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
@@ -36,3 +36,31 @@ def test_every_map_is_decoded_once(tmp_path, monkeypatch: pytest.MonkeyPatch):
         maps.map_where_present("albedo", 3)
     assert {name.split(".")[1] for name in decoded} >= {"lit", "albedo", "samples"}
     assert set(decoded.values()) == {1}
+
+
+def test_light_that_was_inferred_is_doubted_by_its_errors(tmp_path, monkeypatch):
+    """Of a lamp, only where no frame measured it."""
+    made = make_capture(
+        tmp_path / "scan", subdivisions=1, poses=poses_down_and_up(6, 6),
+        radiance={"ceiling": (0.125, 0.125, 0.125)}, size=(48, 36), saturation_radiance=4.0,
+    )  # fmt: skip
+    with usdbrdf.working_on(tmp_path / "room") as asset:
+        usdbrdf.ingest(made.folder, asset, usdbrdf.IngestOptions())
+        usdbrdf.texture(asset, usdbrdf.TextureOptions(texel_size=0.2))
+        usdbrdf.shade(asset, usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.2)))
+    maps = AssetMaps(open_measured(asset))
+    (lamp,) = (obj.prim_path for obj in maps.scene.objects if obj.identifier == "lamp")
+    # Only a bound of it is known.
+    assert maps.doubts_of_light == {lamp: 1.0}
+    inferred = maps.emissive & ~maps.coverage.measured
+    doubt = maps.light_in_doubt("estimate")
+    assert doubt is not None
+    center = np.array([maps.texels.face[inferred], *maps.texels.barycentric[inferred, 1:].T])
+    shown = doubt.radiance.at(center[0].astype(np.int32), *np.float32(center[1:]))
+    np.testing.assert_allclose(shown.mean(axis=0), maps.emission[inferred].mean(axis=0), rtol=0.05)
+    every = doubt.radiance.at(
+        maps.texels.face.astype(np.int32), *np.float32(maps.texels.barycentric[:, 1:].T)
+    )
+    assert not every[~maps.emissive & maps.coverage.measured].any(axis=1).mean() > 0.02
+    monkeypatch.setitem(maps.__dict__, "doubts_of_light", {})
+    assert maps.light_in_doubt("estimate") is None

@@ -14,9 +14,16 @@ import pytest
 from tests.physics.brdf import f_nd
 from tests.physics.surfaces import World, box, room, sphere, world_of
 from tests.scenes import camera_at, look_at
+from usdbrdf.material.conductor import Conductor
 from usdbrdf.material.fit_target import fit_target_frame
-from usdbrdf.material.fit_views import fit_views, sampled_object
-from usdbrdf.material.observations import Follower
+from usdbrdf.material.fit_views import (
+    SampledObject,
+    fit_views,
+    sampled_object,
+    share_in_doubt,
+    with_doubts_of_light,
+)
+from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import LitScene, View
 
@@ -173,10 +180,30 @@ def test_the_material_of_a_sphere_comes_back(studio: Studio, phi: float, psi: fl
     assert literal.cost > 2 * found.cost
 
 
-def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studio: Studio):
-    # Nine views on an arc around the sphere. L_d of the sphere, as the fit gets it, is wrong by a
-    # factor and a gradient; the lobe shows in how a texel changes from view to view.
-    phi, psi = 0.12, 0.4
+OF_VIEWS = 0.12, 0.4
+
+
+class Views(NamedTuple):
+    """What ``fit_views`` needs of nine views on an arc around the sphere."""
+
+    radiance: np.ndarray
+    observed: Observations
+    smoothing: float
+    cameras: list[Camera]
+
+    def sampled(self, lit: LitScene, doubt: LitScene | None = None) -> SampledObject:
+        given = self.observed, self.smoothing, self.cameras.__getitem__, SPHERE
+        found, used = sampled_object(lit, *given, doubt=doubt)
+        assert found is not None
+        assert used > 500
+        return found
+
+
+@pytest.fixture(scope="module")
+def views(studio: Studio) -> Views:
+    # L_d of the sphere, as the fit gets it, is wrong by a factor and a gradient; the lobe shows in
+    # how a texel changes from view to view.
+    phi, psi = OF_VIEWS
     wrong = _true_radiance(studio.world)
     own = studio.world.texels.of_object(SPHERE)
     wrong[own] *= (0.8 + studio.world.texels.position[own, :1]).astype(np.float32)
@@ -196,14 +223,50 @@ def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(studi
         )
         follower.add(i, view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
-    observed, smoothing = follower.chosen(0).of_texels(own), follower.smoothing
-    sampled, used = sampled_object(lit, observed, smoothing, cameras.__getitem__, SPHERE)
-    assert sampled is not None
-    assert used > 500
+    return Views(wrong, follower.chosen(0).of_texels(own), follower.smoothing, cameras)
+
+
+def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(
+    studio: Studio, views: Views
+):
+    (phi, psi), lit = OF_VIEWS, _lit_scene(studio.world, views.radiance)
+    sampled = views.sampled(lit)
     found, _ = fit_views(lit.lobe, lambda: sampled, 0)
     assert found.phi == pytest.approx(phi, abs=0.04)
     assert found.psi == pytest.approx(psi, abs=0.1)
     assert found.evidence > 0.5
+
+
+def test_psi_is_known_no_better_than_the_lamp_that_is_mirrored(studio: Studio, views: Views):
+    world, lit = studio.world, _lit_scene(studio.world, views.radiance)
+    lamp = np.isin(world.texels.object_index(), range(6, 12))[:, None]
+
+    def only(values: np.ndarray) -> LitScene:
+        return _lit_scene(world, np.where(lamp, values, 0).astype(np.float32))
+
+    found, _ = fit_views(lit.lobe, lambda: views.sampled(lit), 0)
+    off = 0.3
+    sampled = views.sampled(lit, only(off * views.radiance))
+    share = share_in_doubt(sampled, lit.lobe, found.phi, 0)
+    # Most of the highlight is the lamp's.
+    assert 0.6 * off < share < 1.05 * off
+    brighter = _lit_scene(world, np.where(lamp, 1 + off, 1) * views.radiance)
+    dimmer, _ = fit_views(lit.lobe, lambda: views.sampled(brighter), 0)
+    assert dimmer.psi == pytest.approx(found.psi / (1 + share), rel=0.08)
+
+    doubted, _ = with_doubts_of_light(lit.lobe, lambda: sampled, 0, found, None)
+    error = np.hypot(found.psi_error, found.psi * share)
+    assert doubted == found._replace(psi_error=error, psi_upper=doubted.psi_upper)
+    assert doubted.psi_upper > found.psi_upper
+    # And of a metal F0, where psi itself is not known.
+    metal = Conductor(found.phi, (0.9, 0.8, 0.7), 0.02, 0.03, 1.0)
+    _, of_metal = with_doubts_of_light(lit.lobe, lambda: sampled, 0, found, metal)
+    assert of_metal is not None
+    assert of_metal.f0_error == pytest.approx(0.9 * share, rel=0.15)
+    assert of_metal.f0 == metal.f0
+    # What was seen is not doubted.
+    seen = views.sampled(lit)
+    assert with_doubts_of_light(lit.lobe, lambda: seen, 0, found, None) == (found, None)
 
 
 def test_a_sphere_without_specular_gets_none(studio: Studio):

@@ -21,6 +21,7 @@ from usdbrdf.asset.readers.scene import (
     frames_from_stage,
     light_from_outside,
     lighting_of_stage,
+    read_shading,
     scene_from_stage,
 )
 from usdbrdf.errors import InputRefused
@@ -49,6 +50,8 @@ _AT_A_TIME = min(4, os.cpu_count() or 1)
 _MAX_WIDTH = 640
 # The camera is chosen among this many frames, by about this many rays through each.
 _CANDIDATES, _RAYS = 64, 2000
+# Of light of which only a bound is known: relative error.
+_OF_BOUND = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,6 +244,44 @@ class AssetMaps:
     def lit_scene(self, environment: Environment) -> LitScene:
         """All that light transport needs, with ``light`` as the light."""
         return lit_scene(self.surface, self.light, self.emissive, environment)
+
+    @cached_property
+    def doubts_of_light(self) -> dict[str, float]:
+        """Relative standard errors of the light that was inferred, not seen: of lamps that clip in
+        every frame or that none shows, by prim path, and of "sky" and "sun"."""
+        found = {}
+        for obj in self.scene.objects:
+            shading = read_shading(self.stage, obj.prim_path)
+            if shading and shading.emitter and shading.radiance_status != "measured":
+                known = shading.radiance_status == "estimated"
+                found[obj.prim_path] = shading.radiance_error if known else _OF_BOUND
+        if (outside := light_from_outside(self.stage)) is not None:
+            found |= {"sky": outside[0].sky_error, "sun": outside[0].sun_error}
+        return {name: error for name, error in found.items() if error > 0}
+
+    def light_in_doubt(self, asked: Surroundings) -> LitScene | None:
+        """The scene in nothing but the standard errors of its light; None where all of that was
+        seen. What a file says of the surroundings is not doubted."""
+        doubts = self.doubts_of_light
+        of_object = [doubts.get(obj.prim_path, 0.0) for obj in self.scene.objects]
+        error = np.array(of_object, np.float32)[self.texels.object_index()]
+        inferred = self.emissive & ~self.coverage.measured & (error > 0)
+        light = np.where(inferred[:, None], error[:, None] * self.emission, np.float32(0))
+        outside = self._doubts_of_outside() if asked == ESTIMATE else black_environment()
+        if not (inferred.any() or outside.image.any() or outside.sun.shines):
+            return None
+        return lit_scene(self.surface, light, inferred, outside)
+
+    def _doubts_of_outside(self) -> Environment:
+        found, doubts = light_from_outside(self.stage), self.doubts_of_light
+        if found is None or not doubts.keys() & {"sky", "sun"}:
+            return black_environment()
+        record, picture = found
+        environment = self.environment(ESTIMATE)
+        known = read_exr(picture.with_name(Path(record.confidence).name))[..., :1] > 0
+        sky = np.where(known, np.float32(0), np.float32(doubts.get("sky", 0)) * environment.image)
+        sun = environment.sun._replace(irradiance=doubts.get("sun", 0) * environment.sun.irradiance)
+        return Environment(sky, environment.z_up).under(sun)
 
     def has(self, aov: str) -> bool:
         """Whether any object has the map."""

@@ -33,6 +33,7 @@ from usdbrdf.material.fit_views import (
     fit_views,
     joined_object,
     sampled_object,
+    with_doubts_of_light,
 )
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
@@ -73,11 +74,13 @@ class Survey:
 
 
 class Lighting(NamedTuple):
-    """A scene in one light, what the frames that show it so told, and S (T, 3), W/m^2, in it."""
+    """A scene in one light, what the frames that show it so told, and S (T, 3), W/m^2, in it; and
+    the scene in nothing but the standard errors of its light, None where all of that was seen."""
 
     lit: LitScene
     survey: Survey
     irradiance: Float | None = None
+    doubt: LitScene | None = None
 
 
 class ObjectFit(NamedTuple):
@@ -324,7 +327,7 @@ def _of_each_object(
 def _sizes(lightings: Sequence[Lighting]) -> list[int]:
     """How many observations there are of each object."""
     sizes = np.zeros(len(lightings[0].lit.scene.objects), np.int64)
-    for lit, survey, _ in lightings:
+    for lit, survey, *_ in lightings:
         owner = lit.texels.object_index()[survey.observations.texel]
         sizes += np.bincount(owner, minlength=len(sizes))
     return [*map(int, sizes)]
@@ -335,10 +338,10 @@ def _sampled(
 ) -> tuple[SampledObject | None, int]:
     """What all lightings show of an object, and the number of samples."""
     found, camera_of = [], reader.frames.camera
-    for lit, survey, irradiance in lightings:
+    for lit, survey, irradiance, doubt in lightings:
         own = survey.observations.of_texels(lit.texels.of_object(index))
         found.append(
-            sampled_object(lit, own, survey.smoothing, camera_of, index, mixture, irradiance)
+            sampled_object(lit, own, survey.smoothing, camera_of, index, mixture, irradiance, doubt)
         )
     sampled = joined_object([one for one, _ in found if one])
     return sampled, len(sampled.samples.texel) if sampled else sum(number for _, number in found)
@@ -379,6 +382,8 @@ def fit_object(
 
     first = look.lobes.get(lobe) if look else None
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
+    if any(one.doubt for one in lightings):
+        fitted, metal = with_doubts_of_light(lobe, sampled, options.seed, fitted, metal)
     found = ObjectFit(
         *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
         fitted.contradiction, num_samples=used, target=target, beckmann=int(lobe == BECKMANN),

@@ -24,8 +24,8 @@ from usdbrdf.material.fit_lobe import (
     repeated_where_noisy,
 )
 from usdbrdf.material.observations import Observations
-from usdbrdf.material.verdict import SOME_EVIDENCE, LobeEstimate
-from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.material.verdict import MAX_PSI_ERROR, NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate
+from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
@@ -46,6 +46,8 @@ ABOVE_NOISE = calibration.number("fit.above_noise")
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
+_UPPER = 1.645  # standard deviations that are exceeded with a probability of 5 %
+_SEED_OF_DOUBT = 0xD0B7
 
 
 class SampledPart(NamedTuple):
@@ -54,12 +56,14 @@ class SampledPart(NamedTuple):
     observed    those whose footprint lies on the object as a whole
     footprints  surface points of each sample, for the usual width and, on curved objects, others
     irradiance  (P, 3), W/m^2, S at each sample's texel; None where it is not known
+    doubt       the scene in nothing but the standard errors of its light; None where it was seen
     """
 
     lit: LitScene
     observed: Observations
     footprints: list[SurfacePoints]
     irradiance: Float | None
+    doubt: LitScene | None = None
 
 
 class SampledObject(NamedTuple):
@@ -101,6 +105,21 @@ class SampledObject(NamedTuple):
             return base - taken[0], slope - taken[1]
 
         return basis
+
+    def slope(self, kind: int, phi: float, seed: int, *, of_doubt: bool = False) -> Float:
+        """(P, 3, 1) of I_nd = base + psi slope, of the usual footprint; of_doubt: of what the light
+        may be off by alone."""
+        found = []
+        ends = np.cumsum([len(part.observed.texel) for part in self.parts])
+        for part, stream in zip(self.parts, np.split(self.samples.texel, ends[:-1]), strict=True):
+            lit = part.doubt if of_doubt else part.lit
+            if lit is None:
+                found.append(np.zeros((len(stream), 3, 1), np.float32))
+                continue
+            points, mixture = part.footprints[0], self.mixture
+            basis = lobe_basis(lit, points, len(stream), seed, mixture, stream)
+            found.append(basis(kind, [phi])[1])
+        return np.concatenate(found)
 
     def _cosine(self, width: int) -> Float:
         """(P,): of the angle between the normal and the camera, the mean over the footprint."""
@@ -161,13 +180,14 @@ def sampled_object(
     index: int,
     mixture: Mixture = MIXTURE,
     irradiance: Float | None = None,
+    doubt: LitScene | None = None,
 ) -> tuple[SampledObject | None, int]:
     """Object ``index`` as its observations show it, and the number of samples; None if too few.
 
     smoothing: of the pictures, in pixels, see ``smoothing_of``. camera_of(frame): the images
     themselves are not needed.
     mixture: the rays of each of a sample's points, traced three times, or where their noise matters
-    fifteen times; curved objects have more. irradiance (T, 3): S, W/m^2.
+    fifteen times; curved objects have more. irradiance (T, 3): S, W/m^2. doubt: see SampledPart.
     """
     observed = observed.take(np.flatnonzero(_clear_of_noise(observed)))
     if not len(observed.texel):
@@ -194,7 +214,7 @@ def sampled_object(
     widths = (_FOOTPRINT, *_OTHER_WIDTHS_PX)[: len(footprints)]
     likely = [_likely(width, smoothing) for width in widths]
     incoming = None if irradiance is None else irradiance[observed.texel]
-    parts = [SampledPart(lit, observed, footprints, incoming)]
+    parts = [SampledPart(lit, observed, footprints, incoming, doubt)]
     return SampledObject(parts, samples, widths, likely, mixture), len(observed.texel)
 
 
@@ -257,6 +277,43 @@ def fit_views(
         of_dielectric=(partial(one, lobe), partial(other, lobe)) if lobe == BECKMANN else None,
     )  # fmt: skip
     return found, conductor
+
+
+def with_doubts_of_light(
+    lobe: int,
+    sampled: Callable[[], SampledObject],
+    seed: int,
+    found: LobeEstimate,
+    metal: Conductor | None,
+) -> tuple[LobeEstimate, Conductor | None]:
+    """The same with the errors that follow from those of light that was inferred, not seen: what a
+    lobe mirrors of a lamp is psi times the lamp's radiance, and only that is measured. All doubts
+    are taken to be off the same way. Where psi is badly known anyway nothing is traced."""
+    if found.evidence < SOME_EVIDENCE or (found.psi_error > MAX_PSI_ERROR and metal is None):
+        return found, metal
+    kind, phi = (lobe, found.phi) if metal is None else (CONDUCTOR, metal.phi)
+    off = share_in_doubt(sampled(), kind, phi, seed)
+    psi_error = min(math.hypot(found.psi_error, found.psi * off), float(NOTHING_KNOWN))
+    above = math.hypot(found.psi_upper - found.psi, _UPPER * found.psi * off)
+    upper = min(max(found.psi_upper, found.psi + above), 1.0)
+    if metal is not None:
+        f0_error = math.hypot(metal.f0_error, off * max(metal.f0))
+        metal = metal._replace(f0_error=f0_error)
+    return found._replace(psi_error=psi_error, psi_upper=upper), metal
+
+
+def share_in_doubt(sampled: SampledObject, kind: int, phi: float, seed: int) -> float:
+    """By which share psi would be off if all light were by its standard error: that of the lobe's
+    slope which mirrors this, as the samples tell psi; from 0 to 1."""
+    model = ViewModel(sampled.samples)
+    first = 3 * (_SEED_OF_DOUBT + seed)
+    slopes = [sampled.slope(kind, phi, first + n) for n in range(2)]
+    slopes.append(sampled.slope(kind, phi, first + 2, of_doubt=True))
+    one, other, doubt = model.reduced(np.concatenate(slopes, axis=2)).parts(3)
+    # Products of independent noises are none on the mean.
+    whole = float(model.product(one, other)[0])
+    part = (float(model.product(one, doubt)[0]) + float(model.product(other, doubt)[0])) / 2
+    return min(max(part / whole, 0.0), 1.0) if whole > 0 else 1.0
 
 
 def _footprints(

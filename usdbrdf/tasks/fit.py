@@ -57,6 +57,9 @@ def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResul
     asked = directives_of(asset, maps[0].stage, OF_FIT)
     if asked:
         chosen["directives"] = asked
+    doubts = [own.doubts_of_light for own in maps]
+    if any(doubts):
+        chosen["doubts_of_light"] = doubts
     inputs: dict[str, str] = {}
     read = (*_READ, *_WEIGHED) if len(maps) > 1 else _READ
     for own in maps:
@@ -90,6 +93,7 @@ def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResul
                     own.own_frames,
                 ),
                 own.irradiance,
+                own.light_in_doubt(options.environment) if options.method == "views" else None,
             )
             for own, scene in zip(maps, lit, strict=True)
         ]
