@@ -202,6 +202,18 @@ def test_the_unit_of_radiance_makes_no_difference(floor: World, scale: float):
     np.testing.assert_allclose(again / np.float32(scale), once, rtol=2e-3, atol=2e-3)
 
 
+def test_pixels_on_some_texels_are_those_of_all(floor: World):
+    surface = _surface(floor, np.ones((SIDE * SIDE, 3), np.float32))
+    camera, shown = _seen(_stripes(), count=3)[1]
+    whole = pixels_of_frame(surface, shown, camera, 1e-4, ERROR)
+    part = slice(20 * SIDE, 30 * SIDE)
+    found = pixels_of_frame(surface, shown, camera, 1e-4, ERROR, part)
+    own = (whole.texel >= part.start) & (whole.texel < part.stop)
+    assert 100 < own.sum() < 0.5 * len(own)
+    for some, all_of_them in zip(found, whole.take(own), strict=True):
+        np.testing.assert_array_equal(some, all_of_them)
+
+
 @pytest.fixture(scope="module")
 def strips() -> World:
     """Three strips side by side, with atlases of 20, 9 and 31 texels' width."""

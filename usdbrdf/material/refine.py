@@ -385,7 +385,10 @@ def _with_patterns(
                 )
             looked_at = _looked_at(seen, part)
             bar = progress(
-                _pixels(seen, looked_at), total=len(looked_at), label="fit: patterns", unit="frames"
+                _pixels(seen, part, looked_at),
+                total=len(looked_at),
+                label="fit: patterns",
+                unit="frames",
             )
             return steps_of(surface, bar, part, level, seed)
 
@@ -411,22 +414,28 @@ class _Patterned(NamedTuple):
     seed: int
 
 
+def _told_by(seen: _Patterned, part: slice) -> slice:
+    """The texels whose pixels tell of those of ``part``."""
+    return with_rows_beside(seen.surface.texels, part, ROWS_BESIDE + REACH)
+
+
 def _looked_at(seen: _Patterned, part: slice) -> list[int]:
     """The frames whose pixels may tell of the texels of ``part``."""
-    texels = seen.surface.texels
-    whole = with_rows_beside(texels, part, ROWS_BESIDE + REACH)
-    return frames_in_view(texels, whole, seen.reader.frames, seen.own)
+    texels, frames = seen.surface.texels, seen.reader.frames
+    return frames_in_view(texels, _told_by(seen, part), frames, seen.own)
 
 
-def _pixels(seen: _Patterned, looked_at: Sequence[int]) -> Iterator[tuple[int, Covering]]:
-    """Of each of these frames its number among all, and what its pixels show."""
+def _pixels(
+    seen: _Patterned, part: slice, looked_at: Sequence[int]
+) -> Iterator[tuple[int, Covering]]:
+    """Of each of these frames its number among all, and what its pixels tell of ``part``."""
     surface, samples, _, reader, own, seed = seen
-    frames = reader.frames
+    frames, whole = reader.frames, _told_by(seen, part)
 
     def of_frame(i: int) -> tuple[int, Covering]:
         picture, camera = Picture.of(reader.read(i)), frames.camera(i)
         noise = OF_NOISE_FLOOR * float(frames.noise_floor_radiance[i])
-        found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR)
+        found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR, whole)
         return i - own.start, found.take(_subsample(found.texel, samples[found.texel], i, seed))
 
     return ahead(of_frame, looked_at)
@@ -434,7 +443,7 @@ def _pixels(seen: _Patterned, looked_at: Sequence[int]) -> Iterator[tuple[int, C
 
 def _pattern_of(seen: _Patterned, part: slice) -> Mapping[str, Array]:
     """A unit of work: what the frames tell of some texels."""
-    pixels = _pixels(seen, _looked_at(seen, part))
+    pixels = _pixels(seen, part, _looked_at(seen, part))
     return steps_of(seen.surface, pixels, part, seen.level, seen.seed)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from usdbrdf import calibration
 from usdbrdf.geometry.visible_faces import visible_faces
@@ -58,10 +59,15 @@ class Covering(NamedTuple):
 
 
 def pixels_of_frame(
-    surface: PatternedSurface, picture: Picture, camera: Camera, noise: float, error: float
+    surface: PatternedSurface,
+    picture: Picture,
+    camera: Camera,
+    noise: float,
+    error: float,
+    part: slice | None = None,
 ) -> Covering:
-    """Those that show texels of ``surface`` and no edge, with the deviation ``noise``, W/(m^2 sr),
-    and the share ``error`` of their radiance."""
+    """Those that show texels of ``surface``, of ``part`` alone if it is given, and no edge, with
+    the deviation ``noise``, W/(m^2 sr), and the share ``error`` of their radiance."""
     scene, texels = surface.scene, surface.texels
     face, point = visible_faces(surface.rays, camera)
     surfaces = FirstSurfaces.of(face, point, scene.face_object)
@@ -72,7 +78,12 @@ def pixels_of_frame(
         size[0], scene.points, scene.triangles, scene.face_object, texels.corner_pixel,
         texels.first_pixel, texels.resolution, surface.own, face, point, texel, where,
     )  # fmt: skip
-    fits = picture.valid & (texel >= 0) & ~glares(picture)
+    asked = texel >= 0
+    if part is not None:
+        asked &= (texel >= part.start) & (texel < part.stop)
+    # What others have in common with these counts.
+    near = maximum_filter(asked, 2 * _COMMON + 1)
+    fits = picture.valid & (texel >= 0) & near & ~glares(picture)
     step = np.zeros((*size, 2, 2), np.float32)
     rest = np.full((*size, 3), np.nan, np.float32)
     pixel_size = 1 / float(camera.intrinsics[0])
@@ -88,7 +99,7 @@ def pixels_of_frame(
         size[0], surfaces.object, texel, rest, surface.values, surface.variance, noise, error,
         beside, weight,
     )  # fmt: skip
-    kept = weight > 0
+    kept = (weight > 0) & asked
     return Covering(texel[kept], where[kept], step[kept], beside[kept], weight[kept])
 
 
