@@ -129,6 +129,8 @@ def test_picking_tells_the_numbers_of_what_is_picked(opened, page_file):
     assert len(set(picked.values())) >= 2
     for look in ("lit", "base_color", "phi", "psi", "status", "verdict", "shaded"):
         shown.locator("#look").select_option(look)
+        explained = shown.locator("#look-legend").inner_text()
+        assert bool(explained) == (look in ("phi", "psi", "status", "verdict")), look
     shown.get_by_role("group", name="Captured lamps").get_by_role("checkbox").first.uncheck()
     shown.get_by_label("strength").fill("1.5")
     shown.wait_for_timeout(300)
@@ -242,7 +244,7 @@ def test_long_names_do_not_widen_the_page(opened, page_file, tmp_path, width):
 
 def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
-    metal, guess = (row for row in data["objects"] if row["status"] != "lamp")
+    metal, guess, *_ = (row for row in data["objects"] if row["status"] != "lamp")
     metal.update(f0=[0.9, 0.6, 0.3], psi=1.0, psi_confidence="high")
     guess.update(f0=None, psi=0.25, psi_error=0.5, phi_confidence="none", psi_confidence="none")
     data["warnings"] = [f"number {i} is wrong" for i in range(12)]

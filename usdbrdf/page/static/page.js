@@ -564,7 +564,17 @@
     }
     window.usdbrdfModel = model;
     const looks = { shaded: 'lit by its lamps', lit: 'as photographed', base_color: 'base colour', phi: 'roughness \u03c6', psi: 'specular \u03c8', status: 'what is known', verdict: 'verdicts' };
-    const look = el('select', { id: 'look', onchange: () => model.setLook(look.value) },
+    const numbers = 'One colour per object. Dark violet: 0; yellow: 1; purple: no number.';
+    const legends = {
+      phi: numbers, psi: numbers,
+      status: 'Green: measured. Orange: not determined. Red: the fit failed. Grey: unseen. Yellow: lamp.',
+      verdict: 'Green: accepted. Red: rejected. Grey: none yet.',
+    };
+    const legend = el('p', { class: 'soft', id: 'look-legend', role: 'status' });
+    const look = el('select', {
+      id: 'look',
+      onchange: () => { model.setLook(look.value); legend.textContent = legends[look.value] || ''; },
+    },
       ...Object.entries(looks).map(([value, text]) => el('option', { value }, text)));
     const lamps = data.room.lamps.map((lamp, i) => el('label', {},
       el('input', { type: 'checkbox', checked: true, onchange: (event) => model.setLamp(i, event.target.checked) }), ` ${lamp.label}`));
@@ -577,6 +587,7 @@
     body.append(
       el('div', { class: 'bar' }, el('label', {}, 'Look ', look), el('button', { type: 'button', onclick: () => model.home() }, 'back to the start')),
       el('div', { class: 'stage' }, canvas, picked),
+      legend,
       el('p', { class: 'soft' }, 'Drag to turn, scroll to come closer, click an object for its numbers. Light that surfaces send on to each other is one constant here: pictures of relight are exact.'),
       el('fieldset', {}, el('legend', {}, 'Captured lamps'), el('div', { class: 'bar' }, ...(lamps.length ? lamps : ['None was found.']))),
       el('fieldset', {}, el('legend', {}, 'A light of your own'), el('div', { class: 'bar' }, a, b, c, d)));
