@@ -263,3 +263,21 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     shown.get_by_text("4 more warnings").click()
     assert shown.locator("#warnings .warning:visible").count() == 12
     assert shown.faults == []
+
+
+def test_a_table_of_hundreds_leaves_the_rest_of_the_page_within_reach(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    kinds = data["objects"]
+    data["objects"] = [
+        {**kinds[i % len(kinds)], "id": f"o{i}", "prim": f"/r/o{i}", "label": f"o {i}"}
+        for i in range(300)
+    ]
+    (tmp_path / "many.html").write_text(page({**data, "room": None}), "utf-8")
+    shown = opened((tmp_path / "many.html").as_uri(), viewport={"width": 1440, "height": 900})
+    assert shown.locator("#objects").bounding_box()["height"] < 2 * 900
+    region = shown.get_by_role("region", name="Table of objects")
+    region.evaluate("x => { x.scrollTop = x.scrollHeight; }")
+    box = region.bounding_box()
+    heading = shown.get_by_role("columnheader", name="Roughness").bounding_box()
+    assert box["y"] <= heading["y"] < box["y"] + 10
+    assert shown.locator("#table tbody tr:not(.detail)").last.is_visible()

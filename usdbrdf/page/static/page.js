@@ -26,6 +26,8 @@
 
   // So many are shown at once; the others, of scans with hundreds of objects, are folded.
   const MOST_WARNINGS = 8;
+  // A longer table scrolls by itself: what follows it stays within reach.
+  const MOST_ROWS = 40;
 
   /* --- Capture ------------------------------------------------------------------------------- */
 
@@ -200,6 +202,7 @@
       }
     }
     data.objects.forEach((one, i) => rows.push(row(one, i)));
+    $('table').parentElement.classList.toggle('long', rows.length > MOST_ROWS);
     for (const id of ['filter-name', 'filter-status', 'filter-verdict']) $(id).addEventListener('input', filter);
     $('filter').addEventListener('submit', (event) => event.preventDefault());
     $('save').addEventListener('click', save);
