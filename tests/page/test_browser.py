@@ -129,6 +129,8 @@ def test_picking_tells_the_numbers_of_what_is_picked(opened, page_file):
     assert len(set(picked.values())) >= 2
     for look in ("lit", "base_color", "phi", "psi", "status", "verdict", "shaded"):
         shown.locator("#look").select_option(look)
+        explained = shown.locator("#look-legend").inner_text()
+        assert bool(explained) == (look in ("phi", "psi", "status", "verdict")), look
     shown.get_by_role("group", name="Captured lamps").get_by_role("checkbox").first.uncheck()
     shown.get_by_label("strength").fill("1.5")
     shown.wait_for_timeout(300)
@@ -221,3 +223,61 @@ def test_figures_can_be_read_on_a_screen_of_any_width(opened, page_file, width):
     shown = opened(page_file.as_uri(), viewport={"width": width, "height": 900})
     texts = shown.locator("figure svg text").all()
     assert min(text.bounding_box()["height"] for text in texts) >= 10
+
+
+@pytest.mark.parametrize("width", [1440, 390])
+def test_long_names_do_not_widen_the_page(opened, page_file, tmp_path, width):
+    long, data = 300 * "x", data_of(page_file.read_text("utf-8"))
+    for named in (*data["objects"], *data["room"]["lamps"]):
+        named["label"] = long
+    for view in data["views"]:
+        view["row"]["view"] = long
+    data["warnings"], data["findings"] = [long], [long]
+    (tmp_path / "long.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "long.html").as_uri(), viewport={"width": width, "height": 900})
+    shown.locator("button.name").first.click()
+    assert shown.evaluate("document.documentElement.scrollWidth") <= width
+    for part in ("#table", "#capture", "#views", "#room fieldset"):
+        inside = "x => x.scrollWidth <= x.clientWidth + 1"
+        assert shown.locator(part).first.evaluate(inside), part
+
+
+def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    metal, guess, *_ = (row for row in data["objects"] if row["status"] != "lamp")
+    metal.update(f0=[0.9, 0.6, 0.3], psi=1.0, psi_confidence="high")
+    guess.update(f0=None, psi=0.25, psi_error=0.5, phi_confidence="none", psi_confidence="none")
+    data["warnings"] = [f"number {i} is wrong" for i in range(12)]
+    (tmp_path / "metal.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "metal.html").as_uri())
+    cells = {
+        prim: shown.locator(f'tr[data-prim="{prim}"] td.number')
+        for prim in (metal["prim"], guess["prim"])
+    }
+    assert cells[metal["prim"]].nth(1).inner_text() == "metal"
+    assert "F0 high" in shown.locator(f'tr[data-prim="{metal["prim"]}"]').inner_text()
+    assert cells[guess["prim"]].nth(1).inner_text() == "0.25 \u00b1 0.50"
+    colour = "x => getComputedStyle(x).color"
+    assert cells[guess["prim"]].nth(1).evaluate(colour) == shown.locator("#lead").evaluate(colour)
+    assert shown.locator("#warnings .warning:visible").count() == 8
+    shown.get_by_text("4 more warnings").click()
+    assert shown.locator("#warnings .warning:visible").count() == 12
+    assert shown.faults == []
+
+
+def test_a_table_of_hundreds_leaves_the_rest_of_the_page_within_reach(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    kinds = data["objects"]
+    data["objects"] = [
+        {**kinds[i % len(kinds)], "id": f"o{i}", "prim": f"/r/o{i}", "label": f"o {i}"}
+        for i in range(300)
+    ]
+    (tmp_path / "many.html").write_text(page({**data, "room": None}), "utf-8")
+    shown = opened((tmp_path / "many.html").as_uri(), viewport={"width": 1440, "height": 900})
+    assert shown.locator("#objects").bounding_box()["height"] < 2 * 900
+    region = shown.get_by_role("region", name="Table of objects")
+    region.evaluate("x => { x.scrollTop = x.scrollHeight; }")
+    box = region.bounding_box()
+    heading = shown.get_by_role("columnheader", name="Roughness").bounding_box()
+    assert box["y"] <= heading["y"] < box["y"] + 10
+    assert shown.locator("#table tbody tr:not(.detail)").last.is_visible()

@@ -16,9 +16,11 @@ import usdbrdf
 from tests.page.conftest import data_of
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
-from usdbrdf.page import views
-from usdbrdf.page.pictures import _BACKGROUND, SurfaceMap, part_around, pictures_of_map
+from usdbrdf.page import objects, views
+from usdbrdf.page.capture import findings
+from usdbrdf.page.pictures import _BACKGROUND, Seen, SurfaceMap, part_around, pictures_of_map
 from usdbrdf.page.report import page, report
+from usdbrdf.page.room import with_the_weakest_as_one
 
 
 def pictures(text):
@@ -171,3 +173,55 @@ def test_the_texture_of_a_map_is_made_once_for_all_cameras():
     assert [picture.shape for picture in pictures] == [(1, 2, 3), (2, 1, 3), (1, 2, 3)]
     assert all((picture.reshape(2, 3)[0] == 128).all() for picture in pictures)
     assert all((picture.reshape(2, 3)[1] == _BACKGROUND).all() for picture in pictures)
+
+
+def test_a_frame_is_read_once_however_many_objects_it_shows(monkeypatch):
+    """Object 0 has its target frame, 1 the frame that shows most of it, 3 that of frame 7 too; 2 is
+    shown by none."""
+    read, drawn = [], []
+    monkeypatch.setattr(objects, "read_frame", lambda _, number: read.append(number) or number)
+    monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"prim": i, "status": "prior"})
+
+    def pictures(_frames, pixels, _seen, index, frame, box, _status, **_):
+        assert pixels == frame
+        drawn.append((index, frame, box.tolist()))
+        return {"frame": frame}
+
+    monkeypatch.setattr(objects, "_pictures", pictures)
+    share = np.array([[0.1, 0.2, 0, 0.1], [0.3, 0.1, 0, 0.2]], np.float32)
+    where = Seen(share=share, box=np.arange(8, dtype=np.float32).reshape(2, 4, 1))
+    atlas = SimpleNamespace(frames=None, scene=SimpleNamespace(objects=[None] * 4))
+    fits = [SimpleNamespace(target_frame=target) for target in (3, -1, -1, 7)]
+    rows = objects.object_rows(atlas, None, fits, where, [3, 7], photographs=True, seed=0)
+    assert [row["prim"] for row in rows] == [0, 1, 2, 3]
+    assert [row.get("frame") for row in rows] == [3, 3, None, 7]
+    assert drawn == [(0, 3, [0]), (1, 3, [1]), (3, 7, [7])]
+    assert read == [3, 7]
+
+
+def test_of_more_lamps_than_a_page_can_light_the_weakest_are_one():
+    lamps = [
+        {"prim": f"/r/{i}", "label": str(i), "place": [float(i), 0, 0], "intensity": [p, p, 2 * p]}
+        for i, p in enumerate((1.0, 9.0, 3.0, 8.0))
+    ]
+    assert with_the_weakest_as_one(lamps, 4) == lamps
+    first, second, rest = with_the_weakest_as_one(lamps, 3)
+    assert [first, second] == [lamps[1], lamps[3]]
+    assert (rest["prim"], rest["label"]) == ("", "2 weaker lamps, as one")
+    assert rest["place"] == [1.5, 0, 0]
+    assert rest["intensity"] == [4, 4, 8]
+
+
+def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentence():
+    words = ["measured", "prior", "failed", "failed", "unseen", "lamp"]
+    lamps = {f"bulb_{i}": 1.0 for i in range(200)}
+    found = {"texture": {}, "shade": {"estimated_emitters": lamps}}
+    told = findings(found, words, True)
+    assert "The fit of 2 failed: their photographs do not determine the numbers." in told
+    assert len(told) == 6
+    assert told[-1].startswith("The lamps bulb_0, bulb_1,")
+    assert told[-1].endswith(" and 194 more clipped everywhere: their radiances are estimates.")
+    alone = findings({"texture": {}, "shade": {"estimated_emitters": {"bulb": 1}}}, words, True)
+    assert alone[-1] == "The lamp bulb clipped everywhere: its radiance is an estimate."
+    (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
+    assert one == "The fit of 1 failed: its photographs do not determine the numbers."

@@ -25,6 +25,7 @@ STEPS = ("ingest", "texture", "shade", "fit")
 _OF_LIGHTING = ("texture", "shade")
 # Frames that are read for their exposures, and pixels across the map, at most.
 _MOST_READ, _MAP_WIDTH = 96, 480
+_NAMED_LAMPS = 6
 _FLOORLESS = np.array((40, 44, 52), np.uint8)
 
 
@@ -144,6 +145,11 @@ def findings(
             f"{prior} {'is' if prior == 1 else 'are'} not determined: no photograph shows a clear "
             "highlight, so the numbers are what remains likely, with an upper bound."
         )
+    if failed := count.get("failed"):
+        told.append(
+            f"The fit of {failed} failed: {'its' if failed == 1 else 'their'} photographs do not "
+            "determine the numbers."
+        )
     if unseen := count.get("unseen"):
         told.append(f"{unseen} {'was' if unseen == 1 else 'were'} shown by no photograph.")
     if lamps := count.get("lamp"):
@@ -159,8 +165,20 @@ def findings(
         told.append(f"The traced light has a standard error of {shade['standard_error']:.1%}.")
     if (escaped := shade.get("escaped_fraction", 0)) > 0.001:
         told.append(f"{escaped:.1%} of the light's directions leave the scan.")
-    for name in shade.get("estimated_emitters", {}):
-        told.append(f"The lamp {name} clipped everywhere: its radiance is an estimate.")
+    told += _clipped_lamps(list(shade.get("estimated_emitters", {})))
     if not radiometric:
         told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
     return told
+
+
+def _clipped_lamps(names: Sequence[str]) -> list[str]:
+    """In one sentence at most, also of a room with hundreds."""
+    if not names:
+        return []
+    if len(names) == 1:
+        return [f"The lamp {names[0]} clipped everywhere: its radiance is an estimate."]
+    shown, more = names[:_NAMED_LAMPS], len(names) - _NAMED_LAMPS
+    rest = f" and {more} more" if more > 0 else ""
+    return [
+        f"The lamps {', '.join(shown)}{rest} clipped everywhere: their radiances are estimates."
+    ]

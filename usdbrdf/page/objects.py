@@ -15,7 +15,7 @@ from usdbrdf.asset.readers.scene import read_shading
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, predict_view
 from usdbrdf.evaluation.metrics import finite
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.material.fit_target import frame_samples, relative_costs
 from usdbrdf.model.arrays import Double
@@ -50,19 +50,30 @@ def object_rows(
     where, chosen  where objects are in the frames of these numbers
     photographs    whether pictures may be photographs
     """
-    objects, rows = atlas.scene.objects, []
-    for i, obj in progress(enumerate(objects), total=len(objects), label="report", unit="objects"):
-        row = _numbers(atlas, i, obj, fits[i])
-        share, target = where.share[:, i], fits[i].target_frame
-        shown = target in chosen and share[chosen.index(target)] > 0
-        at = chosen.index(target) if shown else int(share.argmax())
-        if share[at] > 0:
-            row |= _pictures(
-                atlas.frames, seen, i, chosen[at], where.box[at, i], row["status"],
-                photographs=photographs, seed=seed,
-            )  # fmt: skip
-        rows.append(row)
+    objects = atlas.scene.objects
+    rows = [_numbers(atlas, i, obj, fits[i]) for i, obj in enumerate(objects)]
+    shown = [_place_of(where, chosen, i, fits[i].target_frame) for i in range(len(objects))]
+    # By their frames, so that each frame is read once however many objects it shows.
+    order = sorted((at, i) for i, at in enumerate(shown) if at is not None)
+    read, pixels = -1, None
+    for at, i in progress(order, total=len(order), label="report", unit="objects"):
+        if pixels is None or at != read:
+            read, pixels = at, read_frame(atlas.frames, chosen[at])
+        rows[i] |= _pictures(
+            atlas.frames, pixels, seen, i, chosen[at], where.box[at, i], rows[i]["status"],
+            photographs=photographs, seed=seed,
+        )  # fmt: skip
     return rows
+
+
+def _place_of(where: Seen, chosen: Sequence[int], index: int, target: int) -> int | None:
+    """Which of the chosen frames shows an object: its target frame if that does, else the one that
+    shows the most of it; None where none shows it."""
+    share = where.share[:, index]
+    if target in chosen and share[chosen.index(target)] > 0:
+        return chosen.index(target)
+    most = int(share.argmax())
+    return most if share[most] > 0 else None
 
 
 def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) -> dict[str, Any]:
@@ -167,6 +178,7 @@ def _of_metal(fit: FittedObject) -> str:
 
 def _pictures(
     frames: Frames,
+    pixels: FramePixels,
     seen: ViewedAsset,
     index: int,
     frame: int,
@@ -176,8 +188,8 @@ def _pictures(
     photographs: bool,
     seed: int,
 ) -> dict[str, Any]:
-    """The object in a frame: photograph and model's picture of one exposure, and the evidence."""
-    pixels = read_frame(frames, frame)
+    """The object in a frame, whose ``pixels`` are given: photograph and model's picture of one
+    exposure, and the evidence."""
     part = part_around(frames.camera(frame), box)
     predicted = predict_view(seen, part.camera, _PICTURE, seed + index)
     small = part.of(pixels)

@@ -175,7 +175,8 @@ def surface_maps(atlas: AssetMaps, fits: Sequence[FittedObject | None]) -> Itera
     )
     yield SurfaceMap(
         name="status", title="What is known", values=colours[owner] / np.float32(255), direct=True,
-        legend="Green: measured. Orange: not determined. Grey: unseen. Yellow: lamp.",
+        legend="Green: measured. Orange: not determined. Red: the fit failed. Grey: unseen. "
+        "Yellow: lamp.",
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from usdbrdf.page.pictures import data_uri
 
 # Pixels of a texture's longer side.
 _TEXTURE = 384
+# Lamps with a light and a switch of their own: graphics cards compile shaders for so many.
+_MOST_LAMPS = 24
 
 
 def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] | None:
@@ -30,7 +33,7 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
     glb    gzip, base64: y up, metres; nodes name their prims
     lit    by prim, the lit texture as a picture
     lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
-           radiance times m^2
+           radiance times m^2; the weakest of many are one
     """
     try:
         with scratch_folder() as folder:
@@ -48,7 +51,7 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
         "lit": lit_pictures(atlas, exposure),
         "exposure": exposure,
         "irradiance": _typical_irradiance(atlas),
-        "lamps": lamps(atlas, up_axis),
+        "lamps": with_the_weakest_as_one(lamps(atlas, up_axis)),
     }
 
 
@@ -88,6 +91,26 @@ def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def with_the_weakest_as_one(
+    found: Sequence[dict[str, Any]], most: int = _MOST_LAMPS
+) -> list[dict[str, Any]]:
+    """At most ``most`` lamps of ``found``, in its order; those that send out least are one of no
+    prim, amid them, with the light of all."""
+    if len(found) <= most:
+        return list(found)
+    power = [sum(lamp["intensity"]) for lamp in found]
+    strong = set(sorted(range(len(found)), key=lambda i: -power[i])[: most - 1])
+    weak = [i for i in range(len(found)) if i not in strong]
+    middle = np.average([found[i]["place"] for i in weak], axis=0, weights=[power[i] for i in weak])
+    together = {
+        "prim": "",
+        "label": f"{len(weak)} weaker lamps, as one",
+        "place": [round(float(value), 4) for value in middle],
+        "intensity": np.sum([found[i]["intensity"] for i in weak], axis=0).tolist(),
+    }
+    return [*(found[i] for i in sorted(strong)), together]
 
 
 def _typical_irradiance(atlas: AssetMaps) -> list[float]:

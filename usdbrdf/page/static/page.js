@@ -24,6 +24,11 @@
     measured: 'measured', prior: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
   };
 
+  // So many are shown at once; the others, of scans with hundreds of objects, are folded.
+  const MOST_WARNINGS = 8;
+  // A longer table scrolls by itself: what follows it stays within reach.
+  const MOST_ROWS = 40;
+
   /* --- Capture ------------------------------------------------------------------------------- */
 
   function capture() {
@@ -33,8 +38,12 @@
     const measured = data.objects.filter((one) => one.status === 'measured').length;
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
-    for (const sentence of data.warnings) {
-      $('warnings').append(el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
+    const warned = data.warnings.map((sentence) =>
+      el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
+    const first = warned.length > MOST_WARNINGS + 1 ? MOST_WARNINGS : warned.length;
+    $('warnings').append(...warned.slice(0, first));
+    if (first < warned.length) {
+      $('warnings').append(el('details', {}, el('summary', {}, `${warned.length - first} more warnings`), ...warned.slice(first)));
     }
     if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
     const told = [
@@ -167,7 +176,7 @@
     { name: 'Status', wide: true, key: (one) => order.indexOf(one.status) },
     { name: 'Colour', wide: true, key: (one) => (one.base_color ? one.base_color[0] + one.base_color[1] + one.base_color[2] : -1) },
     { name: 'Roughness', sign: '\u03c6', key: (one) => one.phi ?? 9 },
-    { name: 'Specular', sign: '\u03c8', key: (one) => one.psi ?? 9 },
+    { name: 'Specular', sign: '\u03c8', key: (one) => (one.f0 ? 8 : one.psi ?? 9) },
     { name: 'Sure', wide: true, key: (one) => certain[one.phi_confidence] + certain[one.psi_confidence] },
     { name: 'Evidence', wide: true, key: (one) => one.evidence ?? -1 },
     { name: 'Seen', wide: true, key: (one) => one.seen },
@@ -193,6 +202,7 @@
       }
     }
     data.objects.forEach((one, i) => rows.push(row(one, i)));
+    $('table').parentElement.classList.toggle('long', rows.length > MOST_ROWS);
     for (const id of ['filter-name', 'filter-status', 'filter-verdict']) $(id).addEventListener('input', filter);
     $('filter').addEventListener('submit', (event) => event.preventDefault());
     $('save').addEventListener('click', save);
@@ -204,7 +214,7 @@
   function row(one, i) {
     const picture = one.photograph || one.model;
     const swatch = el('span', { class: 'swatch', style: `background: ${css(one.base_color)}` });
-    const number = (value, error, sure) => {
+    const number = (value, error) => {
       if (one.status === 'lamp') return ['\u2013'];
       const parts = [fixed(value)];
       if (error !== null) parts.push(el('span', { class: 'error' }, ` \u00b1 ${fixed(error)}`));
@@ -215,6 +225,9 @@
       type: 'button', class: 'name', 'aria-expanded': 'false', 'aria-controls': `detail-${i}`,
       onclick: () => open(entry, detail.hidden),
     }, one.label);
+    // Of metals F0, a colour, takes the place of psi.
+    const specular = one.f0 && one.status !== 'lamp' ? ['metal'] : number(one.psi, one.psi_error);
+    const numberCss = (confidence) => (confidence === 'none' ? 'number guess' : 'number');
     const verdict = el('td', { class: 'wide' });
     const status = (css) => el('span', { class: `status ${one.status} ${css}` }, STATUS[one.status]);
     const main = el('tr', { 'data-prim': one.prim },
@@ -222,9 +235,9 @@
       el('td', { class: 'named' }, opener, status('small')),
       el('td', { class: 'wide' }, status('')),
       el('td', { class: 'wide' }, one.status === 'lamp' ? 'shines' : swatch),
-      el('td', { class: 'number' }, ...number(one.phi, one.phi_error)),
-      el('td', { class: 'number' }, ...number(one.psi, one.psi_error)),
-      el('td', { class: 'wide' }, one.status === 'lamp' ? '\u2013' : `\u03c6 ${one.phi_confidence}, \u03c8 ${one.psi_confidence}`),
+      el('td', { class: numberCss(one.phi_confidence) }, ...number(one.phi, one.phi_error)),
+      el('td', { class: numberCss(one.psi_confidence) }, ...specular),
+      el('td', { class: 'wide' }, one.status === 'lamp' ? '\u2013' : `\u03c6 ${one.phi_confidence}, ${one.f0 ? 'F0' : '\u03c8'} ${one.psi_confidence}`),
       el('td', { class: 'wide number' }, one.evidence === null ? '\u2013' : percent(one.evidence, 0)),
       el('td', { class: 'wide number' }, percent(one.seen, 0)),
       verdict);
@@ -543,7 +556,8 @@
     const pick = (prim) => {
       const one = data.objects.find((other) => other.prim === prim);
       picked.textContent = !one ? '' : one.status === 'lamp' ? `${one.label}: lamp`
-        : `${one.label}: ${STATUS[one.status]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, \u03c8 ${fixed(one.psi)} \u00b1 ${fixed(one.psi_error)}`;
+        : `${one.label}: ${STATUS[one.status]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, ${one.f0
+          ? `metal, F0 ${one.f0.map((value) => fixed(value)).join(', ')}` : `\u03c8 ${fixed(one.psi)} \u00b1 ${fixed(one.psi_error)}`}`;
       canvas.dataset.picked = one ? one.prim : '';
     };
     let model;
@@ -553,7 +567,17 @@
     }
     window.usdbrdfModel = model;
     const looks = { shaded: 'lit by its lamps', lit: 'as photographed', base_color: 'base colour', phi: 'roughness \u03c6', psi: 'specular \u03c8', status: 'what is known', verdict: 'verdicts' };
-    const look = el('select', { id: 'look', onchange: () => model.setLook(look.value) },
+    const numbers = 'One colour per object. Dark violet: 0; yellow: 1; purple: no number.';
+    const legends = {
+      phi: numbers, psi: numbers,
+      status: 'Green: measured. Orange: not determined. Red: the fit failed. Grey: unseen. Yellow: lamp.',
+      verdict: 'Green: accepted. Red: rejected. Grey: none yet.',
+    };
+    const legend = el('p', { class: 'soft', id: 'look-legend', role: 'status' });
+    const look = el('select', {
+      id: 'look',
+      onchange: () => { model.setLook(look.value); legend.textContent = legends[look.value] || ''; },
+    },
       ...Object.entries(looks).map(([value, text]) => el('option', { value }, text)));
     const lamps = data.room.lamps.map((lamp, i) => el('label', {},
       el('input', { type: 'checkbox', checked: true, onchange: (event) => model.setLamp(i, event.target.checked) }), ` ${lamp.label}`));
@@ -566,6 +590,7 @@
     body.append(
       el('div', { class: 'bar' }, el('label', {}, 'Look ', look), el('button', { type: 'button', onclick: () => model.home() }, 'back to the start')),
       el('div', { class: 'stage' }, canvas, picked),
+      legend,
       el('p', { class: 'soft' }, 'Drag to turn, scroll to come closer, click an object for its numbers. Light that surfaces send on to each other is one constant here: pictures of relight are exact.'),
       el('fieldset', {}, el('legend', {}, 'Captured lamps'), el('div', { class: 'bar' }, ...(lamps.length ? lamps : ['None was found.']))),
       el('fieldset', {}, el('legend', {}, 'A light of your own'), el('div', { class: 'bar' }, a, b, c, d)));
