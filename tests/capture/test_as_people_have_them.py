@@ -132,6 +132,24 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
 
 
+@pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])
+def test_frames_named_where_they_lay_on_another_machine_need_their_folder(made, place):
+    _rename(made, place + "frames/{:04d}.exr")
+    with pytest.raises(InputRefused, match=r"Name the folder of the pictures with --frames,"):
+        _read(made)
+    scan = _read(made, frames=made.folder / "frames")
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+
+
+def test_the_rolling_shutter_of_instant_ngp_is_told(made):
+    with edited(made.manifest) as document:
+        document["rolling_shutter"] = [0, 0, 0, 0]
+    assert not any("[capture.shutter]" in sentence for sentence in _read(made).warnings)
+    with edited(made.manifest) as document:
+        document["frames"][3]["rolling_shutter"] = [0, 0, 0, 0.02]
+    assert any("[capture.shutter]" in sentence for sentence in _read(made).warnings)
+
+
 def test_frames_of_another_folder_are_named_by_it(made, tmp_path):
     _rename(made, "jpegs/{:04d}.jpg")
     (made.folder / "frames").rename(tmp_path / "radiance")

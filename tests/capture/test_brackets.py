@@ -134,6 +134,48 @@ def test_what_moved_between_the_exposures_is_unknown(bracket):
     assert np.isnan(merged.radiance[outside]).mean() < 0.03
 
 
+def _flickering(factors: dict[int, float]) -> np.ndarray:
+    """Codes of exposures of which some catch all the light at a brighter or darker moment."""
+    light = np.ones(len(EXPOSURES))
+    light[list(factors)] = list(factors.values())
+    return _shoot(_scene(), EXPOSURES * light, seed=3)
+
+
+def test_a_lamp_that_flickers_in_short_exposures_does_not_contradict_itself(bracket):
+    """As in a photographed room, whose lamp is 0.78 times as bright at 1/4000 s as at 1/1000 s."""
+    scene, _, response = bracket
+    codes = _flickering({7: 1.15, 8: 0.9})
+    # In the longer ones it clips: the short ones alone tell how bright it is.
+    lamp = (scene.min(axis=2) > 3e4) & (codes[6] > 250).all(axis=2)
+    assert lamp.sum() > 300
+    merged = merge(codes, EXPOSURES, response)
+    assert np.isnan(merged.radiance[lamp]).mean() < 0.03
+    np.testing.assert_allclose((merged.exposures / EXPOSURES)[7:], [1.15, 0.9], rtol=0.03)
+    known, ratio = _against(merged, scene)
+    assert np.nanmedian(np.abs(ratio[known & lamp[..., None]] - 1)) < 0.03
+
+
+def test_exposures_are_as_stated_where_their_pixels_say_so_within_a_shutters_error(bracket):
+    _, codes, response = bracket
+    np.testing.assert_array_equal(merge(codes, EXPOSURES, response).exposures, EXPOSURES)
+    merged = merge(_flickering({4: 1.03}), EXPOSURES, response)
+    np.testing.assert_array_equal(merged.exposures, EXPOSURES)
+
+
+def test_an_exposure_that_is_far_from_what_is_stated_is_no_flicker(bracket):
+    merged = merge(_flickering({4: 2.5}), EXPOSURES, bracket[2])
+    np.testing.assert_array_equal(merged.exposures, EXPOSURES)
+    assert merged.ghost > 0.2
+
+
+def test_too_few_pixels_tell_no_exposure(bracket):
+    """What moves in a corner, where all else is dark or clips, is no flicker."""
+    codes = np.zeros((2, 60, 60, 3), np.uint8)
+    codes[0, :8, :8], codes[1, :8, :8] = 200, 150
+    merged = merge(codes, EXPOSURES[:2], bracket[2])
+    np.testing.assert_array_equal(merged.exposures, EXPOSURES[:2])
+
+
 def test_blacks_that_a_camera_lifts_contradict_nothing():
     scene = _scene()
     codes = _shoot(scene, EXPOSURES)

@@ -419,6 +419,8 @@ def test_lenses_of_documents_and_of_single_frames(tmp_path):
         frames[3] |= {"camera_model": "FISHEYE624", "distortion_params": list(small)}
         frames[4] |= {"distortion_params": list(small[:6])}
         frames[5] |= {"k1": 0, "p2": 0}
+        # instant-ngp's word for OpenCV's fisheye, which a stated model comes before.
+        frames[6] |= {"is_fisheye": True}
     scan = read_scan(made.folder, IngestOptions())
     found = {}
     for i, path in enumerate(scan.frames.image_paths):
@@ -437,3 +439,9 @@ def test_lenses_of_documents_and_of_single_frames(tmp_path):
     )  # fmt: skip
     assert found[4] == Lens(radial=small[:4], tangential=small[4:6])
     assert found[5] is None
+    assert found[6] == found[0]
+    with edited(made.manifest) as document:
+        del document["camera_model"]
+    views = read_scan(made.folder, IngestOptions()).views
+    curves = {int(v.photograph.stem): v.lens.curve for v in views if v is not None}
+    assert (curves[6], curves[0]) == ("fisheye", "perspective")

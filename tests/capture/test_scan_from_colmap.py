@@ -75,6 +75,34 @@ def test_colmap_and_nerfstudio_give_one_scan(tmp_path, model, text):
     assert [o.label for o in one.objects] == [o.label for o in other.objects]
 
 
+@pytest.mark.parametrize(
+    "written", ["no rows of points", "empty rows", "no last row", "a mark", "Windows"]
+)
+def test_text_models_of_other_programs_lose_no_image(tmp_path, written):
+    """COLMAP's own reader takes every second row for points, whatever it holds."""
+    names = [f"{i:04d}.exr" if i else "0000 1.exr" for i in range(10)]
+    made = colmap_capture(tmp_path / "room", "PINHOLE", text=True, names=names)
+    for file in (made.folder / "sparse/0").glob("*.txt"):
+        rows = file.read_text().splitlines()
+        if file.name == "images.txt" and written != "Windows":
+            points = {r for r in rows if r and r[0] != "#" and len(r.split()) == 3}
+            assert points
+            kept = [row for row in rows if row not in points]
+            rows = (
+                kept if written == "no rows of points" else [r.replace(*points, "") for r in rows]
+            )
+        text = "\n".join(rows) + "\n"
+        text = text.rstrip() if written == "no last row" else text
+        text = text.replace("\n", "\r\n") if written == "Windows" else text
+        file.write_bytes(b"\xef\xbb\xbf" * (written == "a mark") + text.encode())
+    scan = read_scan(made.folder, OPTIONS)
+    assert [path.name for path in scan.frames.image_paths] == sorted(names)
+    order = np.argsort(names)
+    np.testing.assert_allclose(
+        scan.frames.world_from_camera, made.world_from_camera[order], atol=1e-12
+    )
+
+
 def test_every_model_becomes_the_lens_that_pycolmap_has():
     directions = np.random.default_rng(0).normal(size=(500, 3)) * (0.4, 0.3, 0) + (0, 0, 1)
     for name in sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"}):

@@ -247,6 +247,11 @@ def _not_aligned(root):
         camera.remove(camera.find("transform"))
 
 
+def _disabled(root):
+    for camera in root.iter("camera"):
+        camera.set("enabled", "0")
+
+
 def _not_calibrated(root):
     (sensor,) = root.iter("sensor")
     for calibration in sensor.findall("calibration"):
@@ -278,6 +283,7 @@ def _entities(project):
         (_no_model, r"no mesh\. Export the model .*--mesh\. \[mesh.missing\]"),
         (_no_pictures, r"no pictures below.*--frames\. \[capture.frames\]"),
         (_edit(_not_aligned), r"only 6 of 10.*not been aligned.*Align and.*\[capture.alignment\]"),
+        (_edit(_disabled), r"all of its 10 cameras are disabled\. Enable .*\[capture.alignment\]"),
         (_edit(_not_calibrated), r"only 0 of 10.*sensor is not calibrated.*\[capture.alignment\]"),
         (_edit(_cylindrical), r"a 'cylindrical' camera.*\[capture.camera\]"),
         (_edit(_higher_terms), r"'camera 0' has .*higher tangential terms.*\[capture.camera\]"),

@@ -20,6 +20,16 @@ DOCUMENTS = [
     ("renamed.json", '{"sfm_data_version": "0.3"}', "OpenMVG", "openMVG2Colmap"),
     ("reconstruction.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "export_colmap"),
     ("trajectory.json", '{"class_name": "PinholeCameraTrajectory"}', "Open3D", "example"),
+    ("run.log", "0\t0\t1\n1 0 0 0\n0 1e-3 0 0\n0 -0 1 0\n0 0 0 1\n", "Open3D", "trajectory.json"),
+    ("1234.json", '{"t_00": 1, "fx": 700, "blur_score": 5}', "Polycam", "ns-process-data polycam"),
+    ("metadata.json", '{"K": [], "poses": []}', "Record3D", "ns-process-data record3d"),
+    ("cameras.json", '[{"id": 0, "img_name": "1"}]', "Gaussian splatting", "trained on"),
+    ("meta_data.json", '{"frames": [{"camtoworld": []}]}', "SDFStudio", "COLMAP"),
+    ("cameras_sphere.npz", "PK\x03\x04", "NeuS", "COLMAP"),
+    ("cameras.npz", "PK\x03\x04", "IDR", "COLMAP"),
+    ("room.psx", '<document version="1.2.0"/>', "Metashape", "Export Cameras"),
+    ("room.rcproj", "<RealityCaptureProject/>", "RealityScan", "camera parameters"),
+    ("scene.mvs", "MVS", "OpenMVS", "COLMAP"),
 ]
 
 
@@ -53,11 +63,47 @@ def test_a_document_that_names_no_program_is_none_of_theirs(tmp_path):
     assert "this is not a transforms.json" in _refused(document)
 
 
+def test_documents_that_only_look_like_theirs_are_not(tmp_path):
+    """A log of a program, and metadata and cameras that are not those of Record3D or of splats."""
+    (tmp_path / "run.log").write_text("0 0 1\nall went well\n")
+    (tmp_path / "metadata.json").write_text('{"title": "a room"}')
+    (tmp_path / "other.json").write_text('{"poses": []}')
+    assert "it holds neither pictures nor cameras" in _refused(tmp_path)
+
+
+def test_cameras_deep_in_a_folder_are_found(tmp_path):
+    """As Polycam has them, beside a mesh at the top."""
+    (tmp_path / "keyframes/cameras").mkdir(parents=True)
+    (tmp_path / "keyframes/cameras/12.json").write_text('{"t_00": 1}')
+    (tmp_path / "raw.glb").write_bytes(b"")
+    assert "12.json holds the cameras of Polycam" in _refused(tmp_path)
+
+
+def test_photographs_divided_into_training_and_test_are_named_by_their_documents(tmp_path):
+    for part, frames in (("test", 1), ("train", 9), ("val", 2)):
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({"frames": [{}] * frames}))
+    (tmp_path / "r_0.png").write_bytes(b"")
+    said = _refused(tmp_path)
+    assert "transforms_train.json holds the cameras of some of its pictures. Name that file" in said
+
+
+def test_a_file_of_a_colmap_model_is_answered_by_its_folder(tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"")
+    said = _refused(tmp_path / "images.bin")
+    assert "images.bin is a part of a COLMAP model. Name the folder that holds the model" in said
+
+
+def test_a_document_of_another_program_that_has_frames_too_is_named(tmp_path):
+    document = tmp_path / "meta_data.json"
+    document.write_text('{"frames": [{"rgb_path": "0_rgb.png", "camtoworld": []}]}')
+    assert "meta_data.json holds the cameras of SDFStudio" in _refused(document)
+
+
 def test_photographs_alone_need_cameras(tmp_path):
     for i in range(3):
         (tmp_path / f"{i}.JPG").write_bytes(b"")
     said = _refused(tmp_path)
-    assert "it holds 3 pictures, but nothing that says where the cameras stood" in said
+    assert "it holds 3 pictures, but nothing known here says where the cameras stood" in said
     assert "COLMAP, Metashape, RealityScan" in said
 
 

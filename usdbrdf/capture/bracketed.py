@@ -59,6 +59,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         [_aligned(bracket).stack for bracket in telling], [bracket.exposures for bracket in telling]
     )
     frames, clipped, ghosts = [], [], []
+    flickers: list[tuple[str, float]] = []
     unchecked: dict[str, list[str]] = {}
     with environment_failures(str(folder)), whole_folder(folder) as staged:
         (staged / "frames").mkdir()
@@ -70,6 +71,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             frames.append({**made.entry, "file_path": name})
             clipped.append(made.clipped)
             ghosts.append(made.ghost)
+            flickers.extend(made.flicker)
             if made.unchecked:
                 unchecked[name] = made.unchecked
         copy_beside(source, document, staged)
@@ -85,6 +87,14 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             f"{', '.join(files)} in {name}). Bracket in smaller steps, or use a tripod. "
             "[brackets.unchecked]"
         )
+    if flickers:
+        file, factor = max(flickers, key=lambda one: abs(np.log(one[1])))
+        warn(
+            f"{source}: {len(flickers)} of {photographs} photographs are all brighter or darker "
+            f"than their exposures say, {file} most of all ({factor:.2f} x), as a lamp's "
+            "flicker or a fast shutter makes them; that factor has been taken out. With lamps in "
+            "view take exposures of 1/50 s or longer, through a grey filter. [brackets.flicker]"
+        )
     ranges = [float(b.exposures[0] / b.exposures[-1]) for b in brackets]
     return {
         "brackets": len(brackets),
@@ -95,6 +105,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         "contradicting_share_of_worst": float(np.max(ghosts)),
         "unchecked_share": alone / (photographs - len(brackets)),
         "unchecked": unchecked,
+        "flickering": len(flickers),
     }
 
 
@@ -112,12 +123,14 @@ def copy_beside(source: Path, document: Any, folder: Path) -> None:
 
 
 class _Made(NamedTuple):
-    """The frame's entry, shares of clipped and contradicting pixels, names of unchecked files."""
+    """The frame's entry, shares of clipped and contradicting pixels, names of unchecked files, and
+    the exposures whose pixels are all by a factor brighter than stated: file and factor."""
 
     entry: dict[str, Any]
     clipped: float
     ghost: float
     unchecked: list[str]
+    flicker: list[tuple[str, float]]
 
 
 def _merged(bracket: Bracket, response: Response, place: Path) -> _Made:
@@ -130,7 +143,14 @@ def _merged(bracket: Bracket, response: Response, place: Path) -> _Made:
     entry = {k: v for k, v in bracket.entry.items() if k not in ("brackets", "exposure_time")}
     entry.update(saturation_radiance=found.saturation, noise_floor_radiance=found.noise_floor)
     alone = np.flatnonzero(laid.unchecked).tolist()
-    return _Made(entry, found.clipped, found.ghost, [bracket.images[k].name for k in alone])
+    factors = zip(bracket.images, found.exposures / bracket.exposures, strict=True)
+    return _Made(
+        entry,
+        found.clipped,
+        found.ghost,
+        [bracket.images[k].name for k in alone],
+        [(image.name, float(factor)) for image, factor in factors if factor != 1],
+    )
 
 
 def _aligned(bracket: Bracket) -> Aligned:

@@ -10,6 +10,7 @@ Everything is known up to one factor, the same for all pictures of one response.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,10 @@ _SMOOTH = calibration.number("brackets.smooth")
 _GHOST = calibration.number("brackets.ghost")
 _SPREAD = calibration.number("brackets.spread")
 _VAGUE = calibration.number("brackets.vague")
+_KEPT = calibration.number("brackets.kept")
+_FLICKER = calibration.number("brackets.flicker")
+# Samples that two exposures must both tell before they are held against each other.
+_ENOUGH = 200
 # Pixels of each code that one bracket gives to the fit, and rounds of its reweighting.
 _PER_CODE, _ROUNDS = 24, 3
 # Share of a pixel and its eight neighbours that noise alone reaches.
@@ -62,12 +67,15 @@ class Merged(NamedTuple):
     none tells; a channel that clips in all exposures is ``saturation`` or more, one that is dark in
     all lies below ``noise_floor``.
 
+    exposures       (K,) that it was merged with: what is stated, or where the pixels tell otherwise
+                    (lamps flicker, fast shutters err) what they do
     clipped, ghost  shares of the pixels
     """
 
     radiance: Float
     saturation: float
     noise_floor: float
+    exposures: Double
     clipped: float
     ghost: float
 
@@ -195,6 +203,40 @@ def _add(normal: Double, said: Double, codes: Byte, log: Double, weight: Double)
             np.add.at(normal, (codes[one], codes[other]), -weight[one] * weight[other] / total)
 
 
+def exposures_as_shown(stack: Byte, exposures: Double, response: Response, silent: Bool) -> Double:
+    """(K,) exposures of a bracket, ``merge``'s arguments, as its pixels tell them.
+
+    From the longest on each is held against the next longer: what both show clearly has one
+    radiance. A lamp's flicker, which short exposures catch at one moment, counts so as an exposure
+    that is longer or shorter than stated; else the lamp would contradict itself. The longest one
+    lasts longest, so that it averages over the flicker. What differs by no more than
+    ``brackets.kept`` is as stated; what by more than ``brackets.flicker`` is no flicker, and stays.
+    """
+    darkest, brightest = response.clear()
+    tells = (stack >= darkest) & (stack <= brightest) & ~silent
+    order = np.argsort(-exposures, kind="stable")
+    shown = exposures.copy()
+    channel = np.arange(3)
+    for longer, shorter in pairwise(order.tolist()):
+        both = tells[longer] & tells[shorter]
+        if both.sum() < _ENOUGH:
+            continue
+        codes = stack[shorter], stack[longer]
+        brighter, fainter = (response.logarithm[channel, c][both] for c in codes)
+        error = np.hypot(*(response.error[channel, c][both] for c in codes))
+        off = _weighted_median(brighter - fainter, error**-2)
+        off -= float(np.log(exposures[shorter] / shown[longer]))
+        if _KEPT < abs(off) <= _FLICKER:
+            shown[shorter] = exposures[shorter] * np.exp(off)
+    return shown
+
+
+def _weighted_median(values: Double, weight: Double) -> float:
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(below, below[-1] / 2)])
+
+
 def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | None = None) -> Merged:
     """One picture of radiance from a bracket, (K, H, W, 3) uint8, aligned, exposed (K,).
 
@@ -203,6 +245,7 @@ def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | Non
     What is further off the mean than ``brackets.ghost`` of its errors contradicts the others.
     """
     silent = np.zeros(stack.shape, np.bool_) if silent is None else silent
+    exposures = exposures_as_shown(stack, exposures, response, silent)
     channel = np.arange(3)
     logs = response.logarithm[channel, stack] - np.log(exposures)[:, None, None, None]
     error = response.error[channel, stack]
@@ -238,6 +281,7 @@ def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | Non
         radiance=radiance.astype(np.float32),
         saturation=ceiling,
         noise_floor=floor,
+        exposures=exposures,
         clipped=float((radiance >= ceiling).any(axis=2).mean()),
         ghost=float(ghost.mean()),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -9,40 +10,86 @@ from typing import NamedTuple
 # As in ``named_pictures`` and ``mesh_files``, which load NumPy; a glance needs names alone.
 _PICTURES = frozenset((".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg"))
 _MESHES = frozenset((".ply", ".obj", ".glb", ".gltf", ".stl", ".fbx"))
+_OF_COLMAP = frozenset(
+    f"{part}.{kind}" for part in ("cameras", "images", "points3D") for kind in ("bin", "txt")
+)
 _MOST_FILES, _HEAD = 10_000, 4096  # looked at in a folder; bytes of a document
 
 
 class _Program(NamedTuple):
-    """Whose cameras are not read: how their documents begin or end, and what to do."""
+    """Whose cameras are not read: how their documents begin, end or are called, and what to do.
+
+    suffixes, names  of documents that are theirs whatever they say; names begin those of JSON
+    says             what their documents say in their first bytes
+    only             documents of this name alone are theirs if they say that; "": of any
+    """
 
     name: str
     suffixes: tuple[str, ...]
     names: tuple[str, ...]
     says: bytes
     how: str
+    only: str = ""
+
+    def owns(self, document: Path, head: bytes) -> bool:
+        name, suffix = document.name.lower(), document.suffix.lower()
+        if suffix in self.suffixes or (suffix == ".json" and name.startswith(self.names)):
+            return True
+        return self.only in ("", name) and re.search(self.says, head) is not None
 
 
 _ANEW = "Reconstruct the same photographs with COLMAP, and name its folder"
+_EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
+_NOTHING = rb"(?!)"
 _PROGRAMS = (
     _Program(
-        "OpenMVG", (), ("sfm_data",), b'"sfm_data_version"',
+        "OpenMVG", (), ("sfm_data",), rb'"sfm_data_version"',
         "Make a COLMAP model of them with openMVG_main_openMVG2Colmap",
     ),
     _Program(
-        "Meshroom", (".sfm", ".mg", ".baf"), (), b'"featuresFolders"',
+        "Meshroom", (".sfm", ".mg", ".baf"), (), rb'"featuresFolders"',
         "Make a COLMAP model of them with its node ExportColmap (aliceVision_exportColmap)",
     ),
     _Program(
-        "OpenSfM", (), ("reconstruction.json", "reconstruction.meshed.json"), b'"shots"',
+        "OpenSfM", (), ("reconstruction.json", "reconstruction.meshed.json"), rb'"shots"',
         "Make a COLMAP model of them with 'opensfm export_colmap'",
     ),
+    _Program("Open3D", (), (), rb'"PinholeCameraTrajectory"', f"Read them with {_EXAMPLE}"),
+    # Three whole numbers, and a matrix of four rows.
     _Program(
-        "Open3D", (), (), b'"PinholeCameraTrajectory"',
-        "Read them with the example of an adapter, plugins/example_adapter of our sources",
+        "Open3D", (), (), rb"\A\d+\s+\d+\s+\d+[ \t\r]*\n(?:[ \t]*(?:[-+.\de]+\s+){4}){4}",
+        f"Write them as trajectory.json, with the lens, and read them with {_EXAMPLE}",
     ),
-    _Program("VisualSFM", (".nvm",), (), b"NVM_V3", _ANEW),
+    _Program("VisualSFM", (".nvm",), (), rb"NVM_V3", _ANEW),
     # What says nothing but .out, its suffix, may be a text of any kind.
-    _Program("Bundler", (), (), b"# Bundle file", _ANEW),
+    _Program("Bundler", (), (), rb"# Bundle file", _ANEW),
+    _Program(
+        "Polycam", (), (), rb'"t_00"',
+        "Make a transforms.json of them with nerfstudio's 'ns-process-data polycam', and a mesh in "
+        "its frame",
+    ),
+    _Program(
+        "Record3D", (), (), rb'"poses"',
+        "Make a transforms.json of them with nerfstudio's 'ns-process-data record3d', and a mesh "
+        "in its frame",
+        "metadata.json",
+    ),
+    _Program(
+        "Gaussian splatting", (), (), rb'"img_name"',
+        "Name the folder of the COLMAP model that the splats were trained on", "cameras.json",
+    ),
+    _Program("SDFStudio", (), (), rb'"camtoworld"', _ANEW),
+    _Program("NeuS", (), (), rb"\APK", _ANEW, "cameras_sphere.npz"),
+    _Program("IDR", (), (), rb"\APK", _ANEW, "cameras.npz"),
+    _Program(
+        "Metashape", (".psx", ".psz"), (), _NOTHING,
+        "Export them (File > Export > Export Cameras, XML) and the model into one folder",
+    ),
+    _Program(
+        "RealityScan", (".rcproj", ".rsproj"), (), _NOTHING,
+        "Export 'Internal/External camera parameters' (CSV) and the model into one folder",
+    ),
+    _Program("OpenMVS", (".mvs",), (), _NOTHING, _ANEW),
 )  # fmt: skip
 
 
@@ -51,17 +98,25 @@ def other_program(document: Path) -> str:
     from usdbrdf.files.tables import beginning_of
 
     head = beginning_of(document, _HEAD)
-    name, suffix = document.name.lower(), document.suffix.lower()
     for one in _PROGRAMS:
-        own = suffix in one.suffixes or (suffix == ".json" and name.startswith(one.names))
-        if own or one.says in head:
+        if one.owns(document, head):
             return f"{document.name} holds the cameras of {one.name}, which are not read. {one.how}"
     return ""
 
 
 def what_lies_there(path: Path) -> str:
     """One sentence on what a folder or file is that is no capture, one on what to do."""
+    if path.is_file() and path.name in _OF_COLMAP:
+        return (
+            f"{path.name} is a part of a COLMAP model. Name the folder that holds the model and "
+            "its images"
+        )
     files = list(_files(path))
+    # The parts into which the first NeRFs, and who follows them, divide their photographs.
+    parts = [f for f in files if f.match("transforms_*.json")]
+    if parts:
+        largest = max(parts, key=lambda file: file.stat().st_size)
+        return f"{largest.name} holds the cameras of some of its pictures. Name that file"
     for file in files:
         if file.suffix.lower() not in _PICTURES | _MESHES and (said := other_program(file)):
             return said
@@ -78,15 +133,16 @@ def what_lies_there(path: Path) -> str:
         if meshes
         else "Have them found (COLMAP, Metashape, RealityScan), and name the folder that holds both"
     )
-    return f"it holds {held}, but nothing that says where the cameras stood. {how}"
+    return f"it holds {held}, but nothing known here says where the cameras stood. {how}"
 
 
 def _files(path: Path) -> Iterator[Path]:
-    """The file, or those in the folder and in its folders, some thousands of them."""
+    """The file, or those in the folder, in its folders and in theirs, some thousands of them."""
     if path.is_file():
         yield path
         return
-    places = [path, *sorted(p for p in path.iterdir() if p.is_dir() and p.name[0] != ".")]
+    below = (sorted(path.glob(pattern)) for pattern in ("*/", "*/*/"))
+    places = [path, *(p for found in below for p in found if p.name[0] != ".")]
     listed = (file for place in places for file in sorted(place.iterdir()))
     for _, file in zip(range(_MOST_FILES), listed, strict=False):
         if file.is_file() and file.name[0] != ".":

@@ -14,11 +14,15 @@ _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windo
 _LITTER = (".DS_Store", "._*", "Thumbs.db", "ehthumbs.db", "desktop.ini", ".directory", "*~")
 
 
-def contained(root: Path, candidate: str) -> Path:
+_CURE = "Put the file inside the folder and name it relative to it"
+
+
+def contained(root: Path, candidate: str, *, cure: str = _CURE) -> Path:
     """The absolute path of ``candidate`` below ``root``; symbolic links are judged by their target.
 
     Nothing is opened, and the file need not exist. Absolute paths are refused even if they lie
-    inside: they would break as soon as the capture is moved.
+    inside: they would break as soon as the capture is moved. ``cure`` is what the refusal says to
+    do.
     """
     cause: Exception | None = None
     if not candidate or "\0" in candidate:
@@ -42,8 +46,7 @@ def contained(root: Path, candidate: str) -> Path:
             cause, reason = error, f"cannot be resolved ({str(words)[:200]})"
     shown = repr(candidate if len(candidate) <= 200 else candidate[:200] + "...")
     raise InputRefused(
-        f"{str(root)!r}: the path {shown} {reason}. Put the file inside the folder and name it "
-        "relative to it. [paths.outside]"
+        f"{str(root)!r}: the path {shown} {reason}. {cure}. [paths.outside]"
     ) from cause
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ from usdbrdf.model.arrays import Double, Int
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 
 _SUFFIXES = (".bin", ".txt")  # COLMAP prefers the first
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)")
 _NEEDED, _NEWER = ("cameras", "images"), ("rigs", "frames")
 
 
@@ -78,7 +80,10 @@ def read_here(images: Path) -> ColmapModel:
     with scratch_folder() as scratch:
         # The points may be many, and are not there in all captures.
         for file in model_files(folder):
-            (scratch / file.name).symlink_to(file)
+            if file.suffix == ".txt":
+                _write_plain(file, scratch / file.name)
+            else:
+                (scratch / file.name).symlink_to(file)
         no_points = struct.pack("<Q", 0) if images.suffix == ".bin" else b"# none\n"
         (scratch / f"points3D{images.suffix}").write_bytes(no_points)
         try:
@@ -111,13 +116,41 @@ def read_here(images: Path) -> ColmapModel:
     )
 
 
+def _write_plain(file: Path, copy: Path) -> None:
+    """A text file of a model as COLMAP expects it: UTF-8 without a mark, each image followed by its
+    row of points, which stays empty. Others leave these rows out, or the last of them, and COLMAP
+    would take the next image for points, without a word."""
+    with (
+        file.open(encoding="utf-8-sig", errors="surrogateescape") as lines,
+        copy.open("w", encoding="utf-8", errors="surrogateescape") as plain,
+    ):
+        image_before = False
+        for line in lines:
+            said = line.strip()
+            if not said or said.startswith("#"):
+                image_before = image_before and bool(said)
+            elif file.stem != "images":
+                plain.write(f"{said}\n")
+            elif image_before and _is_points(said):
+                image_before = False
+            else:
+                plain.write(f"{said}\n\n")
+                image_before = True
+
+
+def _is_points(said: str) -> bool:
+    """Whether a row after an image's is that of its points: places and numbers, in threes."""
+    words = said.split()
+    return len(words) % 3 == 0 and all(_NUMBER.fullmatch(word) for word in words)
+
+
 def _whole_names(images: Path, known: dict[int, str]) -> tuple[str, ...]:
     """The images' names by their numbers, in the order of ``known``. In a text model a name goes on
     to the end of its line; COLMAP itself reads it up to the first space."""
     if images.suffix != ".txt":
         return tuple(known.values())
     whole = dict(known)
-    with images.open(encoding="utf-8", errors="replace") as lines:
+    with images.open(encoding="utf-8-sig", errors="replace") as lines:
         for line in lines:
             # Number, pose (7) and camera, before the name; points are rows of numbers alone.
             said = line.strip().split(None, 9)

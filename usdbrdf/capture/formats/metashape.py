@@ -126,13 +126,18 @@ def frame_records(
     sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
     place_of = _places(chunk, source, findings)
     cameras = list(chunk.iterfind("cameras//camera"))
+    if cameras and not any(map(_is_enabled, cameras)):
+        raise InputRefused(
+            f"{source}: all of its {len(cameras)} cameras are disabled. Enable them in Metashape, "
+            "and export the cameras again. [capture.alignment]"
+        )
     # Pictures of one name in several folders are told apart by the groups that they are in.
     group_of = {c: g.get("label", "") for g in chunk.iterfind("cameras/group") for c in g}
     chunk_from_camera = {c.get("id", ""): numbers_of(c.find("transform"), 16) for c in cameras}
     records = []
     for camera in cameras:
         label = camera.get("label", "")
-        if camera.get("enabled", "true").lower() in ("false", "0"):
+        if not _is_enabled(camera):
             findings.count("cameras_disabled", 1)
             continue
         sensor = sensors.get(camera.get("sensor_id", ""))
@@ -158,6 +163,10 @@ def frame_records(
             )
         )
     return sorted(records, key=lambda record: record.image_path)
+
+
+def _is_enabled(camera: Element) -> bool:
+    return camera.get("enabled", "true").lower() not in ("false", "0")
 
 
 def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place]:

@@ -37,19 +37,27 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # Where programs put the pictures, beside what they say of them.
 _FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+# Of documents that name pictures where they lay on another machine.
+_OTHER_FOLDER = (
+    "Name the folder of the pictures with --frames, or put them inside this one and name them "
+    "relative to it"
+)
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 
 
-def path_in_capture(root: Path, candidate: str, options: CaptureOptions) -> Path:
-    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside."""
+def path_in_capture(
+    root: Path, candidate: str, options: CaptureOptions, *, cure: str | None = None
+) -> Path:
+    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside, which
+    says what to do by ``cure``."""
     for folder in options.allow_outside if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
             candidate.encode()
             path = (root / candidate).resolve()
             if path.is_relative_to(folder.resolve()):
                 return path
-    return contained(root, candidate)
+    return contained(root, candidate, cure=cure) if cure else contained(root, candidate)
 
 
 def rigid_pose(rotation: Double, centre: Double) -> Double:
@@ -170,9 +178,10 @@ class Pictured:
         if self.options.frames is not None:
             return self._of_frames.named(name)
         whole = f"{below}/{name}" if below else name
-        path = path_in_capture(self.folder, whole, self.options)
+        path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
         if "\\" in name and not path.is_file():
-            path = path_in_capture(self.folder, whole.replace("\\", "/"), self.options)
+            whole = whole.replace("\\", "/")
+            path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
         if path.is_file():
             return path
         beside = self._in_folder(path.parent)

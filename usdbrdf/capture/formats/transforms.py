@@ -183,6 +183,10 @@ def _captured(
             f'{source}: no list "frames" of objects, so this is not a transforms.json. Name the '
             "capture's own document. [capture.format]"
         )
+    if not any({"file_path", "brackets", "video_frame"} & set(frame) for frame in frames) and (
+        said := other_program(source)
+    ):
+        raise InputRefused(f"{source}: {said}. [capture.format]")
     legacy = "applied_transform" not in document and (source.parent / _COLMAP).is_dir()
     if legacy:
         findings.warn(
@@ -198,6 +202,11 @@ def _captured(
         images=images,
         is_legacy=legacy,
     )
+    if any(any(_shutter(frame)) for frame in (document, *frames)):
+        findings.warn(
+            f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
+            "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
+        )
     records = [r for frame in frames if (r := _record(capture, frame, findings))]
     capture.pictured.warn_of_others(findings, source)
     return capture, records
@@ -341,13 +350,22 @@ def _why_unlike(
     )
 
 
+def _shutter(holder: Mapping[str, Any]) -> list[Any]:
+    """What instant-ngp's rolling_shutter says, times of which each is 0 where there is none."""
+    stated = holder.get("rolling_shutter")
+    return stated if isinstance(stated, list) else [stated]
+
+
 def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
-    """What camera_model and the distortion of a frame, else of the document, say.
+    """What camera_model, or instant-ngp's is_fisheye, and the distortion of a frame, else of the
+    document, say.
 
     k1 to k4 are coefficients of r^2 to r^8, as nerfstudio has them; where k5 or k6 stand beside
     them, k4 to k6 are OpenCV's, which divide.
     """
-    model = frame.get("camera_model", capture.document.get("camera_model", "PINHOLE"))
+    fisheye = frame.get("is_fisheye", capture.document.get("is_fisheye"))
+    usual = "OPENCV_FISHEYE" if fisheye is True else "PINHOLE"
+    model = frame.get("camera_model", capture.document.get("camera_model", usual))
     if not isinstance(model, str) or model not in _CURVES:
         raise capture.refuse(
             f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_CURVES)}). "
