@@ -32,6 +32,10 @@ class Workers(Protocol):
         """
         ...
 
+    def forget(self, folder: Path) -> None:
+        """Delete what ``results`` with that folder left elsewhere: its task is done."""
+        ...
+
 
 class ThisProcess:
     """Does all units here."""
@@ -51,6 +55,9 @@ class ThisProcess:
             finally:
                 for job in jobs:
                     job.cancel()
+
+    def forget(self, folder: Path) -> None:
+        """Nothing is elsewhere."""
 
 
 HERE = ThisProcess()
