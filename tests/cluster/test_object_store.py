@@ -176,6 +176,16 @@ def test_what_a_task_uploaded_is_deleted_and_nothing_else(
     assert address_for(place, tmp_path / "ours") != ours.files.address
 
 
+def test_a_worker_keeps_the_copies_of_the_last_steps_alone(theirs: Store, tmp_path: Path) -> None:
+    unit = pytest.importorskip("usdbrdf.cluster.unit", reason="the extra cluster is not installed")
+    copies = [tmp_path / f"step-{i}" for i in range(3)]
+    for folder in copies:
+        folder.mkdir()
+        (folder / "copy.npy").write_bytes(b"1")
+        unit._stores.get(str(folder), lambda at=folder: Store(files_at(theirs.files.address, at)))
+    assert [folder.is_dir() for folder in copies] == [False, True, True]
+
+
 @pytest.mark.parametrize("noted", ["", "..", "some/where", "usdbrdf-0123456789abcdef/../else"])
 def test_a_note_of_somebody_else_deletes_nothing(place: str, tmp_path: Path, noted: str) -> None:
     write_object(f"{place}/theirs", b"kept")
