@@ -23,6 +23,7 @@ SLOW = (
     "asset/test_schema.py",
     "capture/test_adapters.py",
     "cluster/test_workers.py",
+    "cluster/test_workers_by_object_store.py",
     "dcc",
     "delivery/test_acescg.py",
     "delivery/test_glb.py",

@@ -136,7 +136,8 @@ def _argument(said: _Said) -> inspect.Parameter:
     from cyclopts import Parameter
 
     option, field = said.option, said.field
-    kind, several = field.kind, get_origin(field.kind) is tuple or option.joined
+    kind = field.kind | str if option.url else field.kind
+    several = get_origin(kind) is tuple or option.joined
 
     def read(_kind: Any, tokens: Any) -> Any:
         return _value(field, option, [(token.index, token.value) for token in tokens])
@@ -174,7 +175,7 @@ def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> 
     text = words[-1][1]
     if text == option.none:
         return None
-    if text in option.words:
+    if text in option.words or (option.url and "://" in text):
         return text
     if option.file:
         # Said before any work is done; an input that is not there is refused as a capture would be.

@@ -30,6 +30,7 @@ class Option(NamedTuple):
     file: bool = False  # a file must lie there before any work begins
     none: str = ""  # the word for None on the command line
     words: tuple[str, ...] = ()  # that may stand in the place of a file
+    url: bool = False  # a text with :// in it may stand in the place of a path, and stays one
     joined: bool = False  # given again it says more: the texts become one, with commas between
     shared: str = ""  # title in help, of what several tasks have
     help: str = ""  # its meaning, if that is not below the field

@@ -11,7 +11,7 @@ import pytest
 
 from tests.scenes import room_mesh
 from usdbrdf.cluster.described import described, restored
-from usdbrdf.cluster.store import Store
+from usdbrdf.cluster.store import Folder, Store
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import Sampling
@@ -21,13 +21,13 @@ from usdbrdf.transport.rays import Hits, RayScene
 
 
 def through(store: Store, value: object) -> object:
-    document = json.loads(json.dumps(described(value, store.keep), allow_nan=False))
-    return restored(document, store.array, lambda _, make: make())
+    document = json.loads(json.dumps(described(value, store), allow_nan=False))
+    return restored(document, store, lambda _, make: make())
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "shared")
+    return Store(Folder(tmp_path / "shared"))
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_every_other_row_is_kept_as_an_array_of_its_own(store: Store) -> None:
 def test_equal_arrays_are_one_file(store: Store) -> None:
     array = np.arange(1000.0)
     assert store.keep(array) == store.keep(array.copy())
-    assert len(list(store.folder.iterdir())) == 1
+    assert len(list(store.files.folder.iterdir())) == 1
 
 
 def test_a_scene_of_rays_is_built_again_and_meets_the_same(store: Store) -> None:
@@ -89,7 +89,7 @@ def test_a_scene_of_rays_is_built_again_and_meets_the_same(store: Store) -> None
 
 def test_what_was_damaged_is_not_taken(store: Store) -> None:
     name = store.keep(np.arange(1000.0))
-    file = store.folder / name
+    file = store.files.folder / name
     content = bytearray(file.read_bytes())
     content[-1] ^= 1
     file.write_bytes(content)
@@ -102,7 +102,7 @@ def test_what_was_damaged_is_not_taken(store: Store) -> None:
 
 def test_what_was_damaged_is_kept_anew(store: Store) -> None:
     array = np.arange(1000.0)
-    file = store.folder / store.keep(array)
+    file = store.files.folder / store.keep(array)
     file.write_bytes(file.read_bytes()[:-1])
     assert store.keep(array) == file.name
     np.testing.assert_array_equal(store.array(file.name), array)
@@ -111,12 +111,12 @@ def test_what_was_damaged_is_kept_anew(store: Store) -> None:
 @pytest.mark.parametrize("name", ["os:system", "usdbrdf.cli:main.x", "usdbrdfx.cli:main"])
 def test_no_names_but_ours_are_followed(store: Store, name: str) -> None:
     with pytest.raises(UsdBrdfError, match=r"\[cluster.value\]"):
-        restored({"made": name, "of": {}}, store.array, lambda _, make: make())
+        restored({"made": name, "of": {}}, store, lambda _, make: make())
     with pytest.raises(UsdBrdfError, match=r"\[cluster.value\]"):
-        restored({"name": name}, store.array, lambda _, make: make())
+        restored({"name": name}, store, lambda _, make: make())
 
 
 def test_what_is_not_ours_is_not_told(store: Store) -> None:
     for value in (print, Path, math, np.array([None])):
         with pytest.raises((UsdBrdfError, AttributeError)):
-            described(value, store.keep)
+            described(value, store)

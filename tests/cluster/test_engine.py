@@ -168,3 +168,47 @@ def test_a_damaged_photograph_is_refused_in_the_words_of_one_process(
         dict(workers.results(as_ours(unit), damaged, {"0": 0}, tmp_path / "shared", 1))
     assert str(found.value) == str(alone.value)
     assert tries == [0]
+
+
+def test_a_photograph_of_an_object_store_is_called_by_its_own_name(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    damaged, sound = tmp_path / "1.exr", tmp_path / "2.exr"
+    write_exr(damaged, np.random.default_rng(1).random((40, 40, 3), np.float32))
+    write_exr(sound, np.ones((4, 4, 3), np.float32))
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:2000])
+    options = ClusterOptions(shared_folder=f"file://{tmp_path}/objects")
+    with pytest.raises(ImageRefused) as alone:
+        read_radiance(damaged)
+
+    def unit(shared: tuple[Path, Path], piece: int) -> dict[str, Array]:
+        assert not [path for path in shared if path.is_relative_to(tmp_path)]
+        return {"pixels": read_radiance(shared[piece])}
+
+    with workers_of(options, client) as workers:
+        given = (unit, (damaged, sound), {"1": 1}, tmp_path / "shared", 1)
+        ((_, found),) = workers.results(as_ours(given[0]), *given[1:])
+        np.testing.assert_array_equal(found["pixels"], read_radiance(sound))
+        with pytest.raises(ImageRefused) as refused:
+            dict(workers.results(unit, (damaged, sound), {"0": 0}, tmp_path / "shared", 1))
+    assert str(refused.value) == str(alone.value)
+
+
+def test_a_photograph_of_which_a_worker_has_a_bad_copy_is_told_with_the_worker(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    seen = tmp_path / "1.exr"
+    write_exr(seen, np.ones((4, 4, 3), np.float32))
+
+    def unit(shared: Path, piece: int) -> dict[str, Array]:
+        read_radiance(shared)
+        shared.write_bytes(b"damaged")
+        return {"pixels": read_radiance(shared)}
+
+    options = ClusterOptions(shared_folder=f"file://{tmp_path}/objects")
+    with (
+        workers_of(options, client) as workers,
+        pytest.raises(EnvironmentFailure, match=rf"inproc://\S+ cannot .* {seen}: "),
+    ):
+        dict(workers.results(as_ours(unit), seen, {"0": 0}, tmp_path / "shared", 1))

@@ -19,8 +19,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from usdbrdf.cluster.store import Store
 from usdbrdf.errors import UsdBrdfError
-from usdbrdf.model.arrays import Array
 
 Document: TypeAlias = Any
 # Bytes of an array that is told by its digits.
@@ -28,8 +28,8 @@ _SMALL = 1 << 10
 _OURS = "usdbrdf."
 
 
-def described(value: Any, keep: Callable[[Array], str]) -> Document:
-    """JSON of a value; ``keep`` stores an array and gives its name."""
+def described(value: Any, store: Store) -> Document:
+    """JSON of a value, whose arrays the store keeps."""
 
     def of(value: Any) -> Document:
         if value is None or type(value) in (bool, int, str):
@@ -42,10 +42,10 @@ def described(value: Any, keep: Callable[[Array], str]) -> Document:
             if value.dtype.hasobject:
                 raise UsdBrdfError("an array of objects cannot be told to workers. [cluster.value]")
             if value.nbytes > _SMALL:
-                return {"array": keep(value)}
+                return {"array": store.keep(value)}
             return {"digits": [value.dtype.str, [*value.shape], value.tobytes().hex()]}
         if isinstance(value, Path):
-            return {"path": str(value)}
+            return store.files.path_told(value)
         if isinstance(value, range):
             return {"range": [value.start, value.stop, value.step]}
         if isinstance(value, slice):
@@ -64,12 +64,11 @@ def described(value: Any, keep: Callable[[Array], str]) -> Document:
 
 
 def restored(
-    document: Document,
-    array: Callable[[str], Array],
-    costly: Callable[[Document, Callable[[], Any]], Any],
+    document: Document, store: Store, costly: Callable[[Document, Callable[[], Any]], Any]
 ) -> Any:
-    """The value of a document; ``array`` finds one by its name. ``costly`` is given the document of
-    an object that is more than its parts, and what makes it, and may know it already."""
+    """The value of a document; the store finds arrays by their names. ``costly`` is given the
+    document of an object that is more than its parts, and what makes it, and may know it already.
+    """
 
     def of(told: Document) -> Any:
         if not isinstance(told, dict):
@@ -88,12 +87,12 @@ def restored(
             case "number":
                 return np.frombuffer(bytes.fromhex(parts[1]), parts[0])[0]
             case "array":
-                return array(parts)
+                return store.array(parts)
             case "digits":
                 dtype, shape, digits = parts
                 return np.frombuffer(bytearray.fromhex(digits), dtype).reshape(shape)
-            case "path":
-                return Path(parts)
+            case "path" | "file":
+                return store.files.path_found(told)
             case "range":
                 return range(*parts)
             case "slice":

@@ -19,7 +19,9 @@ from typing import Any, TypeVar
 from distributed import Client, Future, KilledWorker
 
 from usdbrdf.cluster.described import described
-from usdbrdf.cluster.store import Store
+from usdbrdf.cluster.object_store import address_for, files_at
+from usdbrdf.cluster.options import is_url
+from usdbrdf.cluster.store import Files, Store, Wanted
 from usdbrdf.cluster.unit import Stranger, Unread, arithmetic, done
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.images import read_radiance
@@ -39,19 +41,24 @@ _GONE = (OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 
 @dataclass
 class _Sent:
-    """A unit that is out, and how often it failed."""
+    """A unit that is out, how often it failed, and whether the files that it reads were given."""
 
     key: str
     failed: int = 0
+    given: bool = False
 
 
 class DaskWorkers:
     """Does units of work on the workers of a Dask cluster."""
 
-    def __init__(self, client: Client, shared_folder: Path | None, unit_limit_s: float) -> None:
-        """shared_folder: which all workers see under this name, None: the task's own, in the asset;
-        unit_limit_s: seconds after which a worker is taken to hang at a unit."""
-        self._client, self._folder, self._limit = client, shared_folder, unit_limit_s
+    def __init__(
+        self, client: Client, shared_folder: Path | str | None, unit_limit_s: float
+    ) -> None:
+        """shared_folder: which all workers see under this name, or the URL of an object store;
+        None: the task's own, in the asset. unit_limit_s: seconds after which a worker is taken to
+        hang at a unit."""
+        self._client, self._shared, self._limit = client, shared_folder, unit_limit_s
+        self._stores: dict[str, Store] = {}
         self._address = str(client.scheduler.address)
         # What each worker had to do at the last look, and since when it gave nothing back.
         self._at_work: dict[str, tuple[frozenset[Any], float]] = {}
@@ -65,15 +72,16 @@ class DaskWorkers:
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
         """See ``job.units.Workers``. Raises EnvironmentFailure where scheduler or workers are gone
         or workers are not like this process, and whatever the unit raises."""
-        store = Store((self._folder or folder).absolute())
+        store = self._store(folder)
         work = store.keep_document(
             {
                 "arithmetic": arithmetic(),
-                "unit": described(unit, store.keep),
-                "shared": described(shared, store.keep),
+                "unit": described(unit, store),
+                "shared": described(shared, store),
             }
         )
-        told = {key: described(piece, store.keep) for key, piece in pieces.items()}
+        told = {key: described(piece, store) for key, piece in pieces.items()}
+        store.files.settle()
         waiting = [_Sent(key) for key in reversed(told)]
         out: dict[Future, _Sent] = {}
         back: SimpleQueue[Future] = SimpleQueue()
@@ -82,7 +90,7 @@ class DaskWorkers:
                 # One more than can be worked on is out, so that no worker waits for its next.
                 while waiting and len(out) <= self._at_once():
                     sent = waiting.pop()
-                    future = self._submitted(str(store.folder), work, told[sent.key])
+                    future = self._submitted(store.files.address, work, told[sent.key])
                     out[future] = sent
                     future.add_done_callback(back.put)
                 try:
@@ -92,10 +100,15 @@ class DaskWorkers:
                     continue
                 sent = out.pop(future)
                 try:
-                    found = store.result(name := self._name(future))
+                    found = store.result(name := self._name(future, store.files))
                 except Stranger:
                     raise
                 except EnvironmentFailure as failure:
+                    if isinstance(failure, Wanted) and not sent.given:
+                        store.files.give_told()
+                        sent.given = True
+                        waiting.append(sent)
+                        continue
                     sent.failed += 1
                     if sent.failed == _TRIES:
                         raise
@@ -103,11 +116,19 @@ class DaskWorkers:
                     waiting.append(sent)
                     continue
                 yield sent.key, found
-                (store.folder / name).unlink(missing_ok=True)
+                store.files.drop(name)
         finally:
             if out and self._client.status == "running":
                 with suppress(*_GONE):
                     self._client.cancel([*out])
+
+    def _store(self, folder: Path) -> Store:
+        """That of the task to which a folder belongs."""
+        place = self._shared or folder
+        address = address_for(str(place), folder) if is_url(place) else str(place)
+        if address not in self._stores:
+            self._stores = {address: Store(files_at(address, folder))}
+        return self._stores[address]
 
     def _submitted(self, *given: Any) -> Future:
         return self._asked(lambda: self._client.submit(done, *given, pure=False))
@@ -127,7 +148,7 @@ class DaskWorkers:
             threads = self._asked(self._client.nthreads)
         return sum(threads.values())
 
-    def _name(self, future: Future) -> str:
+    def _name(self, future: Future, files: Files) -> str:
         """What a worker called the result of its unit; its failures in our words."""
         if future.status != "error":
             return str(self._asked(lambda: future.result(timeout=_NAME)))
@@ -145,7 +166,8 @@ class DaskWorkers:
             ) from error
         if isinstance(error, Unread) and error.path is not None:
             # The photograph itself, or what the worker sees of it? The former is refused here too.
-            read_radiance(error.path)
+            read_radiance(Path(files.sentence_found(str(error.path))))
+            raise Unread(files.sentence_found(str(error))) from error
         if isinstance(error, OSError | MemoryError):
             raise EnvironmentFailure(
                 f"{self._address}: a worker failed ({error}). See whether its disk is full, and "

@@ -8,6 +8,11 @@ from usdbrdf.errors import UsageError
 from usdbrdf.option import Options, option
 
 
+def is_url(place: object) -> bool:
+    """Whether that is an object store, not a folder."""
+    return isinstance(place, str) and "://" in place
+
+
 class ClusterOptions(Options):
     """Who does the long parts of the work. No result depends on it."""
 
@@ -17,8 +22,11 @@ class ClusterOptions(Options):
     "do the work in N processes of this machine"
     scheduler: str | None = option("--scheduler ADDRESS", None)
     "do it on the workers of a Dask cluster, such as tls://HOST:8786, that are installed as this is"
-    shared_folder: Path | None = option("--shared-folder DIR", None, unset="in the asset")
-    "folder that all workers see under this name, for what they work with"
+    shared_folder: Path | str | None = option(
+        "--shared-folder DIR|URL", None, unset="in the asset", url=True
+    )
+    """folder that all workers see under this name, for what they work with, or an object store,
+    such as s3://BUCKET/PREFIX, by which they get photographs too"""
     unit_limit: float = option("--unit-limit S", 1800.0, (1e-3, 1e9))
     """seconds after which a worker is taken to hang at a unit of work, and is restarted while
     others do it"""
@@ -27,6 +35,11 @@ class ClusterOptions(Options):
         super().__post_init__()
         if self.workers is not None and self.scheduler is not None:
             raise UsageError("--workers, --scheduler: they exclude each other. [usage.option]")
+        if is_url(self.shared_folder) and "memory://" in str(self.shared_folder):
+            raise UsageError(
+                f"--shared-folder {self.shared_folder}: no other process sees this one's memory. "
+                "Give a folder, or a store such as s3://BUCKET/PREFIX. [usage.option]"
+            )
 
     @property
     def asked(self) -> bool:

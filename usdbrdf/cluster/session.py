@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from usdbrdf.cluster.options import ClusterOptions
+from usdbrdf.cluster.options import ClusterOptions, is_url
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import HERE, Unit, Workers
@@ -18,6 +18,8 @@ from usdbrdf.model.arrays import Array
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from usdbrdf.cluster.engine import DaskWorkers
 
 # Seconds in which a scheduler answers.
 _ANSWER = 20.0
@@ -50,7 +52,7 @@ class _Session:
 
     def __init__(self, options: ClusterOptions, client: Any, stack: ExitStack) -> None:
         self._options, self._client, self._stack = options, client, stack
-        self._workers: Workers | None = None
+        self._workers: DaskWorkers | None = None
 
     def elsewhere(self) -> int:
         # Of workers of our own what was asked for, though one may be starting anew.
@@ -61,14 +63,21 @@ class _Session:
     ) -> Iterator[tuple[str, Mapping[str, Array]]]:
         return self._started().results(unit, shared, pieces, folder, at_a_time)
 
-    def _started(self) -> Workers:
+    def _started(self) -> DaskWorkers:
         if self._workers is None:
-            from usdbrdf.cluster.engine import DaskWorkers
+            from usdbrdf.cluster import engine
 
             options = self._options
             client = self._client or self._stack.enter_context(_client(options))
-            self._workers = DaskWorkers(client, options.shared_folder, options.unit_limit)
+            self._workers = engine.DaskWorkers(client, options.shared_folder, options.unit_limit)
         return self._workers
+
+    def forget(self, folder: Path) -> None:
+        place = self._options.shared_folder
+        if is_url(place):
+            from usdbrdf.cluster.object_store import forget
+
+            forget(str(place), folder)
 
 
 def _need_dask() -> None:

@@ -1,5 +1,5 @@
 """Where units of work and their workers find each other's arrays: files named by their SHA-256, in
-a folder that all of them see."""
+a folder that all of them see, or in an object store."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import hashlib
 import io
 import json
 import secrets
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,129 @@ from usdbrdf.files.documents import load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
 
 # Of a SHA-256, with which every name begins.
-_DIGITS = 64
+DIGITS = 64
+
+
+class Wanted(EnvironmentFailure):
+    """A file that workers were told of is not in the store yet (see ``Files.give_told``)."""
+
+
+class Files(ABC):
+    """Where the files of a store are, and how workers find other files of this process.
+
+    address  by which another process finds them
+    folder   of this machine, where they are, or copies of those that were asked for
+    """
+
+    address: str
+    folder: Path
+
+    @abstractmethod
+    def put(self, name: str, size: int | None, write: Callable[[Path], object]) -> None:
+        """Have what ``write`` writes under that name: at once, or, where its size in bytes is told,
+        by the end of ``settle``, and one that is there already will do."""
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Wait until all is there that was put; raises what went wrong with it."""
+
+    @abstractmethod
+    def found(self, name: str) -> Path:
+        """The file of that name, or a copy; EnvironmentFailure where it is not there, or holds
+        something else than its name tells."""
+
+    @abstractmethod
+    def drop(self, name: str) -> None:
+        """Delete it."""
+
+    @abstractmethod
+    def path_told(self, path: Path) -> dict[str, Any]:
+        """JSON of a path, by which another process finds that file, or a copy."""
+
+    @abstractmethod
+    def path_found(self, told: dict[str, Any]) -> Path:
+        """The inverse. Whoever opens it may get Wanted."""
+
+    @abstractmethod
+    def give_told(self) -> None:
+        """Have those of ``path_told`` in the store."""
+
+    @abstractmethod
+    def sentence_told(self, text: str) -> str:
+        """A sentence of a worker about its copies, for ``sentence_found`` of who told it of them,
+        which has our files in their places."""
+
+    @abstractmethod
+    def sentence_found(self, text: str) -> str:
+        """The inverse."""
+
+    @abstractmethod
+    def drop_copies(self) -> None:
+        """Delete this machine's copies."""
+
+
+class Folder(Files):
+    """A folder that all workers see under the same name, as they do all other files."""
+
+    def __init__(self, folder: Path) -> None:
+        self.address, self.folder = str(folder), folder
+
+    def put(self, name: str, size: int | None, write: Callable[[Path], object]) -> None:
+        path = self.folder / name
+        if size is None or not (path.is_file() and sha256_of(path) == name[:DIGITS]):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with temporary_beside(path) as staged:
+                write(staged)
+                staged.replace(path)
+
+    def settle(self) -> None:
+        """All is there."""
+
+    def found(self, name: str) -> Path:
+        """A network's file system may show that of another moment for a while."""
+        path = self.folder / name
+        try:
+            found = sha256_of(path)
+        except OSError as error:
+            raise EnvironmentFailure(
+                f"{path}: cannot be read here ({error.strerror}). Give a folder that all workers "
+                "see, under the same name, as --shared-folder. [cluster.folder]"
+            ) from error
+        if found != name[:DIGITS]:
+            raise EnvironmentFailure(
+                f"{path}: is not what its name tells. See whether its disk is full or damaged. "
+                "[cluster.folder]"
+            )
+        return path
+
+    def drop(self, name: str) -> None:
+        (self.folder / name).unlink(missing_ok=True)
+
+    def path_told(self, path: Path) -> dict[str, Any]:
+        return {"path": str(path)}
+
+    def path_found(self, told: dict[str, Any]) -> Path:
+        return Path(told["path"])
+
+    def give_told(self) -> None:
+        """Workers see them where they are."""
+
+    def sentence_told(self, text: str) -> str:
+        return text
+
+    def sentence_found(self, text: str) -> str:
+        return text
+
+    def drop_copies(self) -> None:
+        """There are none."""
 
 
 class Store:
-    """A folder of files whose names tell what is in them: whoever reads one checks that."""
+    """Arrays and documents as files whose names tell what is in them: whoever reads one checks
+    that."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, files: Files) -> None:
+        self.files = files
 
     def keep(self, array: Array) -> str:
         """Store one array as an .npy of its own, and give its name."""
@@ -50,54 +167,36 @@ class Store:
         digest = hashlib.sha256()
         for part in parts:
             digest.update(part)
-        path = self.folder / f"{digest.hexdigest()}{ending}"
-        if not (path.is_file() and sha256_of(path) == digest.hexdigest()):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with temporary_beside(path) as staged:
-                with staged.open("wb") as file:
-                    for part in parts:
-                        file.write(part)
-                staged.replace(path)
-        return path.name
+
+        def write(path: Path) -> None:
+            with path.open("wb") as file:
+                for part in parts:
+                    file.write(part)
+
+        name = f"{digest.hexdigest()}{ending}"
+        self.files.put(name, sum(map(len, parts)), write)
+        return name
 
     def array(self, name: str) -> Array:
         """An array, mapped into memory, which machines share among their workers."""
-        path = self._checked(name)
+        path = self.files.found(name)
         # Writing, which nobody does, would not reach the file: kernels know arrays that may be
         # written to by another type than those that may not, and are compiled for the former.
         return np.asarray(np.load(path, mmap_mode="c", allow_pickle=False))
 
     def document(self, name: str) -> Any:
-        return json.loads(self._checked(name).read_bytes())
+        return json.loads(self.files.found(name).read_bytes())
 
     def keep_result(self, arrays: dict[str, Array]) -> str:
         """Store what a unit found, and give its name."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with temporary_beside(self.folder / "result.npz") as staged:
+        self.files.folder.mkdir(parents=True, exist_ok=True)
+        with temporary_beside(self.files.folder / "result.npz") as staged:
             save_arrays(staged, arrays)
             # A name of its own: whoever reads it deletes it, and others may have found the same.
             name = f"{sha256_of(staged)}-{secrets.token_hex(8)}.npz"
-            staged.replace(self.folder / name)
+            self.files.put(name, None, staged.replace)
         return name
 
     def result(self, name: str) -> dict[str, Array]:
         """What ``keep_result`` stored."""
-        return load_arrays(self._checked(name))
-
-    def _checked(self, name: str) -> Path:
-        """The file of that name; EnvironmentFailure where it is not there or holds something else,
-        which a network's file system may show for a while."""
-        path = self.folder / name
-        try:
-            found = sha256_of(path)
-        except OSError as error:
-            raise EnvironmentFailure(
-                f"{path}: cannot be read here ({error.strerror}). Give a folder that all workers "
-                "see, under the same name, as --shared-folder. [cluster.folder]"
-            ) from error
-        if found != name[:_DIGITS]:
-            raise EnvironmentFailure(
-                f"{path}: is not what its name tells. See whether its disk is full or damaged. "
-                "[cluster.folder]"
-            )
-        return path
+        return load_arrays(self.files.found(name))

@@ -18,6 +18,7 @@ from distributed import get_worker
 from threadpoolctl import threadpool_limits
 
 from usdbrdf.cluster.described import Document, restored
+from usdbrdf.cluster.object_store import files_at
 from usdbrdf.cluster.store import Store
 from usdbrdf.errors import EnvironmentFailure, ImageRefused
 from usdbrdf.identity import tasks_identity
@@ -54,10 +55,11 @@ class Unread(EnvironmentFailure):
 
 
 class _Kept:
-    """The latest few of what is costly to make, each made once, whichever thread asks."""
+    """The latest few of what is costly to make, each made once, whichever thread asks; what is
+    not kept any more is ``dropped``."""
 
-    def __init__(self, most: int) -> None:
-        self._most, self._lock = most, RLock()
+    def __init__(self, most: int, dropped: Callable[[Any], object] = lambda _: None) -> None:
+        self._most, self._dropped, self._lock = most, dropped, RLock()
         self._found: OrderedDict[str, Any] = OrderedDict()
 
     def get(self, key: str, make: Callable[[], Any]) -> Any:
@@ -66,11 +68,12 @@ class _Kept:
                 self._found[key] = make()
             self._found.move_to_end(key)
             while len(self._found) > self._most:
-                self._found.popitem(last=False)
+                self._dropped(self._found.popitem(last=False)[1])
             return self._found[key]
 
 
 _shared, _scenes = _Kept(_KEPT_SHARED), _Kept(_KEPT_SCENES)
+_stores = _Kept(_KEPT_SHARED, lambda store: store.files.drop_copies())
 
 
 def _refuse_to_differ(wanted: Mapping[str, str]) -> None:
@@ -85,20 +88,20 @@ def _refuse_to_differ(wanted: Mapping[str, str]) -> None:
         )
 
 
-def done(folder: str, work: str, piece: Document) -> str:
-    """Do a unit: the name of what it found in the store ``folder``, where ``work`` is the name of
-    what all units of its kind share."""
-    store = Store(Path(folder))
+def done(address: str, work: str, piece: Document) -> str:
+    """Do a unit: the name of what it found in the store at ``address``, where ``work`` is the name
+    of what all units of its kind share."""
+    store: Store = _stores.get(address, lambda: Store(files_at(address, _copies(address))))
 
     def value(document: Document) -> Any:
-        return restored(document, store.array, lambda told, make: _scenes.get(str(told), make))
+        return restored(document, store, lambda told, make: _scenes.get(str(told), make))
 
     def read() -> Any:
         told = store.document(work)
         _refuse_to_differ(told["arithmetic"])
         return value(told["unit"]), value(told["shared"])
 
-    unit, shared = _shared.get(work, read)
+    unit, shared = _shared.get(f"{address}/{work}", read)
     # As where units are done in one process: BLAS's threads only wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         try:
@@ -106,7 +109,15 @@ def done(folder: str, work: str, piece: Document) -> str:
         except ImageRefused as error:
             unread = Unread(
                 f"the worker {get_worker().address} cannot read a photograph of the capture. Let "
-                f"all workers see the capture's folder under the same name. {error}"
+                "all workers see the capture's folder under the same name, or give an object store "
+                f"as --shared-folder. {store.files.sentence_told(str(error))}"
             )
-            unread.path = error.path
+            if error.path is not None:
+                unread.path = Path(store.files.sentence_told(str(error.path)))
             raise unread from error
+
+
+def _copies(address: str) -> Path:
+    """Where this worker has copies of what is in an object store: Dask deletes its folder with it,
+    or when another one starts beside it."""
+    return Path(get_worker().local_directory) / Path(address).name

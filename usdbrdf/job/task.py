@@ -60,6 +60,8 @@ _NAME = re.compile(r"(?P<key>[^@]*)(?:@(?P<index>\d{9}))?\.(?P<sha256>[0-9a-f]{6
 # Seconds between saved states of a running computation, and how many times as long as saving one
 # takes: what a kill can cost, and what saving may.
 _SAVE_AFTER, _SAVE_SELDOM = 2.0, 30
+# Of a task's folder, what its workers are to read.
+_FOR_WORKERS = "shared"
 # What a layer points at is there before the layer: textures, binary layers, text layers.
 _RANK = {".usdc": 1, ".usd": 1, ".usda": 2}
 
@@ -84,7 +86,7 @@ class TaskRun:
         self.asset = asset
         self.name = name
         self._workers = workers
-        self._for_workers = folder / "shared"
+        self._for_workers = folder / _FOR_WORKERS
         self.staged = folder / "staged"
         self.outputs: list[str] = []
         self.once: list[str] = []
@@ -281,10 +283,12 @@ def run_task(
         interrupted = noted is not None and noted.fingerprint == wanted.fingerprint
         for path in work_folder.iterdir():  # this task's work for other parameters
             if re.fullmatch(rf"{re.escape(name)}-[0-9a-f]{{12}}", path.name) and path != folder:
+                workers.forget(path / _FOR_WORKERS)
                 shutil.rmtree(path, ignore_errors=True)
         if reason is None:
             if interrupted:
                 journal.unlink()
+            workers.forget(folder / _FOR_WORKERS)
             shutil.rmtree(folder, ignore_errors=True)
             done = read_stamp(stamp)
             return TaskResult(summary=done.summary if done else {}, reran=False, reason="done")
@@ -296,6 +300,7 @@ def run_task(
         # for long.
         with threadpool_limits(limits=1, user_api="blas"):
             summary = json.loads(json_text(work(run)))
+        workers.forget(folder / _FOR_WORKERS)
         run.gather()
         for relative in (*run.outputs, *run.once):
             if not (run.staged / relative).is_file():

@@ -36,6 +36,10 @@ class Workers(Protocol):
         """
         ...
 
+    def forget(self, folder: Path) -> None:
+        """Delete what ``results`` with that folder left elsewhere: its task is done."""
+        ...
+
 
 class ThisProcess:
     """Does all units here."""
@@ -58,6 +62,9 @@ class ThisProcess:
             finally:
                 for job in jobs:
                     job.cancel()
+
+    def forget(self, folder: Path) -> None:
+        """Nothing is elsewhere."""
 
 
 HERE = ThisProcess()

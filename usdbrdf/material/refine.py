@@ -456,7 +456,7 @@ def frame_reader(
         bytes_for_frames(lit.texels, lit.scene, frames, memory, need)
         for need in (_need(lightings), _OF_PATTERNS)
     )
-    return FrameReader(frames, min(room))
+    return FrameReader(frames.images_alone(), min(room))
 
 
 def _need(lightings: Sequence[LitScene]) -> BytesPerTexel:

@@ -89,6 +89,10 @@ class Frames:
         images = tuple(p or image for p, image in zip(given, self.image_paths, strict=True))
         return replace(self, image_paths=images)
 
+    def images_alone(self) -> Frames:
+        """Without what they were resampled from."""
+        return replace(self, photographs=(), masks=())
+
     def at(self, indices: Sequence[int]) -> Frames:
         """The frames with these indices, in this order."""
         rows = np.asarray(indices, np.int64)

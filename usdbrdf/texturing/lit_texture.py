@@ -83,7 +83,7 @@ def lit_texture_from_frames(
     """
     texels = surface.texels
     frames = frames.at(going_on.order)
-    shown = _Shown(surface, frames, quantile)
+    shown = _Shown(surface, frames.images_alone(), quantile)
 
     def measured(part: slice) -> dict[str, Array]:
         """Some texels in all frames, going on from the last saved state of an interrupted run, or
