@@ -92,8 +92,8 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         warn(
             f"{source}: {len(flickers)} of {photographs} photographs are all brighter or darker "
             f"than their exposures say, {file} most of all ({factor:.2f} x), as a lamp's "
-            "flicker or a fast shutter makes them; that factor has been taken out. With lamps in "
-            "view take exposures of 1/50 s or longer, through a grey filter. [brackets.flicker]"
+            "flicker or a fast shutter may make them; that factor has been taken out. With lamps "
+            "in view take exposures of 1/50 s or longer, through a grey filter. [brackets.flicker]"
         )
     ranges = [float(b.exposures[0] / b.exposures[-1]) for b in brackets]
     return {
