@@ -224,17 +224,11 @@ def exposures_as_shown(stack: Byte, exposures: Double, response: Response, silen
         codes = stack[shorter], stack[longer]
         brighter, fainter = (response.logarithm[channel, c][both] for c in codes)
         error = np.hypot(*(response.error[channel, c][both] for c in codes))
-        off = _weighted_median(brighter - fainter, error**-2)
-        off -= float(np.log(exposures[shorter] / shown[longer]))
+        apart = np.quantile(brighter - fainter, 0.5, weights=error**-2, method="inverted_cdf")
+        off = float(apart - np.log(exposures[shorter] / shown[longer]))
         if _KEPT < abs(off) <= _FLICKER:
             shown[shorter] = exposures[shorter] * np.exp(off)
     return shown
-
-
-def _weighted_median(values: Double, weight: Double) -> float:
-    order = np.argsort(values, kind="stable")
-    below = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(below, below[-1] / 2)])
 
 
 def merge(stack: Byte, exposures: Double, response: Response, silent: Bool | None = None) -> Merged:

@@ -17,12 +17,12 @@ _LITTER = (".DS_Store", "._*", "Thumbs.db", "ehthumbs.db", "desktop.ini", ".dire
 _CURE = "Put the file inside the folder and name it relative to it"
 
 
-def contained(root: Path, candidate: str, *, cure: str = _CURE) -> Path:
+def contained(root: Path, candidate: str, *, cure: str = "") -> Path:
     """The absolute path of ``candidate`` below ``root``; symbolic links are judged by their target.
 
     Nothing is opened, and the file need not exist. Absolute paths are refused even if they lie
     inside: they would break as soon as the capture is moved. ``cure`` is what the refusal says to
-    do.
+    do, if not to put the file inside.
     """
     cause: Exception | None = None
     if not candidate or "\0" in candidate:
@@ -46,7 +46,7 @@ def contained(root: Path, candidate: str, *, cure: str = _CURE) -> Path:
             cause, reason = error, f"cannot be resolved ({str(words)[:200]})"
     shown = repr(candidate if len(candidate) <= 200 else candidate[:200] + "...")
     raise InputRefused(
-        f"{str(root)!r}: the path {shown} {reason}. {cure}. [paths.outside]"
+        f"{str(root)!r}: the path {shown} {reason}. {cure or _CURE}. [paths.outside]"
     ) from cause
 
 

@@ -8,7 +8,7 @@ holds the specular light that is seen from everywhere, then enters as incident l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial, reduce
 from typing import NamedTuple
 
@@ -86,11 +86,9 @@ class SampledObject(NamedTuple):
     def basis(self, width: int, seed: int) -> Basis:
         """Views of a texel share their random numbers: what they have in common then cancels in
         their differences, which are all that is fitted."""
-        ends = np.cumsum([len(part.observed.texel) for part in self.parts])
-        streams = np.split(self.samples.texel, ends[:-1])
         of_parts = [
             lobe_basis(part.lit, part.footprints[width], len(stream), seed, self.mixture, stream)
-            for part, stream in zip(self.parts, streams, strict=True)
+            for part, stream in self._parts_with_texels()
         ]
 
         seen = cache(lambda: (self._mean_of_texel[..., None], self._cosine(width)))
@@ -110,8 +108,7 @@ class SampledObject(NamedTuple):
         """(P, 3, 1) of I_nd = base + psi slope, of the usual footprint; of_doubt: of what the light
         may be off by alone."""
         found = []
-        ends = np.cumsum([len(part.observed.texel) for part in self.parts])
-        for part, stream in zip(self.parts, np.split(self.samples.texel, ends[:-1]), strict=True):
+        for part, stream in self._parts_with_texels():
             lit = part.doubt if of_doubt else part.lit
             if lit is None:
                 found.append(np.zeros((len(stream), 3, 1), np.float32))
@@ -120,6 +117,11 @@ class SampledObject(NamedTuple):
             basis = lobe_basis(lit, points, len(stream), seed, mixture, stream)
             found.append(basis(kind, [phi])[1])
         return np.concatenate(found)
+
+    def _parts_with_texels(self) -> Iterator[tuple[SampledPart, Long]]:
+        """Each part with what ``samples`` call the texels of its own samples."""
+        ends = np.cumsum([len(part.observed.texel) for part in self.parts])
+        return zip(self.parts, np.split(self.samples.texel, ends[:-1]), strict=True)
 
     def _cosine(self, width: int) -> Float:
         """(P,): of the angle between the normal and the camera, the mean over the footprint."""

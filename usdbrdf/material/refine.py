@@ -383,13 +383,8 @@ def _with_patterns(
                 return among_workers(
                     run, "steps", shares, _pattern_of, given, shares, "fit: patterns"
                 )
-            looked_at = _looked_at(seen, part)
-            bar = progress(
-                _pixels(seen, part, looked_at),
-                total=len(looked_at),
-                label="fit: patterns",
-                unit="frames",
-            )
+            frames, pixels = _pixels(seen, part)
+            bar = progress(pixels, total=len(frames), label="fit: patterns", unit="frames")
             return steps_of(surface, bar, part, level, seed)
 
         return in_passes(run, "patterns", groups, steps)
@@ -414,23 +409,13 @@ class _Patterned(NamedTuple):
     seed: int
 
 
-def _told_by(seen: _Patterned, part: slice) -> slice:
-    """The texels whose pixels tell of those of ``part``."""
-    return with_rows_beside(seen.surface.texels, part, ROWS_BESIDE + REACH)
-
-
-def _looked_at(seen: _Patterned, part: slice) -> list[int]:
-    """The frames whose pixels may tell of the texels of ``part``."""
-    texels, frames = seen.surface.texels, seen.reader.frames
-    return frames_in_view(texels, _told_by(seen, part), frames, seen.own)
-
-
-def _pixels(
-    seen: _Patterned, part: slice, looked_at: Sequence[int]
-) -> Iterator[tuple[int, Covering]]:
-    """Of each of these frames its number among all, and what its pixels tell of ``part``."""
+def _pixels(seen: _Patterned, part: slice) -> tuple[Sequence[int], Iterator[tuple[int, Covering]]]:
+    """The frames whose pixels may tell of the texels of ``part``; and of each of them its number
+    among all, and what these pixels tell."""
     surface, samples, _, reader, own, seed = seen
-    frames, whole = reader.frames, _told_by(seen, part)
+    frames, texels = reader.frames, surface.texels
+    whole = with_rows_beside(texels, part, ROWS_BESIDE + REACH)
+    looked_at = frames_in_view(texels, whole, frames, own)
 
     def of_frame(i: int) -> tuple[int, Covering]:
         picture, camera = Picture.of(reader.read(i)), frames.camera(i)
@@ -438,12 +423,12 @@ def _pixels(
         found = pixels_of_frame(surface, picture, camera, noise, RELATIVE_ERROR, whole)
         return i - own.start, found.take(_subsample(found.texel, samples[found.texel], i, seed))
 
-    return ahead(of_frame, looked_at)
+    return looked_at, ahead(of_frame, looked_at)
 
 
 def _pattern_of(seen: _Patterned, part: slice) -> Mapping[str, Array]:
     """A unit of work: what the frames tell of some texels."""
-    pixels = _pixels(seen, part, _looked_at(seen, part))
+    _, pixels = _pixels(seen, part)
     return steps_of(seen.surface, pixels, part, seen.level, seen.seed)
 
 

@@ -79,11 +79,11 @@ def pixels_of_frame(
         texels.first_pixel, texels.resolution, surface.own, face, point, texel, where,
     )  # fmt: skip
     asked = texel >= 0
+    fits = picture.valid & asked & ~glares(picture)
     if part is not None:
-        asked &= (texel >= part.start) & (texel < part.stop)
-    # What others have in common with these counts.
-    near = maximum_filter(asked, 2 * _COMMON + 1)
-    fits = picture.valid & (texel >= 0) & near & ~glares(picture)
+        asked = (texel >= part.start) & (texel < part.stop)
+        # What others have in common with these counts.
+        fits &= maximum_filter(asked, 2 * _COMMON + 1)
     step = np.zeros((*size, 2, 2), np.float32)
     rest = np.full((*size, 3), np.nan, np.float32)
     pixel_size = 1 / float(camera.intrinsics[0])

@@ -46,18 +46,16 @@ _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 
 
-def path_in_capture(
-    root: Path, candidate: str, options: CaptureOptions, *, cure: str | None = None
-) -> Path:
+def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
     """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside, which
-    says what to do by ``cure``."""
+    says what to do by ``cure``, see ``contained``."""
     for folder in options.allow_outside if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
             candidate.encode()
             path = (root / candidate).resolve()
             if path.is_relative_to(folder.resolve()):
                 return path
-    return contained(root, candidate, cure=cure) if cure else contained(root, candidate)
+    return contained(root, candidate, cure=cure)
 
 
 def rigid_pose(rotation: Double, centre: Double) -> Double:

@@ -570,7 +570,7 @@
     const numbers = 'One colour per object. Dark violet: 0; yellow: 1; purple: no number.';
     const legends = {
       phi: numbers, psi: numbers,
-      status: 'Green: measured. Orange: not determined. Red: the fit failed. Grey: unseen. Yellow: lamp.',
+      status: data.maps.find((map) => map.name === 'status')?.legend,
       verdict: 'Green: accepted. Red: rejected. Grey: none yet.',
     };
     const legend = el('p', { class: 'soft', id: 'look-legend', role: 'status' });
