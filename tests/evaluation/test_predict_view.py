@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from tests.scenes import camera_at, look_at
-from usdbrdf.evaluation.evaluate_views import measured_atlas, predict_view, viewed_asset
+from usdbrdf.asset.readers.views import Views
+from usdbrdf.evaluation.evaluate_views import (
+    measured_atlas,
+    predict_view,
+    scored_views,
+    viewed_asset,
+)
+from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.transport.surface_texture import surface_texture
 
@@ -95,3 +102,21 @@ def test_where_specular_light_was_taken_out_the_full_model_starts_from_the_rest(
 def in_the_dark(lit):
     dark = lit.radiance._replace(pixels=np.zeros_like(lit.radiance.pixels))
     return replace(lit, radiance=dark)
+
+
+def test_a_reduced_view_is_a_mean_as_its_photograph_is(room, seen):
+    """The photographs show one radiance per object, so that edges alone can differ."""
+    _, atlas = measured_atlas(room.asset)
+    frames = atlas.frames.at([0, 1])
+    views = Views(names=("0", "1"), frames=frames)
+    half = frames.camera(0).width // 2
+    scored = list(scored_views(seen, views, 1.0, QUICK, [half, half]))
+    off = point_off = 0.0
+    for i, view in enumerate(scored):
+        camera = frames.camera(i).at_width(half)
+        point = to_display_srgb(
+            predict_view(seen, camera, QUICK, i << 16).baseline, exposure_scale=1.0
+        )
+        off += np.abs(view.shown["baseline"] - view.reference)[view.counted].mean()
+        point_off += np.abs(point - view.reference)[view.counted].mean()
+    assert off < 0.6 * point_off

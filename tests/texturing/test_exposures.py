@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.texturing.exposures import Probes, contradicting_frames, gains_of_frames
+from usdbrdf.texturing.exposures import Probes, gains_of_frames
+from usdbrdf.texturing.exposures import contradicting_frames as contradicting_frames_of
 
 FRAMES, TEXELS = 40, 600
 
@@ -29,6 +30,13 @@ def _logarithm(
     for frame, factor in (factors or {}).items():
         found[:, frame] += np.log(factor)
     return found.astype(np.float32)
+
+
+def contradicting_frames(frames, logarithm, owner=None):
+    """Of one surface, if nothing else is said."""
+    return contradicting_frames_of(
+        frames, logarithm, np.zeros(len(logarithm), int) if owner is None else owner
+    )
 
 
 def _frames(*, radiometric: bool = True) -> SimpleNamespace:
@@ -81,6 +89,17 @@ def test_two_camps_are_refused_unless_they_are_photographs(wrong):
     with pytest.raises(InputRefused, match=r"of 40 frames .*0\d+\.exr \(.*not linear.*exposure\]$"):
         contradicting_frames(_frames(), logarithm)
     assert contradicting_frames(_frames(radiometric=False), logarithm)
+
+
+def test_gloss_of_one_surface_is_no_wrong_exposure():
+    """Nearly all that one frame shows is a floor, which mirrors a window to all others."""
+    owner = (np.arange(TEXELS) % 10 == 0).astype(int)
+    logarithm = _logarithm()
+    logarithm[owner == 0, 5] += np.log(0.7)
+    assert contradicting_frames(_frames(), logarithm, owner) == {}
+    assert contradicting_frames(_frames(), logarithm).keys() == {"0005.exr"}
+    logarithm[owner == 1, 5] += np.log(0.7)
+    assert contradicting_frames(_frames(), logarithm, owner).keys() == {"0005.exr"}
 
 
 def test_frames_that_share_nothing_are_not_judged():

@@ -51,9 +51,20 @@ def test_a_lens_without_falloff_is_left_alone():
 def test_a_balance_that_drifts_is_found_in_its_frame():
     balance = np.ones((10, 3))
     balance[4] = (1.25, 1, 0.9)
-    drift = balance_drift(_samples(0, 0, balance=balance))
+    samples, owner = _samples(0, 0, balance=balance), np.arange(1500) % 3
+    drift = balance_drift(samples, owner)
     assert drift[4] == pytest.approx(np.log2(1.25), abs=0.03)
     assert np.delete(drift, 4).max() < 0.03
+
+
+def test_a_hue_that_one_surface_mirrors_is_no_drift():
+    samples, owner = _samples(0, 0), (np.arange(1500) % 4 == 0).astype(int)
+    samples.logarithm[owner == 0, 4, 2] += np.log(1.2)
+    assert balance_drift(samples, np.zeros(1500, int))[4] > 0.2
+    assert balance_drift(samples, owner).max() < 0.03
+    few = samples.logarithm.copy()
+    few[20:, 4] = np.nan
+    assert balance_drift(samples._replace(logarithm=few), np.zeros(1500, int))[4] == 0
 
 
 def test_what_was_darkened_comes_out_as_it_was(tmp_path, capsys):

@@ -8,6 +8,7 @@ full       I = diffuse + I_nd(phi, psi)     one specular bounce of the lit textu
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ _POINTS_AT_ONCE = 1 << 20
 _LAMP_MARGIN = 2
 # Pixels of all photographs together that the exposure is taken from, at most.
 _EXPOSURE_PIXELS = 1 << 24
+# Points of a photograph's own pixels across one of a reduced picture, at most: what bounds time.
+_POINTS_ACROSS = 2
 # Pixels of views that wait for FLIP together, at most: what bounds the memory.
 _WAITING_PIXELS = 1 << 23
 
@@ -192,11 +195,19 @@ def _batches(
     waiting: list[ScoredView] = []
     frames = views.frames
     for i in progress(range(len(frames)), total=len(frames), label="evaluate", unit="views"):
-        camera, photograph = frames.camera(i), read_frame(frames, i)
+        camera, photograph, asked = frames.camera(i), read_frame(frames, i), options
         if widths and widths[i] < camera.width:
+            # A pixel of a reduced photograph is the mean of many: one point of it would show
+            # patterns that the mean has lost, and the sharper model would look the worse.
+            points = min(math.ceil(camera.width / widths[i]), _POINTS_ACROSS) ** 2
+            asked = replace(
+                options,
+                samples_per_pixel=options.samples_per_pixel * points,
+                rays=options.rays * points,
+            )
             camera = camera.at_width(widths[i])
             photograph = photograph.at_size(camera.width, camera.height)
-        predicted = predict_view(seen, camera, options, options.seed + (i << 16))
+        predicted = predict_view(seen, camera, asked, options.seed + (i << 16))
         counted = photograph.valid & predicted.surface
         measured = photograph.radiance
         reference = to_display_srgb(np.nan_to_num(measured), exposure_scale=exposure)

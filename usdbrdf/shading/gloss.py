@@ -78,7 +78,8 @@ def _some_that_see(surface: TexturedScene, frames: Frames, index: Long, seed: in
     a texel gets depends on nothing but its number."""
     texels, count = surface.texels, len(index)
     position, normal = texels.position[index], texels.geometric_normal[index]
-    points = MeshPoints(position.astype(np.float64), normal.astype(np.float64))
+    owner = texels.object_index()[index]
+    points = MeshPoints(position.astype(np.float64), normal.astype(np.float64), owner)
     # The lowest numbers win; one that does not see the texel has none.
     best, frame = np.full((count, _VIEWS), np.inf), np.full((count, _VIEWS), -1, np.int32)
     for i in range(len(frames)):

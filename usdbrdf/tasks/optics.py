@@ -38,7 +38,7 @@ def asked_of_its_optics(
     columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in shown]
     logarithm, radius2 = (np.stack(each, axis=1) for each in zip(*columns, strict=True))
     samples = Samples(logarithm, radius2)
-    falloff, drift = falloff_of_frames(samples), balance_drift(samples)
+    falloff, drift = falloff_of_frames(samples), balance_drift(samples, surface.owner)
     told: dict[str, Any] = {"vignetting_stops": falloff and round(falloff.stops, 3)}
     told["white_balance_drift_stops"] = None if drift is None else round(float(drift.max()), 3)
     doubts = []

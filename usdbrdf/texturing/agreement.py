@@ -15,7 +15,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
-from usdbrdf.model.arrays import Bool, Double, Float, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
 from usdbrdf.transport.rays import RayScene
@@ -31,14 +31,16 @@ _SLACK = 5e-3
 
 
 class MeshPoints(NamedTuple):
-    """P points of a mesh, even by area: point, normal (P, 3) float64, in the capture's unit."""
+    """P points of a mesh: point, normal (P, 3) float64, in the capture's unit; owner (P,) int32,
+    the object that a point is of."""
 
     point: Double
     normal: Double
+    owner: Int
 
 
 def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> MeshPoints:
-    """``count`` points, the same for equal meshes."""
+    """``count`` points, even by area, the same for equal meshes."""
     rng = np.random.default_rng(_SEED)
     across = across_triangles(mesh.points, mesh.triangles)
     area = np.linalg.norm(across, axis=1)
@@ -46,7 +48,8 @@ def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> MeshPoints:
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     a, b, c = (mesh.points[mesh.triangles[face, k]].astype(np.float64) for k in range(3))
-    return MeshPoints(a + u * (b - a) + v * (c - a), across[face] / area[face, None])
+    point, normal = a + u * (b - a) + v * (c - a), across[face] / area[face, None]
+    return MeshPoints(point, normal, mesh.face_object[face])
 
 
 def surface_and_rays(mesh: ScanMesh) -> tuple[MeshPoints, RayScene]:

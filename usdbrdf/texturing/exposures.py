@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.job.progress import warn
-from usdbrdf.model.arrays import Bool, Double, Float, Int
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
@@ -30,6 +30,9 @@ _CONTRADICTING = calibration.number("exposures.contradicting") * math.log(2)
 _STANDING_OUT = calibration.number("exposures.standing_out")
 _MOST = calibration.number("exposures.most")
 _OUTLYING = calibration.number("exposures.outlying")
+# Of a surface that is asked about its frame, and of those that must agree.
+_OF_SURFACE = calibration.number("exposures.of_surface")
+_AGREEING = calibration.number("exposures.agreeing")
 # Samples of texels that other frames show too, without which a frame is not judged.
 _FEWEST = 24
 # Steps of the reweighting.
@@ -67,6 +70,11 @@ class Probes(NamedTuple):
         own = self.logarithm[first - self.first : end - self.first]
         return Probes(self.every, first, own)
 
+    @property
+    def texels(self) -> Long:
+        """(P,) their numbers."""
+        return np.arange(self.first, self.first + len(self.logarithm)) * self.every
+
     def add(self, frame: int, texel: Int, radiance: Float) -> None:
         """Keep what is needed of one frame's samples: texel (M,), radiance (M, 3)."""
         own = np.flatnonzero(texel % self.every == 0)
@@ -77,11 +85,13 @@ class Probes(NamedTuple):
 
 class Gains(NamedTuple):
     """Of N frames: logarithm of the gain, scatter (as a standard deviation) of the frame's samples
-    around it, and number of its samples that other frames can be held against, each (N,)."""
+    around it, and number of its samples that other frames can be held against, each (N,); and by
+    what each sample is brighter than its texel, (P, N), NaN where there is nothing to compare."""
 
     logarithm: Double
     scatter: Double
     samples: Double
+    brighter: Double
 
 
 def gains_of_frames(logarithm: Float) -> Gains:
@@ -104,9 +114,9 @@ def gains_of_frames(logarithm: Float) -> Gains:
         np.median(np.abs(o[k])) if k.any() else 0 for o, k in zip(off.T, known.T, strict=True)
     ]
     enough = count >= _FEWEST
-    if enough.any():
-        gain -= np.median(gain[enough])
-    return Gains(gain, 1.4826 * np.array(spreads, np.float64), count)
+    usual = np.median(gain[enough]) if enough.any() else 0.0
+    brighter = np.where(known, off + gain - usual, np.nan)
+    return Gains(gain - usual, 1.4826 * np.array(spreads, np.float64), count, brighter)
 
 
 def _least_squares(value: Double, weight: Double, start: Double) -> Double:
@@ -127,16 +137,38 @@ def _mean(value: Double, weight: Double) -> Double:
     return np.asarray((weight * value).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12))
 
 
-def with_estimated_exposures(frames: Frames, logarithm: Float) -> tuple[Frames, dict[str, float]]:
+def surfaces_agree(brighter: Double, gain: Double, owner: Int) -> Bool:
+    """(N,) frames whose surfaces agree on their gain: most of those with enough samples are off by
+    half of it at least. What one surface alone is off by is its gloss, or a wrong shape. A frame
+    that shows too little does not.
+
+    brighter  (P, N) by what samples are brighter than their points, NaN where unknown
+    gain      (N,) what a frame is off by
+    owner     (P,) the surface that a point is of
+    """
+    agreeing, asked = np.zeros((2, len(gain)))
+    for surface in np.unique(owner):
+        own = brighter[owner == surface]
+        for i in np.flatnonzero(np.isfinite(own).sum(axis=0) >= _OF_SURFACE):
+            asked[i] += 1
+            agreeing[i] += np.nanmedian(own[:, i]) * np.sign(gain[i]) >= abs(gain[i]) / 2
+    enough = np.isfinite(brighter).sum(axis=0) >= _FEWEST
+    return np.asarray(enough & (agreeing >= _AGREEING * asked), np.bool_)
+
+
+def with_estimated_exposures(
+    frames: Frames, logarithm: Float, owner: Int
+) -> tuple[Frames, dict[str, float]]:
     """The frames as if each had been exposed as its pixels say, and image and gain of those that
     contradicted the others. Frames that share too little with others stay as they are.
 
     logarithm  (P, N) as in ``Probes``
+    owner      (P,) the surface that a point is of
     """
     found = gains_of_frames(logarithm)
     known = found.samples >= _FEWEST
     gain = np.where(known, np.exp(found.logarithm), 1.0)
-    off = np.flatnonzero(known & _contradict(found))
+    off = np.flatnonzero(known & _contradict(found, owner))
     changed = replace(
         frames,
         exposure_time=frames.exposure_time * gain,
@@ -158,20 +190,26 @@ def doubts_about_exposures(off: Mapping[str, float], count: int, source: Path) -
         )
 
 
-def _contradict(gains: Gains) -> Bool:
+def _contradict(gains: Gains, owner: Int) -> Bool:
     size = np.abs(gains.logarithm)
-    return np.asarray((size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter), np.bool_)
+    off = (size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter)
+    if off.any():
+        off &= surfaces_agree(gains.brighter, gains.logarithm, owner)
+    return np.asarray(off, np.bool_)
 
 
-def contradicting_frames(frames: Frames, logarithm: Float) -> dict[str, float]:
+def contradicting_frames(frames: Frames, logarithm: Float, owner: Int) -> dict[str, float]:
     """Image and gain of the frames that show the same texels brighter or darker than the others do,
     by a quarter of a stop or more; the user is told.
+
+    logarithm  (P, N) as in ``Probes``
+    owner      (P,) the surface that a texel is of
 
     Raises InputRefused where more than a fifth do and the images are said to be radiance.
     """
     gains = gains_of_frames(logarithm)
     compared = gains.samples >= _FEWEST
-    off = np.flatnonzero(compared & _contradict(gains))
+    off = np.flatnonzero(compared & _contradict(gains, owner))
     factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
     if not factor:
         return {}

@@ -114,7 +114,8 @@ def lit_texture_from_frames(
 
     groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
-    return _filled_in(texels, found, contradicting_frames(frames, found.probes))
+    owner = texels.object_index()[Probes.empty(len(texels), len(frames)).texels]
+    return _filled_in(texels, found, contradicting_frames(frames, found.probes, owner))
 
 
 class _Shown(NamedTuple):

@@ -16,9 +16,10 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
-from usdbrdf.model.arrays import Bool, Double, Float, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.agreement import MeshPoints, seen_points
+from usdbrdf.texturing.exposures import surfaces_agree
 from usdbrdf.transport.rays import RayScene
 
 _OUTLYING = calibration.number("optics.outlying")
@@ -122,25 +123,30 @@ def _without_means(value: Double, weight: Double) -> Double:
     return left
 
 
-def balance_drift(samples: Samples) -> Double | None:
-    """(N,) how far each frame's red or blue is off the others' beside its green, in stops; None
-    where they share too few points."""
+def balance_drift(samples: Samples, owner: Int) -> Double | None:
+    """(N,) how far each frame's red or blue is off the others' beside its green, in stops; 0 where
+    a frame shows too little, or its surfaces do not agree; None where all share too few points.
+
+    owner  (P,) the surface that a point is of
+    """
     logarithm = samples.logarithm.astype(np.float64)
     known = np.isfinite(logarithm).all(axis=2)
     known &= (known.sum(axis=1) > 1)[:, None]
     if int(known.sum()) < _FEWEST:
         return None
     worst = np.zeros(logarithm.shape[1])
+    shared = known.any(axis=1)
     for channel in (0, 2):
         beside_green = logarithm[..., channel] - logarithm[..., 1]
-        hue = np.where(known, beside_green, np.nan)[known.any(axis=1)]
+        hue = np.where(known, beside_green, np.nan)[shared]
         gain = np.zeros(hue.shape[1])
         seen = np.isfinite(hue).any(axis=0)
         for _ in range(_STEPS):
             usual = np.nanmedian(hue - gain, axis=1, keepdims=True)
             gain[seen] = np.nanmedian((hue - usual)[:, seen], axis=0)
-        gain -= np.median(gain)
-        worst = np.maximum(worst, np.abs(gain))
+        middle = np.median(gain)
+        told = surfaces_agree(hue - usual - middle, gain - middle, owner[shared])
+        worst = np.maximum(worst, np.where(told, np.abs(gain - middle), 0))
     return worst / math.log(2)
 
 

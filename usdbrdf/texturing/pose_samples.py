@@ -74,8 +74,9 @@ def look_up(
     _smooth(len(picture), picture, smooth)
     place = np.zeros(len(value), np.int32)
     _look_up(
-        len(value), *surface, Projection.of(camera), face, seen, smooth, patch, value, slope, place
-    )
+        len(value), surface.point, surface.normal, Projection.of(camera), face, seen, smooth, patch,
+        value, slope, place,
+    )  # fmt: skip
     shown = np.flatnonzero(np.isfinite(value)).astype(np.int32)
     return LookedUp(shown, value[shown], slope[shown], place[shown])
 

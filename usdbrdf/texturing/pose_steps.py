@@ -88,20 +88,19 @@ def _points_of_frames(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera])
     rng = np.random.default_rng(_SEED)
     count = -(-min(_POINTS, _MOST_SAMPLES // len(cameras)) // len(cameras))
     across = across_triangles(mesh.points, mesh.triangles)
-    points, normals = [], []
+    points, normals, owners = [], [], []
     for camera in cameras:
         face, point = visible_faces(rays, camera.at_width(min(camera.width, 8 * _COARSEST)))
         chosen = rng.choice(face.size, min(count, face.size), replace=False)
         chosen = chosen[face.ravel()[chosen] >= 0]
-        point, normal = (
-            point.reshape(-1, 3)[chosen].astype(np.float64),
-            across[face.ravel()[chosen]],
-        )
+        point, face = point.reshape(-1, 3)[chosen].astype(np.float64), face.ravel()[chosen]
+        normal = across[face]
         behind = (normal * (camera.eye - point)).sum(axis=1) < 0
         normal = np.where(behind[:, None], -normal, normal)
         points.append(point)
         normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    return MeshPoints(np.concatenate(points), np.concatenate(normals))
+        owners.append(mesh.face_object[face])
+    return MeshPoints(np.concatenate(points), np.concatenate(normals), np.concatenate(owners))
 
 
 def _usual_distance(surface: MeshPoints, cameras: Sequence[Camera]) -> float:
