@@ -45,10 +45,15 @@ export async function start(canvas, room, colours, pick) {
   const camera = new PerspectiveCamera(60, 1, reach / 1000, reach * 10);
   const controls = new OrbitControls(camera, canvas);
   const home = () => {
-    const centre = box.getCenter(new Vector3());
-    controls.target.copy(centre);
-    // From a corner inside of a room; the faces of rooms are seen from within.
-    camera.position.copy(centre).add(new Vector3(0.36 * size.x, 0.12 * size.y, 0.36 * size.z));
+    if (room.first) {
+      camera.position.set(...room.first.eye);
+      controls.target.set(...room.first.target);
+    } else {
+      const centre = box.getCenter(new Vector3());
+      controls.target.copy(centre);
+      // From a corner inside of a room; the faces of rooms are seen from within.
+      camera.position.copy(centre).add(new Vector3(0.36 * size.x, 0.12 * size.y, 0.36 * size.z));
+    }
     controls.update();
   };
   home();

@@ -14,13 +14,15 @@ from pxr import Usd
 
 import usdbrdf
 from tests.page.conftest import data_of
+from usdbrdf.asset.maps import camera_hits
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
+from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
+from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
 from usdbrdf.page.capture import findings
 from usdbrdf.page.pictures import _BACKGROUND, Seen, SurfaceMap, part_around, pictures_of_map
 from usdbrdf.page.report import page, report
-from usdbrdf.page.room import with_the_weakest_as_one
+from usdbrdf.page.room import lamps, with_the_weakest_as_one
 
 
 def pictures(text):
@@ -56,6 +58,38 @@ def test_frames_views_and_maps_are_there(room, page_file):
         *("lit", "coverage", "samples", "spread", "stderr", "irradiance", "albedo", "phi", "psi")
     }
     assert all(len(shown["pictures"]) == len(data["views"]) for shown in data["maps"])
+
+
+def test_the_room_opens_as_the_frame_looks_that_shows_most_objects(room, page_file):
+    first = data_of(page_file.read_text("utf-8"))["room"]["first"]
+    asset, atlas = measured_atlas(room.asset)
+    frames, lit = atlas.frames, viewed_asset(asset, atlas, None).lit
+    owner = atlas.scene.face_object
+    hits = [camera_hits(lit.rays, frames, i, 64, 48) for i in range(len(frames))]
+    count = [len(np.unique(owner[h.face[h.face >= 0]])) for h in hits]
+    turn = turned_up("Z", "Y")[:3, :3]
+    places = [turn @ frames.camera(i).eye for i in range(len(frames))]
+    chosen = int(np.linalg.norm(places - np.array(first["eye"]), axis=1).argmin())
+    np.testing.assert_allclose(first["eye"], places[chosen], atol=1e-3)
+    assert count[chosen] >= max(count) - 1
+    forward = turn @ -frames.camera(chosen).world_from_camera[:3, 2]
+    along = np.array(first["target"]) - first["eye"]
+    distance = np.median(hits[chosen].distance[hits[chosen].face >= 0])
+    np.testing.assert_allclose(along, distance * forward, rtol=0.05, atol=0.05)
+
+
+def test_a_few_texels_that_mirror_a_lamp_are_no_lamp(room):
+    _, atlas = measured_atlas(room.asset)
+    found = lamps(atlas, "Z")
+    assert found
+    own = atlas.texels.of_object(0)
+    assert not atlas.emission[own].any()
+    emission = atlas.emission.copy()
+    some = SimpleNamespace(texels=atlas.texels, emission=emission, scene=atlas.scene)
+    emission[own] = 1e-6 * emission.max()
+    assert len(lamps(some, "Z")) == len(found)
+    emission[own] = emission.max()
+    assert len(lamps(some, "Z")) == len(found) + 1
 
 
 def test_pictures_have_no_metadata_and_nothing_names_this_machine(room, page_file):

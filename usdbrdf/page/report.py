@@ -48,8 +48,9 @@ from usdbrdf.page.views import (
     unnamed,
 )
 
-# Frames in which objects are looked for.
-_SEARCHED = 64
+# Frames in which objects are looked for; and of a frame's pixels what makes an object plain in it:
+# the room in 3D opens as the frame looks in which most are.
+_SEARCHED, _PLAIN = 64, 0.002
 
 
 def report(
@@ -115,6 +116,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
+    widest = chosen[int((where.share >= _PLAIN).sum(axis=1).argmax())]
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
     with scratch_folder() as folder:
@@ -158,7 +160,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
         "views": [view.told(pictures) for view in shown],
         "plot": models_only(rows),
         "maps": _maps(atlas, seen, known, _overviews(views.frames)),
-        "room": room_model(place, atlas, up_axis),
+        "room": room_model(place, atlas, seen.lit.rays, frames.camera(widest), up_axis),
         "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
         **reviewed(place),
     }

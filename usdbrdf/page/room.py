@@ -17,20 +17,27 @@ from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import resized
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions
 from usdbrdf.page.pictures import data_uri
+from usdbrdf.transport.rays import RayScene
 
 # Pixels of a texture's longer side.
 _TEXTURE = 384
 # Lamps with a light and a switch of their own: graphics cards compile shaders for so many.
 _MOST_LAMPS = 24
+# And what sends out a smaller share of all light has none.
+_FAINT = 1e-3
 
 
-def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] | None:
+def room_model(
+    asset: Asset, atlas: AssetMaps, rays: RayScene, camera: Camera, up_axis: str
+) -> dict[str, Any] | None:
     """What the page needs for its view in 3D; None, and a line that says why, where there is none.
 
     glb    gzip, base64: y up, metres; nodes name their prims
+    first  where the view opens, see ``first_look``: as ``camera`` looked
     lit    by prim, the lit texture as a picture
     lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
            radiance times m^2; the weakest of many are one
@@ -48,11 +55,25 @@ def room_model(asset: Asset, atlas: AssetMaps, up_axis: str) -> dict[str, Any] |
     packed = gzip.compress(content, compresslevel=6, mtime=0)
     return {
         "glb": base64.b64encode(packed).decode("ascii"),
+        "first": first_look(rays, camera, up_axis),
         "lit": lit_pictures(atlas, exposure),
         "exposure": exposure,
         "irradiance": _typical_irradiance(atlas),
         "lamps": with_the_weakest_as_one(lamps(atlas, up_axis)),
     }
+
+
+def first_look(rays: RayScene, camera: Camera, up_axis: str) -> dict[str, list[float]] | None:
+    """``eye`` and ``target``, which is as far as what the camera sees, y up; None where it sees
+    nothing."""
+    hits = rays.closest(*camera.rays(camera.pixels()))
+    seen = hits.face >= 0
+    if not seen.any():
+        return None
+    turn, forward = turned_up(up_axis, "Y")[:3, :3], -camera.world_from_camera[:3, 2]
+    target = camera.eye + float(np.median(hits.distance[seen])) * forward
+    places = {"eye": turn @ camera.eye, "target": turn @ target}
+    return {name: [round(float(value), 4) for value in place] for name, place in places.items()}
 
 
 def lit_pictures(atlas: AssetMaps, exposure: float) -> dict[str, str]:
@@ -70,8 +91,10 @@ def lit_pictures(atlas: AssetMaps, exposure: float) -> dict[str, str]:
 
 def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
     """Lamps as points that send out as much light, alike in all directions: of an area A that
-    shines with radiance L all around itself or to one side, the mean intensity is A L / 4."""
-    turn, texels, found = turned_up(up_axis, "Y")[:3, :3], atlas.texels, []
+    shines with radiance L all around itself or to one side, the mean intensity is A L / 4. A few
+    texels of a thing that mirrors a lamp are none."""
+    turn, texels = turned_up(up_axis, "Y")[:3, :3], atlas.texels
+    found: list[dict[str, Any]] = []
     for i, obj in enumerate(atlas.scene.objects):
         own = texels.of_object(i)
         power = texels.area[own, None] * atlas.emission[own]
@@ -90,7 +113,9 @@ def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
                 "intensity": [float(value) for value in power.sum(axis=0) / 4],
             }
         )
-    return found
+    strength = [sum(lamp["intensity"]) for lamp in found]
+    least = _FAINT * sum(strength)
+    return [lamp for lamp, own in zip(found, strength, strict=True) if own >= least]
 
 
 def with_the_weakest_as_one(
