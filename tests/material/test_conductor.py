@@ -214,3 +214,23 @@ def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.Monkey
     sampled = SampledObject([], None, (), [], None)  # type: ignore[arg-type]
     assert list(fit_views.fit_kinds(sampled, [PAPER, DIELECTRIC], 0)) == [PAPER]
     assert tried == [None]
+
+
+@pytest.mark.parametrize("lobe", [PAPER, DIELECTRIC, BECKMANN])
+def test_a_metal_competes_with_the_dielectric_of_the_fit(lobe: int, monkeypatch):
+    """Whose diffuse light does not come through at grazing angles: without that every dark thing
+    seen so would be a metal."""
+    asked = {}
+
+    def basis(kind: int, phis: Any) -> int:
+        return kind
+
+    def of_all(*_: Any, of_dielectric: Any = None, **__: Any) -> None:
+        asked["kinds"] = None if of_dielectric is None else [b([0.1]) for b in of_dielectric]
+
+    monkeypatch.setattr(fit_views, "conductor_of", of_all)
+    samples = SimpleNamespace(radiance=None, texel=None)
+    sampled = SimpleNamespace(irradiance=1, samples=samples, basis=lambda width, seed: basis)
+    first = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+    fit_views.fit_views(lobe, lambda: sampled, 0, first)  # type: ignore[arg-type]
+    assert asked["kinds"] == (None if lobe == PAPER else [lobe, lobe])

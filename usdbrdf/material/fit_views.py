@@ -29,7 +29,7 @@ from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, PAPER, is_dielectric
+from usdbrdf.transport.brdf import CONDUCTOR, PAPER, is_dielectric
 from usdbrdf.transport.let_through import kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
@@ -276,7 +276,7 @@ def fit_views(
     conductor = conductor_of(
         samples.radiance, samples.texel, irradiance, (partial(one, kind), partial(other, kind)),
         found, certain=metal,
-        of_dielectric=(partial(one, lobe), partial(other, lobe)) if lobe == BECKMANN else None,
+        of_dielectric=None if kind == lobe else (partial(one, lobe), partial(other, lobe)),
     )  # fmt: skip
     return found, conductor
 
