@@ -21,7 +21,7 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
 from usdbrdf.page.capture import findings
 from usdbrdf.page.pictures import _BACKGROUND, Seen, SurfaceMap, part_around, pictures_of_map
-from usdbrdf.page.report import page, report
+from usdbrdf.page.report import page, report, shows_most
 from usdbrdf.page.room import lamps, with_the_weakest_as_one
 
 
@@ -60,22 +60,26 @@ def test_frames_views_and_maps_are_there(room, page_file):
     assert all(len(shown["pictures"]) == len(data["views"]) for shown in data["maps"])
 
 
-def test_the_room_opens_as_the_frame_looks_that_shows_most_objects(room, page_file):
+def test_the_room_opens_as_one_of_the_frames_looks(room, page_file):
     first = data_of(page_file.read_text("utf-8"))["room"]["first"]
     asset, atlas = measured_atlas(room.asset)
     frames, lit = atlas.frames, viewed_asset(asset, atlas, None).lit
-    owner = atlas.scene.face_object
-    hits = [camera_hits(lit.rays, frames, i, 64, 48) for i in range(len(frames))]
-    count = [len(np.unique(owner[h.face[h.face >= 0]])) for h in hits]
     turn = turned_up("Z", "Y")[:3, :3]
     places = [turn @ frames.camera(i).eye for i in range(len(frames))]
     chosen = int(np.linalg.norm(places - np.array(first["eye"]), axis=1).argmin())
     np.testing.assert_allclose(first["eye"], places[chosen], atol=1e-3)
-    assert count[chosen] >= max(count) - 1
+    hits = camera_hits(lit.rays, frames, chosen, 64, 48)
     forward = turn @ -frames.camera(chosen).world_from_camera[:3, 2]
     along = np.array(first["target"]) - first["eye"]
-    distance = np.median(hits[chosen].distance[hits[chosen].face >= 0])
+    distance = np.median(hits.distance[hits.face >= 0])
     np.testing.assert_allclose(along, distance * forward, rtol=0.05, atol=0.05)
+
+
+def test_it_is_the_frame_that_shows_most_objects_plainly():
+    share = np.array([[0.9, 0.001, 0.001], [0.3, 0.003, 0], [0.4, 0.01, 0.001], [0.2, 0, 0.3]])
+    assert shows_most(share) == 3
+    assert shows_most(share[:3]) == 2
+    assert shows_most(share[:1]) == 0
 
 
 def test_a_few_texels_that_mirror_a_lamp_are_no_lamp(room):

@@ -102,6 +102,41 @@ def test_gloss_of_one_surface_is_no_wrong_exposure():
     assert contradicting_frames(_frames(), logarithm, owner).keys() == {"0005.exr"}
 
 
+def test_many_small_things_are_asked_together():
+    """Of the floor's neighbours none has enough samples of its own in a frame."""
+    floor = np.arange(TEXELS) % 5 < 3
+    owner = np.where(floor, 0, 1 + np.arange(TEXELS) % 60)
+    logarithm = _logarithm()
+    for frame in range(5, 35, 10):
+        logarithm[floor, frame] += np.log(0.6)
+    assert contradicting_frames(_frames(), logarithm, owner) == {}
+    for frame in range(5, 35, 10):
+        logarithm[~floor, frame] += np.log(0.6)
+    assert len(contradicting_frames(_frames(), logarithm, owner)) == 3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_two_frames_show_takes_no_share_of_another_surfaces_gloss(seed):
+    """Beside the floor, texels that one other frame shows, which are as bright in both."""
+    rng = np.random.default_rng(seed)
+    owner = np.arange(TEXELS) % 5
+    logarithm = _logarithm(seed=seed)
+    logarithm[owner == 0, 5] += np.log(0.6)
+    for texel in np.flatnonzero(owner):
+        level = np.nanmedian(logarithm[texel])
+        logarithm[texel] = np.nan
+        pair = [5 if texel % 3 == 0 else rng.integers(0, 20), rng.integers(20, FRAMES)]
+        logarithm[texel, pair] = level + 0.03 * rng.standard_normal(2)
+    assert contradicting_frames(_frames(), logarithm, owner) == {}
+
+
+def test_a_screen_that_shows_something_else_hides_no_wrong_exposure():
+    owner = (np.arange(TEXELS) % 8 == 0).astype(int)
+    logarithm = _logarithm({5: 1.6})
+    logarithm[owner == 1, 5] -= 2
+    assert contradicting_frames(_frames(), logarithm, owner).keys() == {"0005.exr"}
+
+
 def test_frames_that_share_nothing_are_not_judged():
     logarithm = _logarithm()
     logarithm[:, 7] = np.nan

@@ -64,7 +64,7 @@ def test_a_hue_that_one_surface_mirrors_is_no_drift():
     assert balance_drift(samples, owner).max() < 0.03
     few = samples.logarithm.copy()
     few[20:, 4] = np.nan
-    assert balance_drift(samples._replace(logarithm=few), np.zeros(1500, int))[4] == 0
+    assert balance_drift(samples._replace(logarithm=few), np.zeros(1500, int))[4] < 0.05
 
 
 def test_what_was_darkened_comes_out_as_it_was(tmp_path, capsys):

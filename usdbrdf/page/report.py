@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
@@ -26,6 +28,7 @@ from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reading
 from usdbrdf.job.stamp import code_version
+from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
@@ -116,7 +119,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
-    widest = chosen[int((where.share >= _PLAIN).sum(axis=1).argmax())]
+    widest = chosen[shows_most(where.share)]
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
     with scratch_folder() as folder:
@@ -184,6 +187,13 @@ def _in_own_frames(atlas: AssetMaps, prim_path: str) -> FittedObject | None:
         return None
     inside = fit.target_frame in own
     return replace(fit, target_frame=fit.target_frame - own.start if inside else -1)
+
+
+def shows_most(share: Float) -> int:
+    """Which of N frames shows most objects plainly, and of these most of their surface: share (N,
+    num_objects) of the frame's pixels."""
+    plain = (share >= _PLAIN).sum(axis=1)
+    return int(np.lexsort((share.sum(axis=1), plain))[-1])
 
 
 def _frames_to_search(count: int, fits: Sequence[FittedObject]) -> list[int]:

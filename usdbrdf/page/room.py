@@ -27,8 +27,10 @@ from usdbrdf.transport.rays import RayScene
 _TEXTURE = 384
 # Lamps with a light and a switch of their own: graphics cards compile shaders for so many.
 _MOST_LAMPS = 24
-# And what sends out a smaller share of all light has none.
+# And what sends out a smaller share of the strongest one's light has none.
 _FAINT = 1e-3
+# Pixels across in which it is looked how far what a camera sees is.
+_LOOKED_AT = 96
 
 
 def room_model(
@@ -66,7 +68,8 @@ def room_model(
 def first_look(rays: RayScene, camera: Camera, up_axis: str) -> dict[str, list[float]] | None:
     """``eye`` and ``target``, which is as far as what the camera sees, y up; None where it sees
     nothing."""
-    hits = rays.closest(*camera.rays(camera.pixels()))
+    small = camera.at_width(min(_LOOKED_AT, camera.width))
+    hits = rays.closest(*small.rays(small.pixels()))
     seen = hits.face >= 0
     if not seen.any():
         return None
@@ -114,7 +117,7 @@ def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
             }
         )
     strength = [sum(lamp["intensity"]) for lamp in found]
-    least = _FAINT * sum(strength)
+    least = _FAINT * max(strength, default=0)
     return [lamp for lamp, own in zip(found, strength, strict=True) if own >= least]
 
 

@@ -116,5 +116,5 @@ def estimated_exposures(
     images = read_frames(read, range(len(frames)))
     seen = progress(images, total=len(frames), label="exposures", unit="frames")
     columns = [logarithms_in_frame(surface, rays, frames.camera(i), p) for i, p in seen]
-    frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1), surface.owner)
+    frames, off = with_estimated_exposures(frames, np.stack(columns, axis=1))
     return replace(scan, frames=frames), off

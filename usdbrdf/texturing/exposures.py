@@ -86,7 +86,7 @@ class Probes(NamedTuple):
 class Gains(NamedTuple):
     """Of N frames: logarithm of the gain, scatter (as a standard deviation) of the frame's samples
     around it, and number of its samples that other frames can be held against, each (N,); and by
-    what each sample is brighter than its texel, (P, N), NaN where there is nothing to compare."""
+    what each sample is brighter than the others of its texel, (P, N), NaN where none compare."""
 
     logarithm: Double
     scatter: Double
@@ -115,7 +115,10 @@ def gains_of_frames(logarithm: Float) -> Gains:
     ]
     enough = count >= _FEWEST
     usual = np.median(gain[enough]) if enough.any() else 0.0
-    brighter = np.where(known, off + gain - usual, np.nan)
+    # Beside what the others show: a sample's own share in its texel's mean would hide half of it.
+    others = weight.sum(axis=1)[:, None] - weight
+    alone = (value - gain - _mean(value - gain, weight)[:, None]) * (1 + weight / others.clip(1e-9))
+    brighter = np.where(known & (others > 1e-3), alone + gain - usual, np.nan)
     return Gains(gain - usual, 1.4826 * np.array(spreads, np.float64), count, brighter)
 
 
@@ -138,37 +141,40 @@ def _mean(value: Double, weight: Double) -> Double:
 
 
 def surfaces_agree(brighter: Double, gain: Double, owner: Int) -> Bool:
-    """(N,) frames whose surfaces agree on their gain: most of those with enough samples are off by
-    half of it at least. What one surface alone is off by is its gloss, or a wrong shape. A frame
-    that shows too little does not.
+    """(N,) frames whose surfaces agree on their gain: of those with enough samples, the others
+    being taken as one, most are off by half of it at least. What one surface alone is off by is its
+    gloss, or a wrong shape; one that is off the other way says nothing. A frame that shows too
+    little does not agree.
 
-    brighter  (P, N) by what samples are brighter than their points, NaN where unknown
+    brighter  (P, N) by what samples are brighter than others of their points, NaN where unknown
     gain      (N,) what a frame is off by
     owner     (P,) the surface that a point is of
     """
-    agreeing, asked = np.zeros((2, len(gain)))
-    for surface in np.unique(owner):
-        own = brighter[owner == surface]
-        for i in np.flatnonzero(np.isfinite(own).sum(axis=0) >= _OF_SURFACE):
-            asked[i] += 1
-            agreeing[i] += np.nanmedian(own[:, i]) * np.sign(gain[i]) >= abs(gain[i]) / 2
-    enough = np.isfinite(brighter).sum(axis=0) >= _FEWEST
-    return np.asarray(enough & (agreeing >= _AGREEING * asked), np.bool_)
+    surface = np.unique(owner, return_inverse=True)[1]
+    agree = np.zeros(len(gain), np.bool_)
+    for i in range(len(gain)):
+        shown = np.flatnonzero(np.isfinite(brighter[:, i]))
+        if len(shown) < _FEWEST or gain[i] == 0:
+            continue
+        own, off = surface[shown], brighter[shown, i] / gain[i]
+        own = np.where(np.bincount(own)[own] >= _OF_SURFACE, own, -1)
+        parts = [off[own == k] for k in np.unique(own)]
+        told = np.array([np.median(part) for part in parts if len(part) >= _OF_SURFACE])
+        told = told[told > -0.5]
+        agree[i] = len(told) > 0 and (told >= 0.5).mean() >= _AGREEING
+    return agree
 
 
-def with_estimated_exposures(
-    frames: Frames, logarithm: Float, owner: Int
-) -> tuple[Frames, dict[str, float]]:
+def with_estimated_exposures(frames: Frames, logarithm: Float) -> tuple[Frames, dict[str, float]]:
     """The frames as if each had been exposed as its pixels say, and image and gain of those that
     contradicted the others. Frames that share too little with others stay as they are.
 
     logarithm  (P, N) as in ``Probes``
-    owner      (P,) the surface that a point is of
     """
     found = gains_of_frames(logarithm)
     known = found.samples >= _FEWEST
     gain = np.where(known, np.exp(found.logarithm), 1.0)
-    off = np.flatnonzero(known & _contradict(found, owner))
+    off = np.flatnonzero(known & _stands_out(found))
     changed = replace(
         frames,
         exposure_time=frames.exposure_time * gain,
@@ -190,17 +196,14 @@ def doubts_about_exposures(off: Mapping[str, float], count: int, source: Path) -
         )
 
 
-def _contradict(gains: Gains, owner: Int) -> Bool:
+def _stands_out(gains: Gains) -> Bool:
     size = np.abs(gains.logarithm)
-    off = (size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter)
-    if off.any():
-        off &= surfaces_agree(gains.brighter, gains.logarithm, owner)
-    return np.asarray(off, np.bool_)
+    return np.asarray((size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter), np.bool_)
 
 
 def contradicting_frames(frames: Frames, logarithm: Float, owner: Int) -> dict[str, float]:
     """Image and gain of the frames that show the same texels brighter or darker than the others do,
-    by a quarter of a stop or more; the user is told.
+    by a quarter of a stop or more, and most of their surfaces so; the user is told.
 
     logarithm  (P, N) as in ``Probes``
     owner      (P,) the surface that a texel is of
@@ -209,7 +212,8 @@ def contradicting_frames(frames: Frames, logarithm: Float, owner: Int) -> dict[s
     """
     gains = gains_of_frames(logarithm)
     compared = gains.samples >= _FEWEST
-    off = np.flatnonzero(compared & _contradict(gains, owner))
+    off = np.flatnonzero(compared & _stands_out(gains))
+    off = off[surfaces_agree(gains.brighter[:, off], gains.logarithm[off], owner)]
     factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
     if not factor:
         return {}

@@ -124,8 +124,9 @@ def _without_means(value: Double, weight: Double) -> Double:
 
 
 def balance_drift(samples: Samples, owner: Int) -> Double | None:
-    """(N,) how far each frame's red or blue is off the others' beside its green, in stops; 0 where
-    a frame shows too little, or its surfaces do not agree; None where all share too few points.
+    """(N,) how far each frame's red or blue is off the others' beside its green, in stops; 0
+    where that is much and a frame shows too little, or its surfaces do not agree; None where all
+    share too few points.
 
     owner  (P,) the surface that a point is of
     """
@@ -144,9 +145,13 @@ def balance_drift(samples: Samples, owner: Int) -> Double | None:
         for _ in range(_STEPS):
             usual = np.nanmedian(hue - gain, axis=1, keepdims=True)
             gain[seen] = np.nanmedian((hue - usual)[:, seen], axis=0)
-        middle = np.median(gain)
-        told = surfaces_agree(hue - usual - middle, gain - middle, owner[shared])
-        worst = np.maximum(worst, np.where(told, np.abs(gain - middle), 0))
+        gain -= np.median(gain)
+        size = np.abs(gain)
+        # Of two views the middle is half way between: neither tells which of them is off.
+        brighter = np.where(known[shared].sum(axis=1)[:, None] > 2, hue - usual, np.nan)
+        off = np.flatnonzero(size > _TOLD * math.log(2))
+        size[off] *= surfaces_agree(brighter[:, off], gain[off], owner[shared])
+        worst = np.maximum(worst, size)
     return worst / math.log(2)
 
 
