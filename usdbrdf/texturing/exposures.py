@@ -58,8 +58,7 @@ class Probes(NamedTuple):
     @classmethod
     def empty(cls, num_texels: int, num_frames: int, part: slice | None = None) -> Probes:
         """Of the texels of ``part`` (None: all) of so many, no sample."""
-        most = min(_MOST_TEXELS, max(1, _MOST_SAMPLES // num_frames))
-        every = -(-num_texels // most)
+        every = _every(num_texels, num_frames)
         start, stop = (part.start, part.stop) if part else (0, num_texels)
         first, end = -(-start // every), -(-stop // every)
         return cls(every, first, np.full((end - first, num_frames), np.nan, np.float32))
@@ -70,17 +69,21 @@ class Probes(NamedTuple):
         own = self.logarithm[first - self.first : end - self.first]
         return Probes(self.every, first, own)
 
-    @property
-    def texels(self) -> Long:
-        """(P,) their numbers."""
-        return np.arange(self.first, self.first + len(self.logarithm)) * self.every
-
     def add(self, frame: int, texel: Int, radiance: Float) -> None:
         """Keep what is needed of one frame's samples: texel (M,), radiance (M, 3)."""
         own = np.flatnonzero(texel % self.every == 0)
         level = radiance[own].mean(axis=1)
         own, level = own[level > 0], level[level > 0]
         self.logarithm[texel[own] // self.every - self.first, frame] = np.log(level)
+
+
+def probed_texels(num_texels: int, num_frames: int) -> Long:
+    """(P,) the numbers of the texels that the rows of all ``Probes`` are of."""
+    return np.arange(0, num_texels, _every(num_texels, num_frames))
+
+
+def _every(num_texels: int, num_frames: int) -> int:
+    return -(-num_texels // min(_MOST_TEXELS, max(1, _MOST_SAMPLES // num_frames)))
 
 
 class Gains(NamedTuple):

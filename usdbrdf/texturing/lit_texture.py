@@ -18,7 +18,7 @@ from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.texturing.earlier import GoingOn
-from usdbrdf.texturing.exposures import Probes, contradicting_frames
+from usdbrdf.texturing.exposures import Probes, contradicting_frames, probed_texels
 from usdbrdf.texturing.inpaint import inpaint_alike
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
 from usdbrdf.texturing.passes import among_workers, groups_of_texels, in_passes, shares_of
@@ -114,7 +114,7 @@ def lit_texture_from_frames(
 
     groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
-    owner = texels.object_index()[Probes.empty(len(texels), len(frames)).texels]
+    owner = texels.object_index()[probed_texels(len(texels), len(frames))]
     return _filled_in(texels, found, contradicting_frames(frames, found.probes, owner))
 
 
