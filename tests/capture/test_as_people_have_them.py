@@ -224,6 +224,29 @@ def test_a_mask_that_leaves_nothing_costs_its_frame(made):
     assert any("black everywhere. [capture.mask]" in sentence for sentence in scan.warnings)
 
 
+def _with_alpha(made: MadeCapture, i: int, opaque_rows: int) -> None:
+    colours = read_exr(made.image(i))
+    alpha = np.zeros((*colours.shape[:2], 1), np.float32)
+    alpha[:opaque_rows] = 1
+    _write_bytes(made.image(i), np.concatenate([colours * alpha, alpha], axis=2))
+
+
+def test_frames_cut_out_of_their_background_are_masked_by_their_alpha(made):
+    """As of an object on a turntable; alpha of 1 everywhere, as most pictures have it, is none."""
+    for i in range(12):
+        _with_alpha(made, i, opaque_rows=24)
+    assert not any("[capture.alpha]" in sentence for sentence in _read(made).warnings)
+    for i in range(11):
+        _with_alpha(made, i, opaque_rows=18)
+    _with_alpha(made, 11, opaque_rows=0)
+    scan = _read(made)
+    (told, lost) = (sentence for sentence in scan.warnings if "alpha" in sentence)
+    assert "25% of the pixels are transparent" in told
+    assert "its alpha says that nothing is there. [capture.alpha]" in lost
+    assert len(scan.frames) == 11
+    assert scan.counts["pixels_unknown"] == scan.counts["pixels_transparent"] == 11 * 6 * 32
+
+
 def test_a_mesh_in_millimetres_beside_poses_in_metres(made):
     write_ply(made.folder / "mesh.ply", 1000 * made.points, made.triangles, made.face_object)
     with pytest.raises(InputRefused, match=r"one unit\. \[capture\.parallax\]$"):

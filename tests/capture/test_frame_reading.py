@@ -22,7 +22,7 @@ from usdbrdf.model.capture import Frames
 
 
 def _write(path: Path, pixels: np.ndarray, kind: str) -> None:
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, kind)
+    spec = oiio.ImageSpec(*pixels.shape[1::-1], pixels.shape[2], kind)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec)
     assert output.write_image(np.ascontiguousarray(pixels))
@@ -90,6 +90,30 @@ def test_nan_infinity_and_negative_light_are_unknown_not_black(tmp_path):
     assert frame.num_clamped == 1
     assert not frame.clipped.any()
     assert frame.valid.sum() == 5
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png", ".tif"])
+def test_what_alpha_says_is_not_there_is_unknown(tmp_path, suffix):
+    """An object cut out of its background, as renderers and background removers write it."""
+    pixels = np.full((2, 4, 4), 1.0, np.float32)
+    pixels[0, 1, 3] = 0  # the colours that were there
+    pixels[0, 2] = 0
+    pixels[0, 3] = (0.5, 0.5, 0.5, 0.5)  # an edge
+    _write(tmp_path / f"a{suffix}", pixels, "float" if suffix == ".exr" else "uint8")
+    frame = read_frame(_frames(tmp_path / f"a{suffix}"), 0)
+    assert frame.unknown.tolist() == [[False, True, True, True], [False] * 4]
+    assert (frame.num_transparent, frame.num_clamped) == (3, 0)
+    assert np.isnan(frame.radiance[0, 1:]).all()
+    assert np.allclose(frame.radiance[1], 1)
+    assert not frame.dark.any()
+
+
+@pytest.mark.parametrize(("colour", "hidden"), [(1.0, 0), (0.0, 8)])
+def test_alpha_that_was_left_empty_says_nothing(tmp_path, colour, hidden):
+    pixels = np.full((2, 4, 4), colour, np.float32)
+    pixels[..., 3] = 0
+    _write(tmp_path / "a.exr", pixels, "float")
+    assert read_frame(_frames(tmp_path / "a.exr"), 0).num_transparent == hidden
 
 
 @pytest.mark.fault("I4")

@@ -18,8 +18,9 @@ from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.asset.readers.scene import capture_up_of_stage, frames_from_stage, scene_from_stage
 from usdbrdf.asset.readers.views import cameras_of_views
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.checks import FrameRecord, plainly_up
+from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.native import write_capture
+from usdbrdf.capture.up_axis import plainly_up
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.model.capture import Scan

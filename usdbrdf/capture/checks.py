@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.model.mesh import ScanGeometry
-from usdbrdf.options import CaptureOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,53 +80,6 @@ def frames_from_records(
     )
 
 
-# How many times as far as along another axis cameras must point up along y.
-_CLEARLY = 2.0
-# The cosine of the angle from an axis within which the mean of what cameras call up is that axis;
-# and what 3 n r^2 of the length r of the mean of n random directions exceeds once in a hundred.
-_NEARLY_UP, _BY_CHANCE = math.cos(math.radians(30)), 11.3
-
-
-def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
-    """The up axis where a format does not say: z, unless people held their cameras clearly upright
-    along y."""
-    up = np.nan_to_num(_ups(records).sum(axis=0))
-    middle, most = np.argsort(np.abs(up)).tolist()[1:]
-    clearly = most == 1 and up[1] > _CLEARLY * abs(up[middle])
-    return "Y" if clearly else "Z"
-
-
-def plainly_up(records: Sequence[FrameRecord]) -> str:
-    """The axis, as ``options.UpAxis``, that cameras in people's hands plainly call up: the mean of
-    their own is near it, and by no chance as long; "" where they do not."""
-    axes = _ups(records)
-    length = np.linalg.norm(axes, axis=1, keepdims=True)
-    axes = axes[np.isfinite(length[:, 0]) & (length[:, 0] > 0)]
-    mean = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).sum(axis=0) / max(len(axes), 1)
-    most, long = int(np.abs(mean).argmax()), float(np.linalg.norm(mean))
-    plain = 3 * len(axes) * long**2 > _BY_CHANCE and abs(mean[most]) > _NEARLY_UP * long
-    return f"{'-' if mean[most] < 0 else ''}{'XYZ'[most]}" if plain else ""
-
-
-def _ups(records: Sequence[FrameRecord]) -> Double:
-    return np.array([record.world_from_camera[:3, 1] for record in records]).reshape(-1, 3)
-
-
-def up_axis_assumed(
-    records: Sequence[FrameRecord], options: CaptureOptions, findings: Findings, name: str
-) -> Literal["Y", "Z"]:
-    """``up_axis_of`` a capture whose format does not say. Where the user does not either, and the
-    cameras plainly say another, the user is told which option to try."""
-    taken, plain = up_axis_of(records), plainly_up(records)
-    if options.up_axis is None and plain not in ("", taken):
-        findings.warn(
-            f"{name}: its cameras are upright along {plain}, not along {taken}, which is taken to "
-            "be up, so that sun and sky are looked for on the wrong side; try "
-            f"--up-axis {plain}. [capture.up-axis]"
-        )
-    return taken
-
-
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
@@ -137,6 +89,7 @@ _CURES = {
     "capture.file": "Copy the missing images, name their folder with --frames, or remove their "
     "entries.",
     "capture.image": "Export the images again as R, G, B float EXR.",
+    "capture.alpha": "Leave them out, or export them with what they show opaque.",
     "capture.mask": "Export a mask of the photograph's size for it, or remove its entry.",
     "capture.size": "Use the images that the intrinsics are for, or state the w and h of these.",
     "capture.nonfinite": "Export again, or accept masking with --max-nonfinite.",
@@ -205,6 +158,18 @@ class Findings:
             head = f"{source}: all {total} frames are saturated, there is no HDR headroom."
         first = f"{len(worst)} of them, first {worst[0].name!r}: {worst[0].reason}."
         raise InputRefused(f"{head} {first} {_CURES.get(rule, _CURE)} [{rule}]")
+
+    def warn_of_transparent(self, frames: Frames, usable: Sequence[int], source: Path) -> None:
+        """Say how much of the usable frames, of those that were looked at, their alpha hides."""
+        hidden = self.counts.get("pixels_transparent", 0)
+        if hidden:
+            seen = np.intersect1d(usable, self.looked_at)
+            pixels = frames.resolution[seen].prod(axis=1, dtype=np.int64).sum()
+            self.warn(
+                f"{source.name}: {hidden / pixels:.0%} of the pixels are transparent by their "
+                "alpha; what is there is not looked at. Export opaque images if it is part of the "
+                "scene. [capture.alpha]"
+            )
 
     def warn_of_dropped_frames(self, source: Path, total: int) -> None:
         """One sentence per rule."""
@@ -447,6 +412,7 @@ def _looked_through(
         findings.count("pixels_unknown", int(pixels.unknown.sum()))
         findings.count("pixels_negative_clamped", pixels.num_clamped)
         findings.count("pixels_clipped", int(pixels.clipped.sum()))
+        findings.count("pixels_transparent", pixels.num_transparent)
     return usable
 
 
@@ -468,10 +434,13 @@ def _why_useless(
     pixels: FramePixels, white: Bool | None, max_nonfinite: float
 ) -> tuple[str, str] | None:
     """Why a frame says nothing, and the rule; None if it does say something. What its mask hides
-    may be unknown."""
+    may be unknown, and what its alpha does."""
     if white is None or white.shape != pixels.unknown.shape:
         white = np.ones_like(pixels.unknown)
-    unknown = float((pixels.unknown & white).mean())
+    hidden = pixels.num_transparent / pixels.unknown.size
+    if hidden > 1 - _MIN_USEFUL_SHARE:
+        return "its alpha says that nothing is there", "capture.alpha"
+    unknown = float((pixels.unknown & white).mean()) - hidden
     if unknown > max_nonfinite:
         limit = f"(limit {max_nonfinite:.0%})"
         text = f"{unknown:.0%} of the pixels are NaN, infinite or negative {limit}"

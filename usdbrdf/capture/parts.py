@@ -381,6 +381,7 @@ def scan_from_parts(
         most=options.looked_at,
         masks=[r.mask_path for r in rigid] if any(r.mask_path for r in rigid) else (),
     )
+    findings.warn_of_transparent(photographs, usable, source)
     kept = np.flatnonzero(np.isin(photograph_of, usable)).tolist()
     findings.refuse_too_few_frames(source, total, views=len(kept))
     findings.count("rays_hit_percent", round(100 * hit_share))

@@ -23,6 +23,8 @@ CLIPPED_SHARE = 0.998
 _BYTES_OF_PIXEL = 16
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
+# Alpha of what is there, as renderers' filters leave it.
+_OPAQUE = 0.99
 # What a filter leaves of nothing.
 _ANY = 1e-4
 
@@ -44,6 +46,7 @@ class FramePixels:
     dark         (H, W) bool: some channel lies below the noise floor
     unknown      (H, W) bool: some channel is NaN, infinite or clearly negative
     num_clamped  pixels with a tiny negative channel, set to 0
+    num_transparent  pixels that are unknown because the image's alpha says that nothing is there
     """
 
     radiance: Float
@@ -52,6 +55,7 @@ class FramePixels:
     dark: Bool
     unknown: Bool
     num_clamped: int
+    num_transparent: int
 
     def window(self, left: int, top: int, right: int, bottom: int) -> FramePixels:
         """The pixels of a rectangle; right and bottom are the first beyond it."""
@@ -63,6 +67,7 @@ class FramePixels:
             dark=self.dark[part],
             unknown=self.unknown[part],
             num_clamped=self.num_clamped,
+            num_transparent=self.num_transparent,
         )
 
     def at_size(self, width: int, height: int) -> FramePixels:
@@ -82,6 +87,7 @@ class FramePixels:
             dark=some[..., 2],
             unknown=some[..., 3],
             num_clamped=self.num_clamped,
+            num_transparent=self.num_transparent,
         )
 
 
@@ -94,9 +100,7 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     saturation = float(frames.saturation_radiance[i])
     gain = 1.0 if frames.gain is None else float(frames.gain[i])
     encoding = frames.encoding_of(i)
-    recorded, unknown, num_clamped = read_recorded(
-        frames.image_paths[i], encoding, saturation, gain
-    )
+    recorded, unknown, *counts = read_recorded(frames.image_paths[i], encoding, saturation, gain)
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
@@ -110,7 +114,8 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         clipped=clipped,
         dark=dark,
         unknown=unknown,
-        num_clamped=num_clamped,
+        num_clamped=counts[0],
+        num_transparent=counts[1],
     )
 
 
@@ -126,15 +131,17 @@ def transmission(frames: Frames, i: int) -> Float:
 
 def read_recorded(
     path: Path, encoding: str, saturation: float, gain: float = 1.0
-) -> tuple[Float, Bool, int]:
+) -> tuple[Float, Bool, int, int]:
     """The radiance (H, W, 3) that an image records, NaN where it is unknown; where that is (H, W):
-    some channel is NaN, infinite or clearly negative; and how many pixels had a channel a little
-    below zero. Of a linear image in its own primaries, of others in those of Rec.709.
+    some channel is NaN, infinite or clearly negative, or its alpha says that nothing is there;
+    how many pixels had a channel a little below zero; and of how many alpha says that. Of a linear
+    image in its own primaries, of others in those of Rec.709.
 
     saturation, gain: of the frame, see ``Frames``. Channels down to -1e-3 of the frame's median are
     ringing and become 0.
     """
-    recorded = read_radiance(path)
+    stored = read_radiance(path, alpha=True)
+    recorded, transparent = np.ascontiguousarray(stored[..., :3]), _transparent(stored)
     kind = kind_of_encoding(encoding)
     if kind == "log":
         recorded = to_working_space(recorded, encoding)
@@ -145,7 +152,7 @@ def read_recorded(
         recorded = to_working_space(recorded, encoding) * scale
     elif gain != 1:
         recorded = recorded / np.float32(gain)
-    unknown = _in_any_channel(~np.isfinite(recorded))
+    unknown = _in_any_channel(~np.isfinite(recorded)) | transparent
     ringing = ~unknown & _in_any_channel(recorded < 0)
     if ringing.any():
         lowest = -_RINGING * max(float(np.median(recorded[~unknown])), 0.0)
@@ -153,7 +160,20 @@ def read_recorded(
         ringing, unknown = ringing & ~below, unknown | below
     recorded[ringing] = np.maximum(recorded[ringing], 0)
     recorded[unknown] = np.nan
-    return recorded, unknown, int(ringing.sum())
+    return recorded, unknown, int(ringing.sum()), int(transparent.sum())
+
+
+def _transparent(stored: Float) -> Bool:
+    """(H, W) of (H, W, 3 or 4): where alpha says that a pixel shows nothing, or something in part;
+    what is seen beside it, or through it, is an artist's background and not the capture's."""
+    nowhere = np.zeros(stored.shape[:2], np.bool_)
+    if stored.shape[2] == 3:
+        return nowhere
+    opaque = stored[..., 3] >= _OPAQUE
+    # Some programs leave alpha empty.
+    if not opaque.any() and (stored[..., :3] > 0).any():
+        return nowhere
+    return np.asarray(~opaque, np.bool_)
 
 
 Read = Callable[[int], FramePixels]

@@ -60,21 +60,24 @@ oiio.attribute("limits:resolution", MAX_SIDE)
 oiio.attribute("limits:imagesize_MB", MAX_DECLARED_BYTES >> 20)
 
 
-def read_radiance(path: Path, *, max_side: int = MAX_SIDE) -> Float:
-    """The R, G and B of an image as stored, (H, W, 3) float32, no colour conversion.
+def read_radiance(path: Path, *, max_side: int = MAX_SIDE, alpha: bool = False) -> Float:
+    """The R, G and B of an image as stored, (H, W, 3) float32, no colour conversion; with ``alpha``
+    that too, (H, W, 4), where the image has it.
 
     H, W are the display window's; its pixels that the file does not hold are NaN (unknown, not
     black). NaN and infinity in the file are returned as they are. Integer images give [0, 1].
     """
-    return _although_unread_once(path, lambda: _radiance(path, max_side))
+    return _although_unread_once(path, lambda: _radiance(path, max_side, alpha))
 
 
-def _radiance(path: Path, max_side: int) -> Float:
+def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
     source = open_image(path, max_side)
     names = source.spec().channelnames
     lower = [name.lower() for name in names]
     channels = [lower.index(letter) for letter in "rgb" if letter in lower]
-    if len(channels) != 3:
+    if len(channels) == 3 and alpha and "a" in lower:
+        channels.append(lower.index("a"))
+    if len(channels) < 3:
         raise ImageRefused(
             f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
             "beauty pass as R, G, B. [image.channels]"

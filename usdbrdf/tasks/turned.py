@@ -111,6 +111,7 @@ def _upright(camera: Camera, pixels: FramePixels, orientation: int) -> tuple[Cam
         dark=turn(pixels.dark),
         unknown=turn(pixels.unknown),
         num_clamped=pixels.num_clamped,
+        num_transparent=pixels.num_transparent,
     )
     height, width = shown.valid.shape
     return replace(camera, width=width, height=height), shown

@@ -23,9 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
+from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
+from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import image_size

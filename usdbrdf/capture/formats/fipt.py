@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, clause_of, up_axis_assumed
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import mesh_beside, rigid_pose, scan_of
 from usdbrdf.capture.parts import LabelTable
+from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import image_size, read_exr

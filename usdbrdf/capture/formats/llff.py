@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
+from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
     mesh_beside,
     pictures_of,
@@ -21,6 +21,7 @@ from usdbrdf.capture.formats.named_pictures import (
     rigid_pose,
     scan_of,
 )
+from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import read_array
 from usdbrdf.model.capture import Scan

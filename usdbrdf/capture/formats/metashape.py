@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, up_axis_assumed
+from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
@@ -27,6 +27,7 @@ from usdbrdf.capture.formats.named_pictures import (
     scan_of,
     warn_of_unused,
 )
+from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, read_xml
 from usdbrdf.model.arrays import Double

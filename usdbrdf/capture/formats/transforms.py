@@ -11,12 +11,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of, up_axis_assumed
+from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.named_pictures import Pictured, path_in_capture, scan_of
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
 from usdbrdf.capture.unrecognised import other_program
+from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
