@@ -108,6 +108,15 @@ def test_what_alpha_says_is_not_there_is_unknown(tmp_path, suffix):
     assert not frame.dark.any()
 
 
+def test_what_the_file_does_not_hold_is_missing_and_not_transparent(tmp_path):
+    """It counts against --max-nonfinite, of which what is transparent is no part."""
+    pixels = np.full((2, 4, 4), 1.0, np.float32)
+    pixels[0, 1] = np.nan
+    _write(tmp_path / "a.exr", pixels, "float")
+    frame = read_frame(_frames(tmp_path / "a.exr"), 0)
+    assert (int(frame.unknown.sum()), frame.num_transparent) == (1, 0)
+
+
 @pytest.mark.parametrize(("colour", "hidden"), [(1.0, 0), (0.0, 8)])
 def test_alpha_that_was_left_empty_says_nothing(tmp_path, colour, hidden):
     pixels = np.full((2, 4, 4), colour, np.float32)

@@ -44,7 +44,7 @@ class FramePixels:
     valid        (H, W) bool: every channel known, not below the noise floor and not clipped
     clipped      (H, W) bool: some channel is saturated, its radiance a lower bound
     dark         (H, W) bool: some channel lies below the noise floor
-    unknown      (H, W) bool: some channel is NaN, infinite or clearly negative
+    unknown      (H, W) bool: some channel is NaN, infinite, clearly negative, or transparent
     num_clamped  pixels with a tiny negative channel, set to 0
     num_transparent  pixels that are unknown because the image's alpha says that nothing is there
     """
@@ -169,11 +169,12 @@ def _transparent(stored: Float) -> Bool:
     nowhere = np.zeros(stored.shape[:2], np.bool_)
     if stored.shape[2] == 3:
         return nowhere
-    opaque = stored[..., 3] >= _OPAQUE
+    alpha = stored[..., 3]
     # Some programs leave alpha empty.
-    if not opaque.any() and (stored[..., :3] > 0).any():
+    if not (alpha >= _OPAQUE).any() and (stored[..., :3] > 0).any():
         return nowhere
-    return np.asarray(~opaque, np.bool_)
+    # What the file does not hold, whose alpha is NaN too, is missing and not transparent.
+    return np.asarray(alpha < _OPAQUE, np.bool_)
 
 
 Read = Callable[[int], FramePixels]
