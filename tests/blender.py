@@ -12,7 +12,7 @@ needs_blender = pytest.mark.skipif(
 )
 
 
-def in_blender(*arguments, folder, timeout=120, **environment):
+def in_blender(*arguments, folder, timeout=900, **environment):
     """What it prints; started in ``folder``, with more environment variables as given."""
     hidden = ("PYTHONPATH", "PXR_PLUGINPATH_NAME")
     own = {name: value for name, value in os.environ.items() if name not in hidden}

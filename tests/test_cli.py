@@ -76,7 +76,7 @@ def run(*arguments, **options):
         [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=900,
         **options,
     )
 

@@ -77,7 +77,7 @@ def _start(copy: Path, code: str, **environment: str) -> subprocess.Popen[str]:
 
 
 def _output(process: subprocess.Popen[str]) -> tuple[list[str], str]:
-    out, err = process.communicate(timeout=300)
+    out, err = process.communicate(timeout=900)
     assert process.returncode == 0, err
     return out.split(), err
 

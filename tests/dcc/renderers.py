@@ -14,7 +14,7 @@ _PROGRAMS = Path(__file__).resolve().parents[2] / "benchmarks"
 def _run(program, job, folder):
     document = folder / f"{program}.json"
     document.write_text(json.dumps(job))
-    in_blender(_PROGRAMS / f"{program}.py", document, folder=folder, timeout=300)
+    in_blender(_PROGRAMS / f"{program}.py", document, folder=folder, timeout=900)
 
 
 def cycles(layer, views, folder, *, samples, surroundings):

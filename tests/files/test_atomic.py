@@ -39,7 +39,7 @@ def run_python(code, *arguments, fault=""):
         env={**os.environ, "PYTHONPATH": search, VARIABLE: fault},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         check=False,
     )
 

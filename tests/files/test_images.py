@@ -158,7 +158,7 @@ except EnvironmentFailure as error:
         env={**os.environ, "PYTHONPATH": search},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         check=False,
     )
     assert said.stdout.endswith("[image.write]\n"), said.stderr

@@ -32,13 +32,13 @@ def test_one_that_a_callback_swallows_comes_again(number, ends):
     @interruptible()
     def run() -> None:
         from_outside()  # which returns: nothing can be raised through it
-        while time.monotonic() < started + 20:
+        while time.monotonic() < started + 200:
             time.sleep(0.01)
 
     started = time.monotonic()
     with pytest.raises(ends):
         run()
-    assert time.monotonic() < started + 10
+    assert time.monotonic() < started + 100
 
 
 def test_the_handlers_before_are_back():

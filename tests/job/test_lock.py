@@ -66,7 +66,7 @@ def test_lock_of_a_killed_run_is_free(tmp_path, holder):
 def test_waiting_for_the_first_run(tmp_path, holder):
     timer = threading.Timer(0.3, lambda: (holder.stdin.write("\n"), holder.stdin.flush()))
     timer.start()
-    with folder_lock(tmp_path, wait_s=20):
+    with folder_lock(tmp_path, wait_s=200):
         timer.join()
 
 
@@ -87,7 +87,7 @@ def locked_by_another_process(folder):
         capture_output=True,
         text=True,
         input="\n",
-        timeout=30,
+        timeout=300,
         check=False,
     ).stderr
     return "FolderBusy" in said

@@ -187,14 +187,14 @@ def in_new_folder_while_another_waits(asset, second):
         assert waiting.is_alive()
 
     fail_in(asset, begin)
-    waiting.join(timeout=20)
+    waiting.join(timeout=200)
 
 
 def test_a_failed_run_takes_nothing_from_one_that_waits(tmp_path, toy):
     asset = tmp_path / "new/room"
 
     def second():
-        with owned_folder(asset, wait_s=20):
+        with owned_folder(asset, wait_s=200):
             toy.run_toy(asset)
 
     in_new_folder_while_another_waits(asset, second)
@@ -208,7 +208,7 @@ def test_the_one_that_waited_holds_the_lock_that_others_see(tmp_path):
     asset, seen = tmp_path / "room", []
 
     def second():
-        with owned_folder(asset, wait_s=20) as state:
+        with owned_folder(asset, wait_s=200) as state:
             said = subprocess.run(
                 [sys.executable, "-c", TAKE, str(state)],
                 capture_output=True,

@@ -62,7 +62,7 @@ def test_who_reads_is_told_who_works_there_or_waits(room):
             pass
         ending = threading.Timer(0.3, lambda: run.communicate("\n"))
         ending.start()
-        with reading(room, wait_s=20):
+        with reading(room, wait_s=200):
             ending.join()
 
 
@@ -86,7 +86,7 @@ def is_refused(room: Path) -> bool:
         capture_output=True,
         text=True,
         input="\n",
-        timeout=60,
+        timeout=600,
         check=False,
     )
     return "FolderBusy" in done.stderr

@@ -49,7 +49,7 @@ def opened(chromium):
         if script:
             shown.add_init_script(script)
         shown.goto(address)
-        shown.wait_for_selector("body[data-ready=yes]", timeout=60_000)
+        shown.wait_for_selector("body[data-ready=yes]", timeout=600_000)
         return shown
 
     yield open_page

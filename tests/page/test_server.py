@@ -31,7 +31,7 @@ def server(built):
 def asked(server, method, path, body=None, **headers):
     place = urlsplit(server.address)
     assert place.hostname == "127.0.0.1"
-    connection = http.client.HTTPConnection(place.hostname, place.port, timeout=20)
+    connection = http.client.HTTPConnection(place.hostname, place.port, timeout=200)
     try:
         connection.request(method, path, body, headers)
         answer = connection.getresponse()

@@ -28,7 +28,7 @@ from usdbrdf.untrusted.mesh_files import mesh_from_file
 MIN_SAMPLES = 3
 # What FLIP may take. Pictures are seen at 67 pixels per degree, a 4K screen 0.7 m wide from 0.7 m,
 # its authors' default.
-_FLIP_SECONDS, _FLIP_SECONDS_PER_MEGAPIXEL = 120.0, 60.0
+_FLIP_SECONDS, _FLIP_SECONDS_PER_MEGAPIXEL = 300.0, 60.0
 
 
 def relative_l2(image: Float, reference: Float, counted: Bool) -> float:

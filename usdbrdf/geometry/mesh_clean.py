@@ -89,7 +89,7 @@ def decimated(
         function="usdbrdf.geometry.mesh_filters:decimate_objects",
         arrays={**given, "joined": none if joined is None else joined},
         parameters={"target": target, "keep_borders": keep_borders},
-        timeout_s=60 + len(triangles) / 2000,
+        timeout_s=300 + len(triangles) / 2000,
         label=f"{label}: reduction to {target} triangles",
     )
     return reduced["points"], reduced["triangles"], reduced["face_object"]
@@ -166,7 +166,7 @@ def _repaired(points: Float, triangles: Int, found: _Damage, label: str) -> tupl
         function="usdbrdf.geometry.mesh_filters:repair_sheets",
         arrays={"points": points, "triangles": given, "sheet": found.sheet[damaged]},
         parameters={},
-        timeout_s=60 + len(given) / 2000,
+        timeout_s=300 + len(given) / 2000,
         label=f"{label}: repair of {len(found.damaged_sheets)} damaged objects",
     )
     vertex = result["vertex"]

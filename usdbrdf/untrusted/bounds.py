@@ -39,7 +39,7 @@ LIMITS = {
     "picture": Limits(2 * _GIB, 120.0, 24 * _GIB),
     "video": Limits(256 * _GIB, 3600.0, 24 * _GIB),  # of which some frames are written down
 }
-PLUGIN_SECONDS = 60.0  # for the import of another package's module, which may be a large one
+PLUGIN_SECONDS = 300.0  # for the import of another package's module, which may be a large one
 _CURES = {
     "mesh": "Name the mesh with --mesh, or put mesh.ply beside the poses.",
     "stage": "Check its name and permission.",

@@ -36,7 +36,7 @@ def session(tmp_path_factory, source):
             scenario,
             *arguments,
             folder=resources,
-            timeout=300,  # the first conversion on a machine compiles its kernels
+            timeout=900,  # the first conversion on a machine compiles its kernels
             BLENDER_USER_RESOURCES=str(resources),
         )
         report = next(x for x in said.splitlines() if x.startswith("REPORT "))

@@ -55,7 +55,7 @@ def usdbrdf(installed, tmp_path):
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=900,
         )
 
     return run

@@ -65,7 +65,7 @@ def test_libplug_finds_it(plugins, built):
         },
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr
