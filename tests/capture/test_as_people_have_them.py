@@ -247,6 +247,21 @@ def test_frames_cut_out_of_their_background_are_masked_by_their_alpha(made):
     assert scan.counts["pixels_unknown"] == scan.counts["pixels_transparent"] == 11 * 6 * 32
 
 
+def test_what_both_mask_and_alpha_hide_is_hidden_once(made):
+    """What is missing of the rest still counts against --max-nonfinite."""
+    _with_alpha(made, 3, opaque_rows=18)
+    pixels = read_exr(made.image(3))
+    pixels[:6, :, :3] = np.nan
+    _write_bytes(made.image(3), pixels)
+    white = np.zeros((24, 32, 3), np.uint8)
+    white[:18] = 255
+    _write_bytes(made.folder / "white.png", white)
+    with edited(made.manifest) as document:
+        document["frames"][3]["mask_path"] = "white.png"
+    (told,) = (sentence for sentence in _read(made).warnings if "[capture.nonfinite]" in sentence)
+    assert "25% of the pixels are NaN" in told
+
+
 def test_a_mesh_in_millimetres_beside_poses_in_metres(made):
     write_ply(made.folder / "mesh.ply", 1000 * made.points, made.triangles, made.face_object)
     with pytest.raises(InputRefused, match=r"one unit\. \[capture\.parallax\]$"):

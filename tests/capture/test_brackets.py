@@ -236,7 +236,7 @@ def _write_photograph(
     path: Path, codes: np.ndarray, *, time: float, stops: float | None = None
 ) -> None:
     """With its exposure in its EXIF data alone: at f/2 and ISO 400 it has the given time."""
-    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
+    spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], codes.shape[2], "uint8")
     spec.attribute("ExposureTime", float(time))
     spec.attribute("FNumber", 2.0)
     spec.attribute("Exif:PhotographicSensitivity", 400)
@@ -324,7 +324,9 @@ def test_a_lamp_that_clips_in_all_exposures_is_never_unknown(bracket):
     assert (face[..., 0] >= merged.saturation).all()
 
 
-@pytest.mark.parametrize("fault", ["no exposure", "no brackets", "another size", "no file"])
+@pytest.mark.parametrize(
+    "fault", ["no exposure", "no brackets", "another size", "no file", "cut out"]
+)
 def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
     capture = _bracketed(tmp_path / "scan", same_poses=False)
@@ -335,6 +337,8 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
         _write_photograph(first, np.zeros((24, 64, 3), np.uint8), time=0.25)
     if fault == "no file":
         first.unlink()
+    if fault == "cut out":
+        _write_photograph(first, np.zeros((48, 64, 4), np.uint8), time=0.25)
     if fault == "no brackets":
         with edited(capture.manifest) as document:
             for frame in document["frames"]:
@@ -345,6 +349,7 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
         "no brackets": "[brackets.none]",
         "another size": "[brackets.size]",
         "no file": "[capture.file]",
+        "cut out": "[brackets.alpha]",
     }[fault]
     assert capsys.readouterr().err.endswith(f"{rule}\n")
     assert not (tmp_path / "merged").exists()

@@ -21,6 +21,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
+from usdbrdf.files.frames import transparent_of
 from usdbrdf.files.images import exif_exposure, is_eight_bit, needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress, warn
@@ -161,7 +162,14 @@ def _aligned(bracket: Bracket) -> Aligned:
                 f"{path}: not an 8-bit image. Brackets are merged from JPEG or PNG; merge others "
                 "with the program that developed them. [brackets.format]"
             )
-        pictures.append(np.round(255 * read_radiance(path)).astype(np.uint8))
+        stored = read_radiance(path, alpha=True)
+        if transparent_of(stored).any():
+            raise InputRefused(
+                f"{path}: part of it is transparent. Brackets are merged from opaque photographs; "
+                "export them without alpha, and say with mask_path what is not to be looked at. "
+                "[brackets.alpha]"
+            )
+        pictures.append(np.round(255 * stored[..., :3]).astype(np.uint8))
     sizes = {picture.shape for picture in pictures}
     if len(sizes) > 1:
         raise InputRefused(

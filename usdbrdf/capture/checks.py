@@ -412,7 +412,7 @@ def _looked_through(
         findings.count("pixels_unknown", int(pixels.unknown.sum()))
         findings.count("pixels_negative_clamped", pixels.num_clamped)
         findings.count("pixels_clipped", int(pixels.clipped.sum()))
-        findings.count("pixels_transparent", pixels.num_transparent)
+        findings.count("pixels_transparent", int(pixels.transparent.sum()))
     return usable
 
 
@@ -437,10 +437,9 @@ def _why_useless(
     may be unknown, and what its alpha does."""
     if white is None or white.shape != pixels.unknown.shape:
         white = np.ones_like(pixels.unknown)
-    hidden = pixels.num_transparent / pixels.unknown.size
-    if hidden > 1 - _MIN_USEFUL_SHARE:
+    if float((~pixels.transparent).mean()) < _MIN_USEFUL_SHARE:
         return "its alpha says that nothing is there", "capture.alpha"
-    unknown = float((pixels.unknown & white).mean()) - hidden
+    unknown = float((pixels.unknown & ~pixels.transparent & white).mean())
     if unknown > max_nonfinite:
         limit = f"(limit {max_nonfinite:.0%})"
         text = f"{unknown:.0%} of the pixels are NaN, infinite or negative {limit}"

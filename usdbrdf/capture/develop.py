@@ -181,7 +181,7 @@ def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
 @lru_cache(maxsize=1)
 def _recorded(photograph: Path, mask: Path | None, encoding: str, saturation: float) -> Float:
     """(H, W, 3) of a photograph, not to be written to; NaN where it or its mask tells nothing."""
-    recorded = read_recorded(photograph, encoding, saturation)[0]
+    recorded = read_recorded(photograph, encoding, saturation).radiance
     if mask is not None:
         recorded[~mask_at_size(mask, *recorded.shape[:2])] = np.nan
     return recorded

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from usdbrdf.model.capture import Frames
 PHOTOGRAPH_ENCODING = "srgb_rec709_scene"
 # A half float stores 3.2 as 3.19922: a clipped channel is one close to the saturation.
 CLIPPED_SHARE = 0.998
-# Of a frame: three channels of radiance and four masks.
-_BYTES_OF_PIXEL = 16
+# Of a frame: three channels of radiance and five masks.
+_BYTES_OF_PIXEL = 17
 # Resampling rings a little below zero; what is further below was never light.
 _RINGING = 1e-3
 # Alpha of what is there, as renderers' filters leave it.
@@ -44,9 +44,9 @@ class FramePixels:
     valid        (H, W) bool: every channel known, not below the noise floor and not clipped
     clipped      (H, W) bool: some channel is saturated, its radiance a lower bound
     dark         (H, W) bool: some channel lies below the noise floor
-    unknown      (H, W) bool: some channel is NaN, infinite, clearly negative, or transparent
+    unknown      (H, W) bool: some channel is NaN, infinite or clearly negative, or transparent
+    transparent  (H, W) bool: the image's alpha says that nothing, or something in part, is there
     num_clamped  pixels with a tiny negative channel, set to 0
-    num_transparent  pixels that are unknown because the image's alpha says that nothing is there
     """
 
     radiance: Float
@@ -54,8 +54,8 @@ class FramePixels:
     clipped: Bool
     dark: Bool
     unknown: Bool
+    transparent: Bool
     num_clamped: int
-    num_transparent: int
 
     def window(self, left: int, top: int, right: int, bottom: int) -> FramePixels:
         """The pixels of a rectangle; right and bottom are the first beyond it."""
@@ -66,16 +66,17 @@ class FramePixels:
             clipped=self.clipped[part],
             dark=self.dark[part],
             unknown=self.unknown[part],
+            transparent=self.transparent[part],
             num_clamped=self.num_clamped,
-            num_transparent=self.num_transparent,
         )
 
     def at_size(self, width: int, height: int) -> FramePixels:
         """Smaller, each pixel the mean of what is known of those that it covers: valid only if all
-        of them are, clipped, dark or unknown if any is."""
+        of them are, clipped, dark, unknown or transparent if any is."""
         if self.valid.shape == (height, width):
             return self
-        masks = np.stack([~self.valid, self.clipped, self.dark, self.unknown], axis=-1)
+        flags = ~self.valid, self.clipped, self.dark, self.unknown, self.transparent
+        masks = np.stack(flags, axis=-1)
         some = resized(masks.astype(np.float32), width, height) > _ANY
         weight = resized((~self.unknown)[..., None].astype(np.float32), width, height)
         total = resized(np.nan_to_num(self.radiance), width, height)
@@ -86,8 +87,8 @@ class FramePixels:
             clipped=some[..., 1],
             dark=some[..., 2],
             unknown=some[..., 3],
+            transparent=some[..., 4],
             num_clamped=self.num_clamped,
-            num_transparent=self.num_transparent,
         )
 
 
@@ -100,7 +101,8 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     saturation = float(frames.saturation_radiance[i])
     gain = 1.0 if frames.gain is None else float(frames.gain[i])
     encoding = frames.encoding_of(i)
-    recorded, unknown, *counts = read_recorded(frames.image_paths[i], encoding, saturation, gain)
+    found = read_recorded(frames.image_paths[i], encoding, saturation, gain)
+    recorded, unknown = found.radiance, found.unknown
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
@@ -114,8 +116,8 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
         clipped=clipped,
         dark=dark,
         unknown=unknown,
-        num_clamped=counts[0],
-        num_transparent=counts[1],
+        transparent=found.transparent,
+        num_clamped=found.num_clamped,
     )
 
 
@@ -129,19 +131,24 @@ def transmission(frames: Frames, i: int) -> Float:
     return np.asarray(np.exp(square * (first + square * second)), np.float32)
 
 
-def read_recorded(
-    path: Path, encoding: str, saturation: float, gain: float = 1.0
-) -> tuple[Float, Bool, int, int]:
-    """The radiance (H, W, 3) that an image records, NaN where it is unknown; where that is (H, W):
-    some channel is NaN, infinite or clearly negative, or its alpha says that nothing is there;
-    how many pixels had a channel a little below zero; and of how many alpha says that. Of a linear
-    image in its own primaries, of others in those of Rec.709.
+class Recorded(NamedTuple):
+    """What an image records: as of ``FramePixels``, of a linear image in its own primaries, of
+    others in those of Rec.709."""
+
+    radiance: Float
+    unknown: Bool
+    transparent: Bool
+    num_clamped: int
+
+
+def read_recorded(path: Path, encoding: str, saturation: float, gain: float = 1.0) -> Recorded:
+    """What an image records; ImageRefused where it cannot be read whole.
 
     saturation, gain: of the frame, see ``Frames``. Channels down to -1e-3 of the frame's median are
     ringing and become 0.
     """
     stored = read_radiance(path, alpha=True)
-    recorded, transparent = np.ascontiguousarray(stored[..., :3]), _transparent(stored)
+    recorded, transparent = np.ascontiguousarray(stored[..., :3]), transparent_of(stored)
     kind = kind_of_encoding(encoding)
     if kind == "log":
         recorded = to_working_space(recorded, encoding)
@@ -160,10 +167,10 @@ def read_recorded(
         ringing, unknown = ringing & ~below, unknown | below
     recorded[ringing] = np.maximum(recorded[ringing], 0)
     recorded[unknown] = np.nan
-    return recorded, unknown, int(ringing.sum()), int(transparent.sum())
+    return Recorded(recorded, unknown, transparent, int(ringing.sum()))
 
 
-def _transparent(stored: Float) -> Bool:
+def transparent_of(stored: Float) -> Bool:
     """(H, W) of (H, W, 3 or 4): where alpha says that a pixel shows nothing, or something in part;
     what is seen beside it, or through it, is an artist's background and not the capture's."""
     nowhere = np.zeros(stored.shape[:2], np.bool_)

@@ -110,8 +110,8 @@ def _upright(camera: Camera, pixels: FramePixels, orientation: int) -> tuple[Cam
         clipped=turn(pixels.clipped),
         dark=turn(pixels.dark),
         unknown=turn(pixels.unknown),
+        transparent=turn(pixels.transparent),
         num_clamped=pixels.num_clamped,
-        num_transparent=pixels.num_transparent,
     )
     height, width = shown.valid.shape
     return replace(camera, width=width, height=height), shown
