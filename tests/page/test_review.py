@@ -51,10 +51,10 @@ def test_of_a_metal_by_directive_the_page_says_no_more_than_is_known(numbers, to
 
 def test_of_what_is_seen_through_page_and_run_say_so():
     found = fit(status="prior", contradiction=0.45)
-    assert "Its views differ by 45%" in why(found, "prior", None)
+    assert "Its views contradict by 45% that it is a surface" in why(found, "prior", None)
     assert not fit().doubts
     (told,) = found.doubts
-    assert told.startswith("chair: between views its light differs by 45%, ")
+    assert told.startswith("chair: 45% of its light changes between views ")
 
 
 def test_what_is_said_comes_back_and_is_metadata_alone(built):

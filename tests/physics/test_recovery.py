@@ -22,8 +22,10 @@ from usdbrdf.material.fit_views import (
     sampled_object,
     share_in_doubt,
     with_doubts_of_light,
+    with_what_shows_through,
 )
 from usdbrdf.material.observations import Follower, Observations
+from usdbrdf.material.verdict import LobeEstimate, verdict_on_views
 from usdbrdf.model.camera import Camera
 from usdbrdf.transport.lit_scene import LitScene, View
 
@@ -224,6 +226,20 @@ def views(studio: Studio) -> Views:
         follower.add(i, view, np.zeros_like(view.valid), 1e-3)
         cameras.append(view.camera)
     return Views(wrong, follower.chosen(0).of_texels(own), follower.smoothing, cameras)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_what_shows_through_is_held_against_a_lobe(studio: Studio, views: Views, share: float):
+    lit = _lit_scene(studio.world, views.radiance)
+    sampled = views.sampled(lit)
+    seen = sampled.samples.radiance + np.float32(share) * sampled.behind(SPHERE)
+    sampled = sampled._replace(samples=replace(sampled.samples, radiance=seen))
+    found = LobeEstimate(*OF_VIEWS, 0.01, 0.01, 0.0, 1.0, 0.9)
+    held = with_what_shows_through(lit.lobe, sampled, SPHERE, 0, found)
+    assert verdict_on_views(held, True).status == ("prior" if share else "measured")
+    assert held.contradiction == pytest.approx(share, abs=0.2)
+    unsure = found._replace(evidence=0.1)  # nothing is asked about what is not measured anyway
+    assert with_what_shows_through(lit.lobe, sampled, SPHERE, 0, unsure) == unsure
 
 
 def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(

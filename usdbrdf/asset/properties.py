@@ -380,9 +380,10 @@ class FittedObject(MeasuredObject):
         specular lobe): what the highlights explain; 0 is nothing, 1 is everything; without
         unit.""", high=1)]
     contradiction: Annotated[float, Fact(FIT, "contradiction", "float", 0.0, """Relative standard
-        deviation between views, alike over the object or places of it, that no lobe explains;
-        authored where it is too large for a surface, and things are seen through or in it; without
-        unit.""", low=0)] = math.nan
+        deviation between views, alike over the object or places of it, that no lobe explains, or
+        the share of the light behind it that shows through it for sure, whichever is more; authored
+        where it is too large for a surface, and things are seen through or in it; without unit.""",
+        low=0)] = math.nan
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
         the photographs, and their stated errors are small; prior: they do not determine both, whose
         values are the medians of what remains likely if all was equally likely before; unseen: no
@@ -435,9 +436,9 @@ class FittedObject(MeasuredObject):
         if not self.is_contradicted:
             return []
         return [
-            f"{self.identifier}: between views its light differs by {self.contradiction:.0%}, as "
-            "no surface's does, so its lobe is not measured. If it is glass, say so by a "
-            "directive. [fit.contradicted]"
+            f"{self.identifier}: {self.contradiction:.0%} of its light changes between views as no "
+            "surface's does, or is that of what lies behind it, so its lobe is not measured. If it "
+            "is glass, say so by a directive. [fit.contradicted]"
         ]
 
     @property

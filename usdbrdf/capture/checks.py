@@ -83,7 +83,7 @@ def frames_from_records(
 MIN_FRAMES, _MAX_DROPPED_SHARE = 8, 0.2
 _CURE = "Correct them, or leave them out of the capture."  # for rules of other adapters
 _CURES = {
-    "capture.pose": "Give every frame a rigid 4 x 4 transform_matrix.",
+    "capture.pose": "Give every frame a rigid pose (in transforms.json a 4 x 4 transform_matrix).",
     "capture.alignment": "Align and calibrate these cameras, or take them out of the project.",
     "capture.camera": "Correct the focal lengths, principal points and distortion.",
     "capture.file": "Copy the missing images, name their folder with --frames, or remove their "

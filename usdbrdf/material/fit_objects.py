@@ -34,6 +34,7 @@ from usdbrdf.material.fit_views import (
     joined_object,
     sampled_object,
     with_doubts_of_light,
+    with_what_shows_through,
 )
 from usdbrdf.material.observations import Follower, Observations
 from usdbrdf.material.verdict import (
@@ -384,6 +385,8 @@ def fit_object(
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     if any(one.doubt for one in lightings):
         fitted, metal = with_doubts_of_light(lobe, sampled, options.seed, fitted, metal)
+    if not metal:
+        fitted = with_what_shows_through(lobe, sampled, index, options.seed, fitted)
     found = ObjectFit(
         *fitted[:7], fitted.phi_median, fitted.psi_median, fitted.psi_upper,
         fitted.contradiction, num_samples=used, target=target, beckmann=int(lobe == BECKMANN),

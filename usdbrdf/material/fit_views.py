@@ -24,7 +24,14 @@ from usdbrdf.material.fit_lobe import (
     repeated_where_noisy,
 )
 from usdbrdf.material.observations import Observations
-from usdbrdf.material.verdict import MAX_PSI_ERROR, NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate
+from usdbrdf.material.seen_through import radiance_behind, seen_through
+from usdbrdf.material.verdict import (
+    MAX_PSI_ERROR,
+    NOTHING_KNOWN,
+    SOME_EVIDENCE,
+    LobeEstimate,
+    verdict_on_views,
+)
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
@@ -47,7 +54,7 @@ MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 _UPPER = 1.645  # standard deviations that are exceeded with a probability of 5 %
-_SEED_OF_DOUBT = 0xD0B7
+_SEED_OF_DOUBT, _SEED_OF_THROUGH = 0xD0B7, 0x71E0
 
 
 class SampledPart(NamedTuple):
@@ -103,6 +110,15 @@ class SampledObject(NamedTuple):
             return base - taken[0], slope - taken[1]
 
         return basis
+
+    def behind(self, index: int) -> Float:
+        """(P, 3) W/(m^2 sr): what each sample's rays meet behind the object ``index``, which they
+        are of, on the mean over the usual footprint."""
+        found = [
+            radiance_behind(part.lit, part.footprints[0], index).reshape(-1, len(RINGS), 3).mean(1)
+            for part in self.parts
+        ]
+        return np.concatenate(found)
 
     def slope(self, kind: int, phi: float, seed: int, *, of_doubt: bool = False) -> Float:
         """(P, 3, 1) of I_nd = base + psi slope, of the usual footprint; of_doubt: of what the light
@@ -302,6 +318,18 @@ def with_doubts_of_light(
         f0_error = math.hypot(metal.f0_error, off * max(metal.f0))
         metal = metal._replace(f0_error=f0_error)
     return found._replace(psi_error=psi_error, psi_upper=upper), metal
+
+
+def with_what_shows_through(
+    lobe: int, sampled: SampledObject, index: int, seed: int, found: LobeEstimate
+) -> LobeEstimate:
+    """A lobe that would be measured, held against what is seen through the object ``index``: what
+    shows through a thing for sure contradicts its being a surface."""
+    if verdict_on_views(found, True).status != "measured":
+        return found
+    basis = partial(sampled.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
+    through = seen_through(sampled.samples, sampled.behind(index), basis, found)
+    return found._replace(contradiction=max(found.contradiction, through.at_least))
 
 
 def share_in_doubt(sampled: SampledObject, kind: int, phi: float, seed: int) -> float:

@@ -32,7 +32,8 @@ class LobeEstimate(NamedTuple):
     what psi exceeds with a probability of 5 %, if all in [0, 1] was equally likely before: where no
     highlight shows, the frames still say that psi is small or phi large. For psi_median no lobe at
     all was as likely before as one: it is 0 where the simpler model explains as much.
-    contradiction: see ``ViewModel``; of a surface it is small, whatever its lobe."""
+    contradiction: see ``ViewModel``, or what shows through for sure, see ``Through``; of a surface
+    it is small, whatever its lobe."""
 
     phi: float
     psi: float

@@ -135,7 +135,7 @@ def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
         return "A metal explains the views better than any dielectric: F0 takes the place of psi."
     if fit.is_contradicted:
         return (
-            f"Its views differ by {fit.contradiction:.0%}, as those of no surface do: something is "
+            f"Its views contradict by {fit.contradiction:.0%} that it is a surface: something is "
             "seen through it or in it. If it is glass, say so by a directive."
         )
     explained = f"A lobe explains {max(fit.evidence, 0):.0%} of what changes with the view."

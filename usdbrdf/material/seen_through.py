@@ -1,0 +1,111 @@
+"""What lies behind a thing and shows through it.
+
+A pane may reflect as a surface does and still be none: most of what its pixels hold is what their
+rays meet behind it. That moves over the pane as the camera does, by the parallax of what is behind,
+and no lobe and no error of a surface's samples moves with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from usdbrdf.material.verdict import LobeEstimate
+from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.model.arrays import Float
+from usdbrdf.transport.environment import pixels_of_directions
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
+from usdbrdf.transport.rays import lift_from_surface
+
+# So many walls of an object are passed on the way: both of each of a few panes.
+_MOST_LAYERS = 8
+# Steps of expectation maximisation, of what a lobe and what shows through leave.
+_UPDATES = 4
+
+
+class Through(NamedTuple):
+    """share: of the radiance behind that is seen, from 0 to 1; error: its standard deviation."""
+
+    share: float
+    error: float
+
+    @property
+    def at_least(self) -> float:
+        """What it exceeds with a probability of 97.7 %."""
+        return max(self.share - 2 * self.error, 0.0)
+
+
+NOTHING = Through(0.0, math.inf)
+
+
+def radiance_behind(lit: LitScene, points: SurfacePoints, index: int) -> Float:
+    """(R, 3) W/(m^2 sr): what the rays from the camera meet behind object ``index``, of which
+    ``points`` are; 0 where that is nothing, and nothing is known of the surroundings."""
+    behind = np.zeros((len(points.face), 3), np.float32)
+    direction = np.ascontiguousarray(-points.to_camera, np.float32)
+    origin = lift_from_surface(points.position, direction, lit.diagonal_m)
+    left = np.arange(len(origin))
+    for _ in range(_MOST_LAYERS):
+        if not len(left):
+            break
+        hits = lit.rays.closest(origin, direction[left])
+        own = lit.owner(hits.face) == index
+        beyond = left[~own]
+        behind[beyond] = lit.radiance.at(hits.face[~own], hits.u[~own], hits.v[~own])
+        missed = beyond[hits.face[~own] < 0]
+        behind[missed] = _surroundings(lit, direction[missed])
+        reached = origin[own] + direction[left[own]] * hits.distance[own, None]
+        left = left[own]
+        origin = lift_from_surface(reached, direction[left], lit.diagonal_m)
+    return behind
+
+
+def _surroundings(lit: LitScene, direction: Float) -> Float:
+    picture = lit.environment.image
+    height, width = picture.shape[:2]
+    where = pixels_of_directions(direction, height, width, lit.environment.z_up)
+    found: Float = picture.reshape(-1, 3)[where]
+    return found
+
+
+def seen_through(
+    samples: ViewSamples,
+    behind: Float,
+    basis: Callable[[Sequence[float]], tuple[Float, Float]],
+    found: LobeEstimate,
+) -> Through:
+    """How much of ``behind`` (P, 3) the samples show beside diffuse light, free for each texel, and
+    a lobe with the roughness that was ``found``: both factors by least squares, with the errors
+    that samples of a frame share.
+
+    basis: roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K) each.
+    """
+    base, slope = (one[..., 0] for one in basis([found.phi]))
+    rest = samples.radiance - base
+    model = ViewModel(samples)
+    psi, through = found.psi, NOTHING
+    for _ in range(_UPDATES):
+        model.update(base + np.float32(psi) * slope + np.float32(through.share) * behind)
+        psi, through = _least_squares(model, rest, slope, behind)
+    return through
+
+
+def _least_squares(
+    model: ViewModel, rest: Float, slope: Float, behind: Float
+) -> tuple[float, Through]:
+    """psi and how much shows through, each from 0 to 1."""
+    left, lobe, far = model.reduced(np.stack([rest, slope, behind], axis=2)).parts(3)
+    of_lobe, of_far = (float(model.product(one, one)[0]) for one in (lobe, far))
+    both = float(model.product(lobe, far)[0])
+    lobe_left, far_left = (float(model.product(one, left)[0]) for one in (lobe, far))
+    # Where what is behind looks alike from everywhere, or as the lobe does, nothing tells.
+    alone = of_far - both**2 / of_lobe if of_lobe > 0 else of_far
+    if not alone > 1e-9 * of_far:
+        return float(np.clip(lobe_left / max(of_lobe, 1e-30), 0, 1)), NOTHING
+    share = (far_left - both * lobe_left / of_lobe if of_lobe > 0 else far_left) / alone
+    share = min(max(share, 0.0), 1.0)
+    psi = (lobe_left - share * both) / of_lobe if of_lobe > 0 else 0.0
+    return min(max(psi, 0.0), 1.0), Through(share, 1 / math.sqrt(alone))
