@@ -321,14 +321,15 @@ def with_doubts_of_light(
 
 
 def with_what_shows_through(
-    lobe: int, sampled: SampledObject, index: int, seed: int, found: LobeEstimate
+    lobe: int, sampled: Callable[[], SampledObject], index: int, seed: int, found: LobeEstimate
 ) -> LobeEstimate:
     """A lobe that would be measured, held against what is seen through the object ``index``: what
     shows through a thing for sure contradicts its being a surface."""
     if verdict_on_views(found, True).status != "measured":
         return found
-    basis = partial(sampled.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
-    through = seen_through(sampled.samples, sampled.behind(index), basis, found)
+    held = sampled()
+    basis = partial(held.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
+    through = seen_through(held.samples, held.behind(index), basis, found)
     return found._replace(contradiction=max(found.contradiction, through.at_least))
 
 
