@@ -7,6 +7,7 @@ import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
+from usdbrdf.shading import clipped_light
 from usdbrdf.shading.clipped_light import clipped_groups
 
 WALL, LAMP = 2, 6
@@ -32,6 +33,16 @@ def _groups(world: World, lit: np.ndarray, clipped: np.ndarray, unseen=()):
     over = np.zeros(len(lit), bool)
     over[clipped] = True
     return clipped_groups(world.texels, lit, CoverageMap.of(seen, over))
+
+
+def test_walls_are_no_lamps_although_there_are_too_many_groups(world: World, own, monkeypatch):
+    monkeypatch.setattr(clipped_light, "_MAX_GROUPS", 1)
+    lit = world.per_object([(0.9 * BOUND,) * 3] * 6 + [(0.1 * BOUND,) * 3])
+    patch, lamp = own(WALL)[320:384], own(LAMP)[:64]
+    lit[patch] = lit[lamp] = BOUND
+    found = _groups(world, lit, np.concatenate([patch, lamp]))
+    assert len(found) == 1
+    np.testing.assert_array_equal(np.flatnonzero(found.wall), patch)
 
 
 def test_nothing_clipped_is_no_group(world: World):

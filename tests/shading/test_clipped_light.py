@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_the_lamps_are_as_bright_as_their_light_says(
     np.testing.assert_array_equal(lit, before)
     np.testing.assert_array_equal(light.lit[~clipped], lit[~clipped])
     assert light.estimate.determined.all()
-    assert light.least_of_lamps() == 0
+    assert light.least_of_lamps(np.zeros(len(lit))) == 0
     for lamp, expected in zip((6, 7), LAMPS, strict=True):
         found = light.lit[world.texels.of_object(lamp)].mean(axis=0)
         error = light.error_of_object(lamp)
@@ -98,7 +99,7 @@ def test_light_that_did_not_clip_stays_as_it_is(world: World, truth: np.ndarray,
     nothing = np.zeros(len(truth), bool)
     light = _estimated(world, truth, nothing, tmp_path)
     assert light.lit is truth
-    assert light.least_of_lamps() == 0
+    assert light.least_of_lamps(np.zeros(len(truth))) == 0
     assert np.isnan(light.error_of_object(6))
     assert not light.may_shine(nothing).any()
 
@@ -111,12 +112,18 @@ def test_an_undetermined_lamp_stands_below_its_estimate_or_at_what_was_measured(
         object=np.arange(3, dtype=np.int32),
         bound=np.full((3, 3), 4.0, np.float32),
         lamp=np.array([True, True, False]),
+        wall=group == 2,
     )
     estimate = EstimatedRadiance(
         multiplier=np.array([[60.0] * 3, [3.0] * 3, [60.0] * 3]),
         standard_error=np.array([[0.9] * 3, [0.9] * 3, [0.9] * 3]),
         determined=np.zeros(3, np.bool_),
     )
+    # What a reflector might show too is no lamp that others are held against.
+    one = replace(groups, bound=np.array([4.0, 6.0, 1.0], np.float32))
+    light = ClippedLight(lit=np.zeros((8, 3), np.float32), groups=one, estimate=estimate)
+    for reflected, dimmest in ((0, 4), (4, 6), (7, 0)):
+        assert light.least_of_lamps(np.full(8, float(reflected))) == dimmest
     lit = np.tile(np.float32([[4.0] * 3, [4.5] * 3]), (4, 1))
     found = _with_estimates(lit, groups, estimate)
     expected = lit.copy()

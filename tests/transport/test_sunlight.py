@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,21 @@ def test_a_surface_in_the_open_gets_the_cosine_law():
     below = Sun(TOWARDS * [1, 1, -1], IRRADIANCE)
     assert not sunlight(_surface(world), every, below, 0).any()
     assert not sunlight(_surface(world), every, Sun(TOWARDS, np.zeros(3)), 0).any()
+
+
+@pytest.mark.parametrize("fold", [-0.3, 0.3])
+def test_a_folded_surface_does_not_shade_itself(fold: float):
+    """Texels along the fold reach beyond their triangle, where it is hollow below the other one."""
+    flat = quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (16, 16))
+    points = flat.points + np.array([[0, 0, 0], [0, 0, fold], [0, 0, 0], [0, 0, fold]])
+    corners = points[flat.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normals = np.repeat(normal[:, None], 3, axis=1)
+    world = world_of([replace(flat, points=points, normals=normals)])
+    every = np.arange(len(world.texels))
+    found = sunlit(_surface(world), every, Sun(np.array([0.0, 0, 1]), IRRADIANCE), 0)
+    np.testing.assert_allclose(found, world.texels.normal[:, 2], rtol=1e-6)
 
 
 @pytest.mark.parametrize("half_angle", [1e-6, 0.05])

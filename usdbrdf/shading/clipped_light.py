@@ -60,12 +60,14 @@ class ClippedGroups:
     object (K,) int32, whose texels they are
     bound  (K,) float32, the largest radiance at which one of its texels clipped
     lamp   (K,) bool: no measured texel around is nearly as bright
+    wall   (T,) bool: the texels of those that are no lamps, of fainter ones than the K too
     """
 
     group: Int
     object: Int
     bound: Float
     lamp: Bool
+    wall: Bool
 
     def __len__(self) -> int:
         return len(self.object)
@@ -116,6 +118,9 @@ def clipped_groups(
                 lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
             lamp = said.get(i, lamp)
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
+    wall = np.zeros(len(texels), np.bool_)
+    for *_, lamp, part in found:
+        wall[part] = not lamp
     found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]
     group = np.full(len(texels), -1, np.int32)
     for k, item in enumerate(found):
@@ -125,6 +130,7 @@ def clipped_groups(
         object=np.array([item[1] for item in found], np.int32),
         bound=np.array([item[2] for item in found], np.float32),
         lamp=np.array([item[3] for item in found], np.bool_),
+        wall=wall,
     )
 
 
@@ -154,7 +160,7 @@ class ClippedLight:
 
     def may_shine(self, clipped: Bool) -> Bool:
         """(T,): the clipped texels but those that are clearly part of a bright wall."""
-        return np.asarray(clipped & ~self.groups.texels_of(~self.groups.lamp), np.bool_)
+        return np.asarray(clipped & ~self.groups.wall, np.bool_)
 
     def error_of_object(self, index: int) -> float:
         """Relative standard error of the object's estimate; NaN if it has none."""
@@ -163,10 +169,16 @@ class ClippedLight:
             return float("nan")
         return float(self.estimate.standard_error[own].max())
 
-    def least_of_lamps(self) -> float:
-        """Radiance of the dimmest lamp that stayed a lower bound; 0 if none did."""
-        unknown = self.groups.bound[self.groups.lamp & ~self.estimate.determined]
-        return float(unknown.min()) if len(unknown) else 0.0
+    def least_of_lamps(self, reflected: Float) -> float:
+        """Radiance, in its largest channel, of the dimmest lamp that stayed a lower bound; 0 if
+        none did. ``reflected`` (T,): the most that a reflector would show in any channel: what is
+        bounded by no more than that may be one, as a sunlit patch is."""
+        group, count = self.groups.group, len(self.groups)
+        own = group >= 0
+        num_own = np.maximum(np.bincount(group[own], minlength=count), 1)
+        level = np.bincount(group[own], reflected[own], count) / num_own
+        lamp = self.groups.lamp & ~self.estimate.determined & (self.groups.bound > level)
+        return float(self.groups.bound[lamp].min()) if lamp.any() else 0.0
 
 
 def estimate_clipped_light(

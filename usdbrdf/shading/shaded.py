@@ -64,7 +64,8 @@ def find_emitters(
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
     seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound.
-    unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that. S is
+    unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that, as
+    ``ClippedLight.least_of_lamps``. S is
     then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
@@ -74,7 +75,7 @@ def find_emitters(
     shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
     shines &= light > np.median(light)
-    shines &= clipped | (light >= unknown_lamp)
+    shines &= clipped | (radiance.max(axis=1) >= unknown_lamp)
     known = seen | clipped
     emissive = np.zeros(len(texels), np.bool_)
     num_objects = len(texels.resolution)
@@ -84,7 +85,10 @@ def find_emitters(
     for i in range(num_objects):
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
-        is_lamp[i] = area.sum() > 0 and (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
+        # A few texels, of much that nobody saw, show a neighbour's light as well as one's own.
+        enough = min(_MIN_PATCH, len(area) / 2)
+        is_lamp[i] = (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
+        is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= enough
         is_lamp[i] = said.get(i, is_lamp[i])
         if is_lamp[i]:
             emissive[own] = True
@@ -346,7 +350,8 @@ def shade_surface(
     traced = trace_irradiance(run, surface, light.lit, environment, sampling)
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
-    may_shine, dimmest = light.may_shine(coverage.clipped), light.least_of_lamps()
+    may_shine = light.may_shine(coverage.clipped)
+    dimmest = light.least_of_lamps(EMITTER_RATIO / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said
     )

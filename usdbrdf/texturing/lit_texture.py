@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress, say
@@ -26,6 +27,7 @@ from usdbrdf.transport.lit_scene import TexturedScene
 
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
+_FEW_BOUNDS = calibration.count("emitters.min_texels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,9 +168,12 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
             "show them, or only at grazing angles. Check that the objects are larger than the "
             "--texel-size, the poses, and the size of the images. [texturing.unseen]"
         )
-    owner = texels.object_index()
-    has_measured = np.bincount(owner, measured, len(texels.resolution)) > 0
-    bounded = clipped & ~has_measured[owner]
+    owner, count = texels.object_index(), len(texels.resolution)
+    has_measured = np.bincount(owner, measured, count) > 0
+    # A few such texels, of much that nobody saw, are as often a neighbour's pixels.
+    enough = np.minimum(_FEW_BOUNDS, np.bincount(owner, minlength=count) / 2)
+    has_bounds = np.bincount(owner, clipped, count) >= enough
+    bounded = clipped & (~has_measured & has_bounds)[owner]
     least = found.lower_bound[:, None]
     lit, mean = inpaint_alike(
         texels,

@@ -43,7 +43,7 @@ def sunlit(surface: TexturedScene, index: Long, sun: Sun, seed: int) -> Float:
 
 
 def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: range) -> Float:
-    """(N,) share of some ``samples`` that nothing blocks."""
+    """(N,) share of some ``samples`` that nothing blocks, of those that lie before the surface."""
     if not len(index):
         return np.zeros(0, np.float32)
     texels, count = surface.texels, len(samples)
@@ -55,15 +55,16 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
     normal = np.repeat(texels.geometric_normal[index], count, axis=0)
     origin = lift_from_surface(position, normal, surface.diagonal_m)
     hits = surface.rays.closest(origin, towards_sun(sun, drawn[..., 2:].reshape(-1, 2)))
-    free = np.flatnonzero(hits.face < 0)
-    # In a corner some of a texel's square lies beyond the other wall, where the sun may shine.
+    free = (hits.face < 0).reshape(-1, count)
+    # Some of a texel's square lies beyond another wall, where the sun may shine, or, where the
+    # surface is hollow, below the next triangle, where it does not.
     centre = lift_from_surface(texels.position[index], texels.geometric_normal[index],
-                               surface.diagonal_m)[free // count]  # fmt: skip
-    way = surface.rays.closest(centre, origin[free] - centre)
-    seen = np.zeros(len(origin), np.float32)
-    seen[free] = (way.face < 0) | (way.distance > 1)
-    share: Float = seen.reshape(-1, count).mean(axis=1)
-    return share
+                               surface.diagonal_m).repeat(count, axis=0)  # fmt: skip
+    way = surface.rays.closest(centre, origin - centre)
+    before = ((way.face < 0) | (way.distance > 1)).reshape(-1, count)
+    num_before = before.sum(axis=1)
+    share = (free & before).sum(axis=1) / np.maximum(num_before, 1)
+    return np.where(num_before > 0, share, free.mean(axis=1)).astype(np.float32)
 
 
 def towards_sun(sun: Sun, drawn: Double) -> Float:
