@@ -38,7 +38,7 @@ def _groups(world: World, lit: np.ndarray, clipped: np.ndarray, unseen=()):
 def test_walls_are_no_lamps_although_there_are_too_many_groups(world: World, own, monkeypatch):
     monkeypatch.setattr(clipped_light, "_MAX_GROUPS", 1)
     lit = world.per_object([(0.9 * BOUND,) * 3] * 6 + [(0.1 * BOUND,) * 3])
-    patch, lamp = own(WALL)[320:384], own(LAMP)[:64]
+    patch, lamp = own(WALL).reshape(32, 32)[8:16, 8:16].ravel(), own(LAMP)[:64]
     lit[patch] = lit[lamp] = BOUND
     found = _groups(world, lit, np.concatenate([patch, lamp]))
     assert len(found) == 1
