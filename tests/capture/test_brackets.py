@@ -325,7 +325,7 @@ def test_a_lamp_that_clips_in_all_exposures_is_never_unknown(bracket):
 
 
 @pytest.mark.parametrize(
-    "fault", ["no exposure", "no brackets", "another size", "no file", "cut out"]
+    "fault", ["no exposure", "no brackets", "another size", "no file", "cut out", "logarithms"]
 )
 def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
@@ -337,6 +337,9 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
         _write_photograph(first, np.zeros((24, 64, 3), np.uint8), time=0.25)
     if fault == "no file":
         first.unlink()
+    if fault == "logarithms":
+        with edited(capture.manifest) as document:
+            document["encoding"] = "ACEScct"
     if fault == "cut out":
         _write_photograph(first, np.zeros((48, 64, 4), np.uint8), time=0.25)
     if fault == "no brackets":
@@ -350,6 +353,7 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
         "another size": "[brackets.size]",
         "no file": "[capture.file]",
         "cut out": "[brackets.alpha]",
+        "logarithms": "[brackets.encoding]",
     }[fault]
     assert capsys.readouterr().err.endswith(f"{rule}\n")
     assert not (tmp_path / "merged").exists()

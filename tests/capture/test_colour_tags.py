@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import struct
+from dataclasses import replace
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame
 from usdbrdf.files.images import read_radiance
 from usdbrdf.options import IngestOptions
 
@@ -67,3 +70,69 @@ def test_a_header_that_says_nothing_known_changes_nothing(capture):
     scan = read_scan(capture.folder, IngestOptions())
     assert scan.frames.encoding == "lin_rec709_scene"
     assert not any("[capture.encoding]" in sentence for sentence in scan.warnings)
+
+
+def _profile(name: str) -> np.ndarray:
+    """The header and the description of an ICC profile, as ICC.1:2001-04 lays them out."""
+    text = name.encode() + b"\0"
+    description = b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78)
+    description = description.ljust(-(-len(description) // 4) * 4, b"\0")
+    table = struct.pack(">I4sII", 1, b"desc", 144, len(description))
+    head = struct.pack(">I4sI", 144 + len(description), b"lcms", 0x02400000) + b"mntrRGB XYZ "
+    head = head.ljust(36, b"\0") + b"acsp"
+    head = head.ljust(68, b"\0") + struct.pack(">3I", 0xF6D6, 0x10000, 0xD32D)  # D50
+    return np.frombuffer(head.ljust(128, b"\0") + table + description, np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize(
+    ("profile", "encoding"),
+    [
+        ("Display P3", "srgb_p3d65_scene"),
+        ("Adobe RGB (1998)", "srgb_rec709_scene"),
+        ("sRGB IEC61966-2.1", "srgb_rec709_scene"),
+        ("ProPhoto RGB", "srgb_rec709_scene"),
+    ],
+)
+def test_photographs_have_the_space_of_the_profile_in_them(capture, profile, encoding, suffix):
+    icc = _profile(profile)
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            codes = np.round(255 * np.clip(read_radiance(capture.image(i)), 0, 1)).astype(np.uint8)
+            frame["file_path"] = f"frames/photograph_{i}{suffix}"
+            file = str(capture.folder / frame["file_path"])
+            spec = oiio.ImageSpec(codes.shape[1], codes.shape[0], 3, "uint8")
+            spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+            output = oiio.ImageOutput.create(file)
+            assert output.open(file, spec)
+            assert output.write_image(codes)
+            assert output.close()
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert scan.frames.encoding == encoding
+    told = [sentence for sentence in scan.warnings if "[capture.encoding]" in sentence]
+    assert len(told) == (profile != "sRGB IEC61966-2.1")
+    assert all((encoding if encoding != "srgb_rec709_scene" else profile) in one for one in told)
+
+
+def test_colours_of_photographs_beyond_rec709_are_known(capture, tmp_path):
+    """A red of Display P3 is negative in blue and green there, which is no reason to mask it."""
+    codes = np.full((24, 32, 3), (200, 12, 12), np.uint8)
+    spec = oiio.ImageSpec(32, 24, 3, "uint8")
+    output = oiio.ImageOutput.create(str(tmp_path / "red.png"))
+    assert output.open(str(tmp_path / "red.png"), spec)
+    assert output.write_image(codes)
+    assert output.close()
+    frames = read_scan(capture.folder, IngestOptions()).frames
+    paths = [tmp_path / "red.png", *frames.image_paths[1:]]
+    saturation = np.full(len(paths), PHOTOGRAPH_SATURATION)
+    frames = replace(
+        frames, image_paths=tuple(paths), encoding="srgb_p3d65_scene",
+        saturation_radiance=saturation, noise_floor_radiance=0 * saturation,
+    )  # fmt: skip
+    found = read_frame(frames, 0)
+    assert found.valid.all()
+    assert (found.radiance[..., 1] < 0).all()
+    linear = np.where(codes > 10, ((codes / 255 + 0.055) / 1.055) ** 2.4, codes / 255 / 12.92)
+    # From Display P3 to Rec.709, SMPTE EG 432-1 and ITU-R BT.709, whose white is the same.
+    rec709_from_p3 = [[1.22494, -0.22494, 0], [-0.04206, 1.04206, 0], [-0.01964, -0.07864, 1.09828]]
+    np.testing.assert_allclose(found.radiance, linear @ np.transpose(rec709_from_p3), atol=1e-4)

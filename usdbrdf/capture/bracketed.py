@@ -20,13 +20,22 @@ from usdbrdf.capture.brackets import Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
+from usdbrdf.files.colour import encoding_of_tag
 from usdbrdf.files.documents import read_json, write_json
-from usdbrdf.files.frames import transparent_of
-from usdbrdf.files.images import exif_exposure, is_eight_bit, needs_float, read_radiance, write_exr
+from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, transparent_of
+from usdbrdf.files.images import (
+    colour_tag,
+    exif_exposure,
+    is_eight_bit,
+    needs_float,
+    read_radiance,
+    write_exr,
+)
 from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
+_LINEAR = {"srgb_rec709_scene": "lin_rec709_scene", "srgb_p3d65_scene": "lin_p3d65_scene"}
 _PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 # Brackets that the response is told by.
 _TELLING = 12
@@ -55,6 +64,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     else:
         document = read_json(source, nonfinite_below=("transform_matrix",))
     brackets = _brackets(source, document)
+    encoding = _linear_space(source, document, brackets[0].images[0])
     telling = [brackets[i] for i in spread_evenly(len(brackets), _TELLING)]
     response = response_from_brackets(
         [_aligned(bracket).stack for bracket in telling], [bracket.exposures for bracket in telling]
@@ -68,7 +78,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             progress(brackets, total=len(brackets), label="brackets", unit="brackets")
         ):
             name = f"frames/{i:05d}_{bracket.images[0].stem}.exr"
-            made = _merged(bracket, response, staged / name)
+            made = _merged(bracket, response, staged / name, encoding)
             frames.append({**made.entry, "file_path": name})
             clipped.append(made.clipped)
             ghosts.append(made.ghost)
@@ -76,7 +86,8 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             if made.unchecked:
                 unchecked[name] = made.unchecked
         copy_beside(source, document, staged)
-        write_json(staged / "transforms.json", {**document, "frames": frames})
+        rest = {**document, "frames": frames, "encoding": encoding}
+        write_json(staged / "transforms.json", rest)
     photographs = sum(len(bracket.images) for bracket in brackets)
     alone = sum(map(len, unchecked.values()))
     if unchecked:
@@ -134,13 +145,13 @@ class _Made(NamedTuple):
     flicker: list[tuple[str, float]]
 
 
-def _merged(bracket: Bracket, response: Response, place: Path) -> _Made:
+def _merged(bracket: Bracket, response: Response, place: Path, encoding: str) -> _Made:
     """Writes the picture."""
     laid = _aligned(bracket)
     found = merge(laid.stack, bracket.exposures, response, laid.silent)
     # What is clearly negative is unknown to every reader of frames.
     pixels = np.where(np.isnan(found.radiance), -np.float32(found.saturation), found.radiance)
-    write_exr(place, pixels, half=not needs_float(pixels))
+    write_exr(place, pixels, half=not needs_float(pixels), encoding=encoding)
     entry = {k: v for k, v in bracket.entry.items() if k not in ("brackets", "exposure_time")}
     entry.update(saturation_radiance=found.saturation, noise_floor_radiance=found.noise_floor)
     alone = np.flatnonzero(laid.unchecked).tolist()
@@ -188,6 +199,20 @@ def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:
             "capture's own document. [capture.format]"
         )
     return frames
+
+
+def _linear_space(source: Path, document: Any, photograph: Path) -> str:
+    """The space of what is merged, linear in the primaries of the photographs."""
+    stated = document.get("encoding")
+    said = stated or encoding_of_tag(*colour_tag(photograph)) or PHOTOGRAPH_ENCODING
+    found = _LINEAR.get(said, said)
+    if found not in _LINEAR.values():
+        names = ", ".join(_LINEAR)
+        raise InputRefused(
+            f"{source if stated else photograph}: its colour space is {said!r}; brackets are "
+            f"merged from photographs in one of {names}. Convert them. [brackets.encoding]"
+        )
+    return found
 
 
 def _document_of_folder(folder: Path) -> dict[str, Any]:

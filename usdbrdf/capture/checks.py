@@ -240,9 +240,16 @@ def tagged_encoding(
 ) -> str:
     """The colour space that the first image says it has, of which the user is told; ``usual`` where
     it says none of the same kind."""
-    tag: str | None = None
+    name, tag = "", None
     with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        tag = encoding_of_tag(*colour_tag(records[0].image_path)) if records else None
+        name, places = colour_tag(records[0].image_path) if records else ("", ())
+        tag = encoding_of_tag(name, places)
+    if name and tag is None and kind_of_encoding(usual) == "display":
+        findings.warn(
+            f"{source.name}: the images say that their colour space is {name!r}, which is not "
+            f"known; they are read as {usual}. Convert them to sRGB, or state --input-space. "
+            "[capture.encoding]"
+        )
     kinds = [kind_of_encoding(encoding) == "display" for encoding in (tag or usual, usual)]
     if tag is None or tag == usual or kinds[0] != kinds[1]:
         return usual

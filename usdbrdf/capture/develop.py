@@ -22,7 +22,7 @@ import numpy as np
 from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.lens_views import Intrinsics, PinholeView, Size, shows_any, views_of
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import kind_of_encoding
+from usdbrdf.files.colour import kind_of_encoding, linear_space_of
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
 from usdbrdf.files.images import needs_float, white_of_mask, write_exr
 from usdbrdf.job.progress import progress
@@ -124,7 +124,7 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
     """The frames with images below ``folder``; those that are ``views`` of photographs (see
     ``Scan``) are handed to ``place``, one after the other.
 
-    Images keep the encoding of the photographs where that is linear; others become linear.
+    Images keep the encoding of the photographs where that is linear; others become so.
     """
     if not any(views):
         return frames
@@ -135,11 +135,10 @@ def developed(frames: Frames, views: Sequence[View | None], folder: Path, place:
         place(str(frames.image_paths[i]), partial(_write_frame, frames, i, view))
     for kept in (_recorded, _places, mask_at_size):
         kept.cache_clear()
-    stays = kind_of_encoding(frames.encoding) == "linear"
     return replace(
         frames,
         image_paths=tuple(folder / path for path in frames.image_paths),
-        encoding=frames.encoding if stays else "lin_rec709_scene",
+        encoding=linear_space_of(frames.encoding),
         photograph_encoding=frames.encoding,
     )
 
@@ -168,13 +167,12 @@ def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
     saturation = float(frames.saturation_radiance[i])
     source = _recorded(view.photograph, view.mask, frames.encoding, saturation)
     image = resampled(source, view, frames.camera(i), saturation)
-    stays = kind_of_encoding(frames.encoding) == "linear"
     write_exr(
         path,
         image,
         half=not needs_float(image),
         holes=True,
-        encoding=frames.encoding if stays else "lin_rec709_scene",
+        encoding=linear_space_of(frames.encoding),
     )
 
 

@@ -45,6 +45,14 @@ _CHROMATICITIES = {
     "lin_rec709_scene": (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329),
 }
 _SAME_PLACE = 2e-3
+# What ICC profiles of photographs call themselves, in lower case; the short ones are those that
+# services put into pictures to save bytes.
+_PROFILES = {
+    "c2": "srgb_rec709_scene",
+    "c2ci": "srgb_rec709_scene",
+    "display p3": "srgb_p3d65_scene",
+    "sp3c": "srgb_p3d65_scene",
+}
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
@@ -71,6 +79,9 @@ def kind_of_encoding(encoding: str) -> Literal["linear", "log", "display"] | Non
 def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
     """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
     says nothing that is known."""
+    profile = name.lower().strip()
+    if profile in _PROFILES or profile.startswith("srgb iec61966"):
+        return _PROFILES.get(profile, DISPLAY_SPACE)
     if name and kind_of_encoding(name):
         return name
     for encoding, places in _CHROMATICITIES.items():
@@ -88,6 +99,20 @@ def unknown_encoding(encoding: str) -> str:
     near = [of[name] for name in get_close_matches(encoding.lower(), of, n=3, cutoff=0.5)]
     like = f" Alike are {', '.join(map(repr, near))}." if near else ""
     return f"colour space {encoding!r} is not known.{like}"
+
+
+def linear_space_of(encoding: str) -> str:
+    """The scene-linear space in which values of ``encoding`` are judged, and clip: their own if
+    they are linear, and of Display P3, whose colours beyond Rec.709 are negative there; else the
+    working space."""
+    if kind_of_encoding(encoding) == "linear":
+        return encoding
+    return "lin_p3d65_scene" if encoding == "srgb_p3d65_scene" else WORKING_SPACE
+
+
+def to_linear(pixels: Float, encoding: str) -> Float:
+    """A copy of (H, W, 3) float32 pixels in ``linear_space_of`` their encoding."""
+    return _converted(pixels, encoding, linear_space_of(encoding))
 
 
 def to_working_space(pixels: Float, encoding: str) -> Float:

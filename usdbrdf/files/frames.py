@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from usdbrdf.ahead import ahead
-from usdbrdf.files.colour import kind_of_encoding, to_working_space
+from usdbrdf.files.colour import kind_of_encoding, linear_space_of, to_linear, to_working_space
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
@@ -95,8 +95,8 @@ class FramePixels:
 def read_frame(frames: Frames, i: int) -> FramePixels:
     """Read frame ``i``; ImageRefused where the file cannot be read whole.
 
-    Limits hold for the channels as they were recorded, so linear images are judged before their
-    primaries change.
+    Limits hold for the channels as they were recorded, so images are judged before their primaries
+    change.
     """
     saturation = float(frames.saturation_radiance[i])
     gain = 1.0 if frames.gain is None else float(frames.gain[i])
@@ -106,8 +106,7 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
-    linear = kind_of_encoding(encoding) == "linear"
-    radiance = to_working_space(recorded, encoding) if linear else recorded
+    radiance = to_working_space(recorded, linear_space_of(encoding))
     if any(frames.vignetting):
         radiance = radiance / transmission(frames, i)[..., None]
     return FramePixels(
@@ -132,8 +131,7 @@ def transmission(frames: Frames, i: int) -> Float:
 
 
 class Recorded(NamedTuple):
-    """What an image records: as of ``FramePixels``, of a linear image in its own primaries, of
-    others in those of Rec.709."""
+    """What an image records: as of ``FramePixels``, but in ``linear_space_of`` its encoding."""
 
     radiance: Float
     unknown: Bool
@@ -151,12 +149,12 @@ def read_recorded(path: Path, encoding: str, saturation: float, gain: float = 1.
     recorded, transparent = np.ascontiguousarray(stored[..., :3]), transparent_of(stored)
     kind = kind_of_encoding(encoding)
     if kind == "log":
-        recorded = to_working_space(recorded, encoding)
+        recorded = to_linear(recorded, encoding)
     if kind == "display":
         # Radiance is value * reference exposure / exposure time. The adapter wrote that factor into
         # the saturation; unlike a median of exposure times it stays when frames are left out.
         scale = np.float32(saturation / PHOTOGRAPH_SATURATION)
-        recorded = to_working_space(recorded, encoding) * scale
+        recorded = to_linear(recorded, encoding) * scale
     elif gain != 1:
         recorded = recorded / np.float32(gain)
     unknown = _in_any_channel(~np.isfinite(recorded)) | transparent

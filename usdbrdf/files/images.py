@@ -138,10 +138,12 @@ def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
 
 
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
-    """What an image's header says of its colour space: a name, "" without one; and x, y of red,
-    green, blue and white, () without these."""
+    """What an image's header says of its colour space: that of the ICC profile in it, else another
+    name, "" without one; and x, y of red, green, blue and white, () without these."""
     spec = open_image(path).spec()
-    name, places = spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
+    # Of JPEG and PNG OpenImageIO says sRGB, whatever profile is in them.
+    name = spec.getattribute("ICCProfile:profile_description")
+    name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
     sound = isinstance(places, tuple) and len(places) == 8
     return str(name or ""), tuple(float(place) for place in places) if sound else ()
 

@@ -64,7 +64,8 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
     before = ((way.face < 0) | (way.distance > 1)).reshape(-1, count)
     num_before = before.sum(axis=1)
     share = (free & before).sum(axis=1) / np.maximum(num_before, 1)
-    return np.where(num_before > 0, share, free.mean(axis=1)).astype(np.float32)
+    found: Float = np.where(num_before > 0, share, free.mean(axis=1)).astype(np.float32)
+    return found
 
 
 def towards_sun(sun: Sun, drawn: Double) -> Float:
