@@ -27,7 +27,7 @@ from usdbrdf.transport.lit_scene import TexturedScene
 
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
-_FEW_BOUNDS = calibration.count("emitters.min_texels")
+_FEW_BOUNDS = calibration.count("inpaint.min_bounds")
 
 
 @dataclass(frozen=True, kw_only=True)
