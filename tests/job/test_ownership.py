@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from usdbrdf.errors import EnvironmentFailure, FolderBusy, OwnershipConflict
+from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX
 from usdbrdf.job.ownership import edited_files, owned_folder
 
@@ -172,6 +172,29 @@ def test_what_was_not_there_before_a_failure_is_not_there_after_it(tmp_path):
 def test_folders_that_hold_something_else_by_then_stay(tmp_path):
     fail_in(tmp_path / "new/room", (tmp_path / "new/other").mkdir)
     assert names_in(tmp_path) == ["new", "new/other"]
+
+
+@pytest.mark.parametrize(
+    ("failure", "stays"), [(KeyboardInterrupt, True), (InputRefused, False), (KeyError, True)]
+)
+def test_outputs_that_a_first_step_finished_stay_unless_the_input_is_refused(
+    tmp_path, failure, stays
+):
+    asset = tmp_path / "room"
+
+    def work(content):
+        with owned_folder(asset):
+            kept = asset / ".usdbrdf/work/ingest-1/kept"
+            kept.mkdir(parents=True, exist_ok=True)
+            found = (kept / "frame.exr").is_file()
+            (kept / "frame.exr").write_text(content)
+            raise failure(found)
+
+    for again in (False, True):
+        with pytest.raises(failure) as raised:
+            work("finished")
+        assert raised.value.args[0] == (again and stays)
+        assert asset.is_dir() == stays
 
 
 # Two runs that begin in the same new folder

@@ -354,10 +354,16 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
 def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
     try:
         yield
-    except BaseException:
+    except BaseException as error:
         state = asset / STATE_FOLDER
+        # What an interrupted first step has finished is what the same command goes on from.
+        goes_on = not isinstance(error, InputRefused) and any(state.glob("work/*/kept/*"))
         with suppress(OSError):
-            if state in made and [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]:
+            if (
+                not goes_on
+                and state in made
+                and [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]
+            ):
                 for name in ("stamps", "work", "cache"):
                     shutil.rmtree(state / name, ignore_errors=True)
                 _remove_empty(state, made)
