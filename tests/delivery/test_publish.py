@@ -209,11 +209,11 @@ def test_one_at_a_time(room, tmp_path):
     def hold():
         with folder_lock(dest / ".usdbrdf-publish"):
             entered.set()
-            done.wait(60)
+            done.wait(600)
 
     holder = threading.Thread(target=hold)
     holder.start()
-    entered.wait(60)
+    entered.wait(600)
     try:
         with pytest.raises(FolderBusy, match=r"lock\.busy"):
             publish(room.asset.folder, dest)
@@ -236,11 +236,11 @@ def test_nothing_is_made_of_an_asset_in_which_a_run_works(room, tmp_path):
     def work():
         with folder_lock(state):
             entered.set()
-            done.wait(60)
+            done.wait(600)
 
     run = threading.Thread(target=work)
     run.start()
-    entered.wait(60)
+    entered.wait(600)
     try:
         for name, make in makers.items():
             with pytest.raises(FolderBusy) as busy[name]:

@@ -103,7 +103,7 @@ def in_thread(function) -> list[BaseException]:
 
     thread = threading.Thread(target=caught)
     thread.start()
-    thread.join(60)
+    thread.join(600)
     return raised
 
 

@@ -20,7 +20,7 @@ from usdbrdf.capture.brackets import Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
-from usdbrdf.files.colour import encoding_of_tag
+from usdbrdf.files.colour import encoding_of_tag, linear_space_of
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, transparent_of
 from usdbrdf.files.images import (
@@ -35,7 +35,7 @@ from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
-_LINEAR = {"srgb_rec709_scene": "lin_rec709_scene", "srgb_p3d65_scene": "lin_p3d65_scene"}
+_SPACES = ("srgb_rec709_scene", "srgb_p3d65_scene")
 _PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 # Brackets that the response is told by.
 _TELLING = 12
@@ -205,14 +205,13 @@ def _linear_space(source: Path, document: Any, photograph: Path) -> str:
     """The space of what is merged, linear in the primaries of the photographs."""
     stated = document.get("encoding")
     said = stated or encoding_of_tag(*colour_tag(photograph)) or PHOTOGRAPH_ENCODING
-    found = _LINEAR.get(said, said)
-    if found not in _LINEAR.values():
-        names = ", ".join(_LINEAR)
+    if said not in (*_SPACES, *map(linear_space_of, _SPACES)):
+        names = ", ".join(_SPACES)
         raise InputRefused(
             f"{source if stated else photograph}: its colour space is {said!r}; brackets are "
             f"merged from photographs in one of {names}. Convert them. [brackets.encoding]"
         )
-    return found
+    return linear_space_of(said)
 
 
 def _document_of_folder(folder: Path) -> dict[str, Any]:

@@ -11,7 +11,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from usdbrdf.ahead import ahead
-from usdbrdf.files.colour import kind_of_encoding, linear_space_of, to_linear, to_working_space
+from usdbrdf.files.colour import (
+    WORKING_SPACE,
+    kind_of_encoding,
+    linear_space_of,
+    to_linear,
+    to_working_space,
+)
 from usdbrdf.files.images import read_radiance, resized
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
@@ -106,7 +112,8 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     # Comparisons with NaN are False: unknown pixels are neither clipped nor dark.
     clipped = _in_any_channel(recorded >= CLIPPED_SHARE * saturation)
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
-    radiance = to_working_space(recorded, linear_space_of(encoding))
+    space = linear_space_of(encoding)
+    radiance = recorded if space == WORKING_SPACE else to_working_space(recorded, space)
     if any(frames.vignetting):
         radiance = radiance / transmission(frames, i)[..., None]
     return FramePixels(

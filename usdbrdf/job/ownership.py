@@ -356,14 +356,11 @@ def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
         yield
     except BaseException as error:
         state = asset / STATE_FOLDER
-        # What an interrupted first step has finished is what the same command goes on from.
-        goes_on = not isinstance(error, InputRefused) and any(state.glob("work/*/kept/*"))
         with suppress(OSError):
-            if (
-                not goes_on
-                and state in made
-                and [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]
-            ):
+            unused = [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]
+            # What an interrupted first step has finished is what the same command goes on from.
+            unused &= isinstance(error, InputRefused) or not any(state.glob("work/*/kept/*"))
+            if unused and state in made:
                 for name in ("stamps", "work", "cache"):
                     shutil.rmtree(state / name, ignore_errors=True)
                 _remove_empty(state, made)

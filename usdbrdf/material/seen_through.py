@@ -101,11 +101,11 @@ def _least_squares(
     of_lobe, of_far = (float(model.product(one, one)[0]) for one in (lobe, far))
     both = float(model.product(lobe, far)[0])
     lobe_left, far_left = (float(model.product(one, left)[0]) for one in (lobe, far))
+    per_lobe = 1 / of_lobe if of_lobe > 0 else 0.0
+    through, alone = NOTHING, of_far - both**2 * per_lobe
     # Where what is behind looks alike from everywhere, or as the lobe does, nothing tells.
-    alone = of_far - both**2 / of_lobe if of_lobe > 0 else of_far
-    if not alone > 1e-9 * of_far:
-        return float(np.clip(lobe_left / max(of_lobe, 1e-30), 0, 1)), NOTHING
-    share = (far_left - both * lobe_left / of_lobe if of_lobe > 0 else far_left) / alone
-    share = min(max(share, 0.0), 1.0)
-    psi = (lobe_left - share * both) / of_lobe if of_lobe > 0 else 0.0
-    return min(max(psi, 0.0), 1.0), Through(share, 1 / math.sqrt(alone))
+    if alone > 1e-9 * of_far:
+        share = (far_left - both * lobe_left * per_lobe) / alone
+        through = Through(min(max(share, 0.0), 1.0), 1 / math.sqrt(alone))
+    psi = (lobe_left - through.share * both) * per_lobe
+    return min(max(psi, 0.0), 1.0), through

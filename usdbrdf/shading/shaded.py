@@ -65,8 +65,8 @@ def find_emitters(
 
     seen (T,): the texel's radiance was observed; clipped (T,): only as a lower bound.
     unknown_lamp: the radiance, a lower bound, of a lamp that is in S with no more than that, as
-    ``ClippedLight.least_of_lamps``. S is
-    then too dark, so that dimmer measured surfaces exceed it without shining. 0 if there is none.
+    ``ClippedLight.least_of_lamps``. S is then too dark, so that dimmer measured surfaces exceed it
+    without shining. 0 if there is none.
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
     said: of objects whether they shine as a whole or not at all, whatever they show
@@ -86,7 +86,7 @@ def find_emitters(
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
         # A few texels, of much that nobody saw, show a neighbour's light as well as one's own.
-        enough = min(_MIN_PATCH, len(area) / 2)
+        enough = min(_MIN_PATCH, len(area) / 4)
         is_lamp[i] = (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
         is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= enough
         is_lamp[i] = said.get(i, is_lamp[i])

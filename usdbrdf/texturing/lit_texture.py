@@ -171,7 +171,7 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
     owner, count = texels.object_index(), len(texels.resolution)
     has_measured = np.bincount(owner, measured, count) > 0
     # A few such texels, of much that nobody saw, are as often a neighbour's pixels.
-    enough = np.minimum(_FEW_BOUNDS, np.bincount(owner, minlength=count) / 2)
+    enough = np.minimum(_FEW_BOUNDS, np.bincount(owner, minlength=count) / 4)
     has_bounds = np.bincount(owner, clipped, count) >= enough
     bounded = clipped & (~has_measured & has_bounds)[owner]
     least = found.lower_bound[:, None]
