@@ -165,7 +165,8 @@ def _errors(g: Double, codes: list[Byte], logs: list[Double]) -> Double:
     deviation; never less than that of rounding to codes."""
     least = np.hypot(_SPREAD, np.gradient(g) / np.sqrt(12))
     error = least
-    for _ in range(_ROUNDS):
+    # Where two ranges of codes disagree, each in turn would be to blame; half of the way, both are.
+    for _ in range(2 * _ROUNDS):
         sizes: list[Double] = []
         numbers: list[Int] = []
         for z, log in zip(codes, logs, strict=True):
@@ -181,7 +182,7 @@ def _errors(g: Double, codes: list[Byte], logs: list[Double]) -> Double:
         known = np.array([c for c in range(256) if len(own[c])] or [_MIDDLE])
         found = [float(np.median(own[c])) if len(own[c]) else 0.0 for c in known]
         each = np.interp(np.arange(256), known, 1.4826 * np.array(found))
-        error = np.maximum(median_filter(each, _AROUND, mode="nearest"), least)
+        error = np.sqrt(error * np.maximum(median_filter(each, _AROUND, mode="nearest"), least))
     return np.asarray(error, np.float64)
 
 

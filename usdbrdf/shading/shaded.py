@@ -25,6 +25,7 @@ from usdbrdf.shading.base_color import albedo_map
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
+from usdbrdf.texturing.inpaint import telling
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
@@ -85,10 +86,8 @@ def find_emitters(
     for i in range(num_objects):
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
-        # A few texels, of much that nobody saw, show a neighbour's light as well as one's own.
-        enough = min(_MIN_PATCH, len(area) / 4)
         is_lamp[i] = (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
-        is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= enough
+        is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= telling(len(area))
         is_lamp[i] = said.get(i, is_lamp[i])
         if is_lamp[i]:
             emissive[own] = True

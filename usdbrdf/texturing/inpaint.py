@@ -8,14 +8,17 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from usdbrdf import calibration
-from usdbrdf.model.arrays import Bool, Float, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.texels import Texels
 
 _NEIGHBOURS = 8
 _NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
+_TELLING = calibration.count("inpaint.telling")
+_TELLING_SHARE = calibration.number("inpaint.telling_share")
 # Zero has no logarithm: it counts as this share of the median of all known positive values.
 _ZERO = 1e-6
 # How much further off than the nearest a texel may lie that is taken for it, which halves the time.
@@ -27,6 +30,12 @@ _COARSER, _FEWEST, _SEED = 4, 32, 0
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
 # is never far.
 _MOST_SOURCES = 1 << 18
+
+
+def telling(num_texels: npt.ArrayLike) -> Double:
+    """How many of an object's texels must tell something of it, by their number in all: a few, of
+    much that nobody saw, are as often a neighbour's pixels."""
+    return np.minimum(_TELLING, _TELLING_SHARE * np.asarray(num_texels))
 
 
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress, say
@@ -20,14 +19,13 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.exposures import Probes, contradicting_frames, probed_texels
-from usdbrdf.texturing.inpaint import inpaint_alike
+from usdbrdf.texturing.inpaint import inpaint_alike, telling
 from usdbrdf.texturing.observe import Measured, Observation, samples_from_frames
 from usdbrdf.texturing.passes import among_workers, groups_of_texels, in_passes, shares_of
 from usdbrdf.transport.lit_scene import TexturedScene
 
 # A larger share of unmeasured texels is worth a warning.
 _MOSTLY = 0.9
-_FEW_BOUNDS = calibration.count("inpaint.min_bounds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,9 +168,7 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
         )
     owner, count = texels.object_index(), len(texels.resolution)
     has_measured = np.bincount(owner, measured, count) > 0
-    # A few such texels, of much that nobody saw, are as often a neighbour's pixels.
-    enough = np.minimum(_FEW_BOUNDS, np.bincount(owner, minlength=count) / 4)
-    has_bounds = np.bincount(owner, clipped, count) >= enough
+    has_bounds = np.bincount(owner, clipped, count) >= telling(np.bincount(owner, minlength=count))
     bounded = clipped & (~has_measured & has_bounds)[owner]
     least = found.lower_bound[:, None]
     lit, mean = inpaint_alike(
