@@ -13,12 +13,14 @@ from functools import cache, partial, reduce
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from usdbrdf import calibration
 from usdbrdf.material.conductor import Conductor, conductor_of
 from usdbrdf.material.fit_lobe import (
     Candidate,
     FittedKind,
+    Pair,
     first_seed,
     fit_lobe,
     repeated_where_noisy,
@@ -32,12 +34,12 @@ from usdbrdf.material.verdict import (
     LobeEstimate,
     verdict_on_views,
 )
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import LEAST_DIFFUSE, ViewModel, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
-from usdbrdf.transport.brdf import CONDUCTOR, PAPER, is_dielectric
-from usdbrdf.transport.let_through import kept_below
+from usdbrdf.transport.brdf import CONDUCTOR, F0_OF_PSI, PAPER, is_dielectric
+from usdbrdf.transport.let_through import USUAL_F0, kept_below
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, sub_pixel_points
 from usdbrdf.transport.lobe_radiance import Basis, Mixture, lobe_basis
 
@@ -53,6 +55,8 @@ ABOVE_NOISE = calibration.number("fit.above_noise")
 MIXTURE = Mixture(per_lobe=4, lights=8, cosine=8)
 _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
+# Of a refractive index of 1.5.
+_USUAL_PSI = USUAL_F0 / F0_OF_PSI
 _UPPER = 1.645  # standard deviations that are exceeded with a probability of 5 %
 _SEED_OF_DOUBT, _SEED_OF_THROUGH = 0xD0B7, 0x71E0
 
@@ -98,16 +102,16 @@ class SampledObject(NamedTuple):
             for part, stream in self._parts_with_texels()
         ]
 
-        seen = cache(lambda: (self._mean_of_texel[..., None], self._cosine(width)))
+        cosine = cache(lambda: self._cosine(width))
 
         def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
             bases, slopes = zip(*(one(kind, phis) for one in of_parts), strict=True)
             base, slope = np.concatenate(bases), np.concatenate(slopes)
             if not is_dielectric(kind):
                 return base, slope
-            mean, cosine = seen()
-            taken = mean * np.stack(kept_below(phis, cosine))[:, :, None]
-            return base - taken[0], slope - taken[1]
+            diffuse = self._diffuse(base + np.float32(_USUAL_PSI) * slope)
+            of_base, of_slope = (kept[:, None] for kept in kept_below(phis, cosine()))
+            return base - diffuse * of_base, slope - diffuse * of_slope
 
         return basis
 
@@ -120,19 +124,20 @@ class SampledObject(NamedTuple):
         ]
         return np.concatenate(found)
 
-    def slope(self, kind: int, phi: float, seed: int, *, of_doubt: bool = False) -> Float:
-        """(P, 3, 1) of I_nd = base + psi slope, of the usual footprint; of_doubt: of what the light
-        may be off by alone."""
+    def lobe(self, kind: int, phi: float, seed: int, *, of_doubt: bool = False) -> Pair:
+        """(base, slope) of I_nd = base + psi slope, (P, 3, 1) each, of the usual footprint and what
+        the surface reflects alone; of_doubt: of what the light may be off by."""
         found = []
         for part, stream in self._parts_with_texels():
             lit = part.doubt if of_doubt else part.lit
             if lit is None:
-                found.append(np.zeros((len(stream), 3, 1), np.float32))
+                nothing = np.zeros((len(stream), 3, 1), np.float32)
+                found.append((nothing, nothing))
                 continue
             points, mixture = part.footprints[0], self.mixture
-            basis = lobe_basis(lit, points, len(stream), seed, mixture, stream)
-            found.append(basis(kind, [phi])[1])
-        return np.concatenate(found)
+            found.append(lobe_basis(lit, points, len(stream), seed, mixture, stream)(kind, [phi]))
+        base, slope = map(np.concatenate, zip(*found, strict=True))
+        return base, slope
 
     def _parts_with_texels(self) -> Iterator[tuple[SampledPart, Long]]:
         """Each part with what ``samples`` call the texels of its own samples."""
@@ -148,13 +153,20 @@ class SampledObject(NamedTuple):
             found.append(cosine.reshape(len(part.observed.texel), -1).mean(axis=1))
         return np.concatenate(found)
 
-    @property
-    def _mean_of_texel(self) -> Float:
-        """(P, 3) W/(m^2 sr): about its diffuse radiance, what the lobe adds being much less."""
-        texel, radiance = self.samples.texel, self.samples.radiance
-        sums = np.stack([np.bincount(texel, channel) for channel in radiance.T], axis=1)
-        means: Float = (sums / np.bincount(texel)[:, None])[texel].astype(np.float32)
-        return means
+    def _diffuse(self, lobe: Float) -> Float:
+        """(P, 3, K) W/(m^2 sr): about the diffuse radiance of each sample's texel, what it shows on
+        the mean without the ``lobe``, (P, 3, K) too."""
+        texel = self.samples.texel
+        views = sparse.csr_matrix((np.ones(len(texel), np.float32), (texel, np.arange(len(texel)))))
+        number = np.bincount(texel).astype(np.float32)[:, None]
+
+        def of_texel(values: Float) -> Float:
+            means: Float = (views @ values.reshape(len(values), -1) / number)[texel]
+            return means.reshape(values.shape)
+
+        seen = of_texel(self.samples.radiance)[..., None]
+        diffuse: Float = np.maximum(seen - of_texel(lobe), np.float32(LEAST_DIFFUSE) * seen)
+        return diffuse
 
     @property
     def irradiance(self) -> Float | None:
@@ -309,14 +321,16 @@ def with_doubts_of_light(
     are taken to be off the same way. Where psi is badly known anyway nothing is traced."""
     if found.evidence < SOME_EVIDENCE or (found.psi_error > MAX_PSI_ERROR and metal is None):
         return found, metal
-    kind, phi = (lobe, found.phi) if metal is None else (CONDUCTOR, metal.phi)
-    off = share_in_doubt(sampled(), kind, phi, seed)
-    psi_error = min(math.hypot(found.psi_error, found.psi * off), float(NOTHING_KNOWN))
-    above = math.hypot(found.psi_upper - found.psi, _UPPER * found.psi * off)
-    upper = min(max(found.psi_upper, found.psi + above), 1.0)
+    kind, phi, psi = lobe, found.phi, found.psi
     if metal is not None:
-        f0_error = math.hypot(metal.f0_error, off * max(metal.f0))
-        metal = metal._replace(f0_error=f0_error)
+        kind, phi, psi = CONDUCTOR, metal.phi, max(metal.f0) / F0_OF_PSI
+    off = error_by_doubt(sampled(), kind, phi, psi, seed)
+    if metal is not None:
+        metal = metal._replace(f0_error=math.hypot(metal.f0_error, F0_OF_PSI * off))
+        off *= found.psi / psi
+    psi_error = min(math.hypot(found.psi_error, off), float(NOTHING_KNOWN))
+    above = math.hypot(found.psi_upper - found.psi, _UPPER * off)
+    upper = min(max(found.psi_upper, found.psi + above), 1.0)
     return found._replace(psi_error=psi_error, psi_upper=upper), metal
 
 
@@ -333,18 +347,20 @@ def with_what_shows_through(
     return found._replace(contradiction=max(found.contradiction, through.at_least))
 
 
-def share_in_doubt(sampled: SampledObject, kind: int, phi: float, seed: int) -> float:
-    """By which share psi would be off if all light were by its standard error: that of the lobe's
-    slope which mirrors this, as the samples tell psi; from 0 to 1."""
+def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:
+    """By how much psi would be off if all light were by its standard error: what a lobe would then
+    mirror more, or less, as the samples tell psi; at most psi itself, that of a lobe of which all
+    mirrors light that is not there, where its base mirrors nothing."""
     model = ViewModel(sampled.samples)
     first = 3 * (_SEED_OF_DOUBT + seed)
-    slopes = [sampled.slope(kind, phi, first + n) for n in range(2)]
-    slopes.append(sampled.slope(kind, phi, first + 2, of_doubt=True))
-    one, other, doubt = model.reduced(np.concatenate(slopes, axis=2)).parts(3)
+    lobes = [sampled.lobe(kind, phi, first + n)[1] for n in range(2)]
+    base, slope = sampled.lobe(kind, phi, first + 2, of_doubt=True)
+    values = np.concatenate([*lobes, base + np.float32(psi) * slope], axis=2)
+    one, other, doubt = model.reduced(values).parts(3)
     # Products of independent noises are none on the mean.
     whole = float(model.product(one, other)[0])
     part = (float(model.product(one, doubt)[0]) + float(model.product(other, doubt)[0])) / 2
-    return min(max(part / whole, 0.0), 1.0) if whole > 0 else 1.0
+    return max(part / whole, 0.0) if whole > 0 else psi
 
 
 def _footprints(

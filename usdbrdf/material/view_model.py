@@ -172,7 +172,7 @@ _FIRST_GUESS, _LEAST = 0.02, 1e-4
 # With more shared errors than this, cells are made larger, up to the object.
 _MOST_EFFECTS = 2500
 _TAIL = calibration.number("errors.student_freedom")
-_LEAST_LEVEL = calibration.number("errors.least_diffuse")
+LEAST_DIFFUSE = calibration.number("errors.least_diffuse")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +216,7 @@ class ViewModel:
         self._noise = samples.noise.astype(np.float64)
         views = np.bincount(samples.texel)
         mean = np.stack([np.bincount(samples.texel, c) / views for c in self._radiance.T], axis=-1)
-        mean = np.maximum(mean, _LEAST_LEVEL * mean.mean(axis=1, keepdims=True))[samples.texel]
+        mean = np.maximum(mean, LEAST_DIFFUSE * mean.mean(axis=1, keepdims=True))[samples.texel]
         self._mean, self._level = mean, mean
         self._specular = np.zeros_like(mean)
         # Of all samples, what is left for errors after each texel took its mean.
@@ -281,7 +281,7 @@ class ViewModel:
         self._robust_weight = (_TAIL + 3) / (_TAIL + distance)
         self._specular = np.maximum(non_diffuse, 0).astype(np.float64)
         diffuse = self._texel_means(self._weight @ rest[..., None])[self._texel, :, 0]
-        self._level = np.maximum(diffuse, _LEAST_LEVEL * self._mean)
+        self._level = np.maximum(diffuse, LEAST_DIFFUSE * self._mean)
         self._factorise()
 
     def _texel_means(self, weighted: Double) -> Double:

@@ -32,7 +32,7 @@ _PHIS, _COSINES = 17, 33
 _VIEWS = 8
 _LEAST_COSINE = 1e-3
 # Of a refractive index of 1.5.
-_USUAL_F0 = 0.04
+USUAL_F0 = 0.04
 
 
 class FacetShares(NamedTuple):
@@ -81,7 +81,7 @@ def kept_below(phis: Sequence[float], cosine: Float) -> tuple[Float, Float]:
         found = [np.interp(place, range(_COSINES), curve) for curve in of_phi]
         return np.asarray(np.stack(found, axis=1) / let_through, np.float32)
 
-    usual = 1 - (table.base_mean + _USUAL_F0 * table.rise_mean)[:, 0]
+    usual = 1 - (table.base_mean + USUAL_F0 * table.rise_mean)[:, 0]
     let_through = np.interp(rows, range(_PHIS), usual)
 
     base, rise = (
