@@ -438,7 +438,7 @@ class FittedObject(MeasuredObject):
         return [
             f"{self.identifier}: {self.contradiction:.0%} of its light changes between views as no "
             "surface's does, or is that of what lies behind it, so its lobe is not measured. If it "
-            "is glass, say so by a directive. [fit.contradicted]"
+            "is glass, or a metal, say so by a directive. [fit.contradicted]"
         ]
 
     @property
