@@ -276,6 +276,38 @@ def test_outputs_that_take_long_are_made_once(tmp_path):
     assert list((asset / ".usdbrdf/work").iterdir()) == []
 
 
+@pytest.mark.fault("R2")
+@pytest.mark.parametrize("stop", ["write_stamp", "move", "flush_folder"])
+def test_outputs_that_took_long_are_not_made_again_after_a_stop_at_publishing(
+    tmp_path, monkeypatch, stop
+):
+    """Before the journal is written, and before the first output is moved, or after all are."""
+    asset, made = tmp_path / "room", []
+    (asset / ".usdbrdf").mkdir(parents=True)
+
+    def work(run):
+        for name in ("a", "b/c"):
+            run.output_kept(
+                f"frames/{name}.exr", lambda place, name=name: made.append(place.write_text(name))
+            )
+        run.output("layers/a.usda").write_text("x")
+        return {}
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    task = {"order": 20, "parameters": {}, "inputs": {}, "work": work}
+    monkeypatch.setattr(task_module, stop, stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_task(asset, "toy", **task)
+    monkeypatch.undo()
+    assert run_task(asset, "toy", **task).reran
+    assert len(made) == 2
+    assert (asset / "frames/b/c.exr").read_text() == "b/c"
+    assert (asset / "layers/a.usda").read_text() == "x"
+    assert list((asset / ".usdbrdf/work").iterdir()) == []
+
+
 def _threads_of_blas() -> set[int]:
     return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 

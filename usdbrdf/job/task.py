@@ -125,28 +125,30 @@ class TaskRun:
         """The same, written by ``write``, unless an interrupted run of the task got so far: for
         outputs each of which takes long."""
         relative = check_relative(relative)
-        stem = quote(relative, safe="")
-        for path in self._kept.glob(f"{glob_escape(stem)}.*"):
-            if sha256_of(path) == path.name.removeprefix(f"{stem}."):
+        stem = _stem_of_kept(relative)
+        for path in self._kept.glob(f"{glob_escape(stem)}*"):
+            if sha256_of(path) == path.name.removeprefix(stem):
                 self.kept[relative] = path
         if relative not in self.kept:
             with temporary_beside(self._kept / Path(relative).name) as staged:
                 write(staged)
-                self.kept[relative] = self._kept / f"{stem}.{sha256_of(staged)}"
+                self.kept[relative] = self._kept / f"{stem}{sha256_of(staged)}"
                 publish(staged, self.kept[relative])
         if relative not in self.outputs:
             self.outputs.append(relative)
 
-    def gather(self) -> None:
-        """Bring the kept outputs to the others, when all is done."""
-        for relative, path in self.kept.items():
-            place = self.staged / relative
-            place.parent.mkdir(parents=True, exist_ok=True)
-            move(path, place)
-
     def output_once(self, relative: str) -> Path:
         """The same for a file that is the artist's once it exists: it is never replaced."""
         return self._place(relative, self.once)
+
+    def hashes(self) -> dict[str, str]:
+        """The SHA-256 of every output; UsdBrdfError where one was not written."""
+        places = {relative: self.staged / relative for relative in (*self.outputs, *self.once)}
+        places |= self.kept
+        for relative, place in places.items():
+            if not place.is_file():
+                raise UsdBrdfError(f"the task {self.name} did not write {relative}. [task.output]")
+        return {relative: sha256_of(places[relative]) for relative in self.outputs}
 
     def _place(self, relative: str, register: list[str]) -> Path:
         relative = check_relative(relative)
@@ -292,7 +294,7 @@ def run_task(
             shutil.rmtree(folder, ignore_errors=True)
             done = read_stamp(stamp)
             return TaskResult(summary=done.summary if done else {}, reran=False, reason="done")
-        if noted and interrupted and _can_publish(asset, folder / "staged", noted):
+        if noted and interrupted and _can_publish(asset, folder, noted):
             _publish(asset, folder, noted, order)
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
         run = TaskRun(asset, name, folder, workers)
@@ -301,11 +303,7 @@ def run_task(
         with threadpool_limits(limits=1, user_api="blas"):
             summary = json.loads(json_text(work(run)))
         workers.forget(folder / _FOR_WORKERS)
-        run.gather()
-        for relative in (*run.outputs, *run.once):
-            if not (run.staged / relative).is_file():
-                raise UsdBrdfError(f"the task {name} did not write {relative}. [task.output]")
-        outputs = {relative: sha256_of(run.staged / relative) for relative in run.outputs}
+        outputs = run.hashes()
         # The hashes of this task's files as they may lie there now, and of what is about to be
         # replaced, such as an empty layer that another task put there.
         earlier = hashes_in([read_stamp(stamp), noted])
@@ -328,7 +326,22 @@ def run_task(
         return TaskResult(summary=summary, reran=True, reason=reason)
 
 
-def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
+def _stem_of_kept(relative: str) -> str:
+    """How the name of a kept output begins; its SHA-256 follows."""
+    return f"{quote(relative, safe='')}."
+
+
+def _waiting(folder: Path, journal: Stamp, relative: str) -> Path:
+    """Where an output is from its writing until it is moved into the asset. Nothing moves before
+    the journal is there: a run that is killed then still finds what was kept."""
+    if relative in journal.outputs:
+        kept = folder / "kept" / f"{_stem_of_kept(relative)}{journal.outputs[relative]}"
+        if kept.is_file():
+            return kept
+    return folder / "staged" / relative
+
+
+def _can_publish(asset: Path, folder: Path, journal: Stamp) -> bool:
     """Whether every output of an interrupted publish is in the asset or still waits, intact. What
     waits and is not goes: the asset may have the same from an earlier run."""
 
@@ -336,12 +349,14 @@ def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
         return file.is_file() and sha256_of(file) == sha256
 
     for relative, sha256 in journal.outputs.items():
-        if not intact(staged / relative, sha256):
-            (staged / relative).unlink(missing_ok=True)
+        waiting = _waiting(folder, journal, relative)
+        if not intact(waiting, sha256):
+            waiting.unlink(missing_ok=True)
             if not intact(asset / relative, sha256):
                 return False
     return all(
-        (asset / relative).is_file() or (staged / relative).is_file() for relative in journal.once
+        (asset / relative).is_file() or _waiting(folder, journal, relative).is_file()
+        for relative in journal.once
     )
 
 
@@ -351,11 +366,11 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
 
     def moved(relative: str) -> Path:
         """The folder of an output that has been moved there, or had been already."""
-        staged, final = folder / "staged" / relative, asset / relative
+        waiting, final = _waiting(folder, journal, relative), asset / relative
         inside(asset, final.parent)
-        if staged.is_file():
+        if waiting.is_file():
             final.parent.mkdir(parents=True, exist_ok=True)
-            move(staged, final)
+            move(waiting, final)
         return final.parent
 
     def rank(relative: str) -> int:
