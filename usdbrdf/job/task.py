@@ -288,11 +288,12 @@ def run_task(
                 workers.forget(path / _FOR_WORKERS)
                 shutil.rmtree(path, ignore_errors=True)
         if reason is None:
-            if interrupted:
-                journal.unlink()
+            done = read_stamp(stamp)
+            if noted and done and not interrupted:
+                _undo(asset, noted, done)
+            journal.unlink(missing_ok=True)
             workers.forget(folder / _FOR_WORKERS)
             shutil.rmtree(folder, ignore_errors=True)
-            done = read_stamp(stamp)
             return TaskResult(summary=done.summary if done else {}, reran=False, reason="done")
         if noted and interrupted and _can_publish(asset, folder, noted):
             _publish(asset, folder, noted, order)
@@ -392,6 +393,14 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     noted.unlink()
     flush_folder(noted.parent)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def _undo(asset: Path, journal: Stamp, done: Stamp) -> None:
+    """Delete what a publish for other parameters put beside the outputs of the finished task before
+    it was stopped; of those it had replaced none, or the task would not count as finished."""
+    moved = {relative: [sha256] for relative, sha256 in journal.outputs.items()}
+    for changed in _retire(asset, replace(done, earlier=moved)):
+        flush_folder(changed)
 
 
 def _retire(asset: Path, journal: Stamp) -> set[Path]:
