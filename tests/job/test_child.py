@@ -71,6 +71,10 @@ def litter(arrays, parameters):
 def hungry(arrays, parameters):
     return {"x": np.ones(1 << 32)}
 
+def threads(arrays, parameters):
+    from threadpoolctl import threadpool_info
+    return {"threads": np.array([pool["num_threads"] for pool in threadpool_info()])}
+
 def objects(arrays, parameters):
     return {"x": np.array([object()])}
 """
@@ -259,6 +263,12 @@ def test_a_memory_limit_above_that_of_the_shell_is_no_fault(child):
         assert child("double", {"x": np.ones(2)}, memory_limit_bytes=1 << 40, factor=2)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def test_blas_keeps_to_one_thread_in_a_child(child, monkeypatch):
+    """Each takes addresses, of which there may be few on machines with many cores."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    assert child("threads", memory_limit_bytes=3 << 30)["threads"].tolist() == [1]
 
 
 def test_a_child_imports_nothing_but_what_its_function_needs():

@@ -33,6 +33,8 @@ from usdbrdf.model.arrays import Array
 
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
+# BLAS's threads would only wait for each other, and each takes addresses, which may be limited.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -107,7 +109,7 @@ def _started(folder: Path, label: str) -> Iterator[subprocess.Popen[bytes]]:
             [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
             # What a crash leaves in the folder of temporary files goes with ours.
-            env={**os.environ, "PYTHONPATH": search, "TMPDIR": str(folder)},
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": search, "TMPDIR": str(folder)},
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=said,
