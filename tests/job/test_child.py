@@ -50,6 +50,10 @@ def note(arrays, parameters):
         file.write(str(os.getpid()))
     time.sleep(600)
 
+def spin(arrays, parameters):
+    while True:
+        pass
+
 def leave(arrays, parameters):
     print("no memory for a thread", file=sys.stderr, flush=True)
     os._exit(1)
@@ -156,6 +160,12 @@ def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):
         child("hang", timeout_s=0.2, note=str(note))
     assert late.value.exit_code == 4
     assert all(_ended(int(pid)) for pid in note.read_text().split())
+
+
+def test_computing_without_end_is_told_from_waiting(child):
+    crashed = pytest.raises(CrashedChild, match=r"for longer than it may.+\[child\.endless\]$")
+    with crashed, module.child("toy_children:spin", {}, {}, 600, "spinning", cpu_limit_s=2) as end:
+        end()
 
 
 def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
