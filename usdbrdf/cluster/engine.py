@@ -22,9 +22,10 @@ from usdbrdf.cluster.described import described
 from usdbrdf.cluster.object_store import address_for, files_at
 from usdbrdf.cluster.options import is_url
 from usdbrdf.cluster.store import Files, Store, Wanted
-from usdbrdf.cluster.unit import Stranger, Unread, arithmetic, done
+from usdbrdf.cluster.unit import Stranger, Unread, done
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.images import read_radiance
+from usdbrdf.job.arithmetic import arithmetic
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import Unit
 from usdbrdf.model.arrays import Array

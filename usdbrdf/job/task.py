@@ -1,10 +1,11 @@
 """Run a task so that it can be killed at any moment and started again by the same command.
 
 Work happens in ``.usdbrdf/work/<task>-<fingerprint>``: checkpoints of finished pieces, each a file
-that carries its own hash in its name, and the outputs under their final names. Only complete,
-verified outputs are published; a journal written before the first replacement lets the next run
-finish a publish that was interrupted half-way. The stamp comes last. Hold ``folder_lock`` around
-it: nothing here expects company.
+that carries its own hash in its name, and the outputs under their final names. Each kind of machine
+has pieces of its own there: those of two differ in their last bits, and no run is to give a mixture
+(see ``job.arithmetic``). Only complete, verified outputs are published; a journal written before
+the first replacement lets the next run, wherever that is, finish a publish that was interrupted
+half-way. The stamp comes last. Hold ``folder_lock`` around it: nothing here expects company.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.files.paths import inside
+from usdbrdf.job.arithmetic import name_of_arithmetic
 from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stamp import (
@@ -93,9 +95,10 @@ class TaskRun:
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
         self.kept: dict[str, Path] = {}
-        self._kept = folder / "kept"
-        self._kept.mkdir(exist_ok=True)
-        self._checkpoints = folder / "checkpoints"
+        own = _own(folder)
+        self._kept = own / "kept"
+        self._kept.mkdir(parents=True, exist_ok=True)
+        self._checkpoints = own / "checkpoints"
         self._checkpoints.mkdir(exist_ok=True)
         self._files: dict[tuple[str, int | None], Path] = {}
         # When a running computation's state was saved last, and how long that took: the first is
@@ -276,7 +279,8 @@ def run_task(
     folder = work_folder / f"{name}-{wanted.fingerprint}"
     stamp, journal = stamp_path(asset, order, name), journal_path(asset, name)
     with environment_failures(name):
-        for place in (stamp.parent, *(folder / name for name in ("staged", "checkpoints", "kept"))):
+        places = folder / "staged", *(_own(folder) / part for part in ("checkpoints", "kept"))
+        for place in (stamp.parent, *places):
             inside(asset, place)
         for place in (stamp.parent, work_folder):
             place.mkdir(parents=True, exist_ok=True)
@@ -327,6 +331,11 @@ def run_task(
         return TaskResult(summary=summary, reran=True, reason=reason)
 
 
+def _own(folder: Path) -> Path:
+    """Of a task's folder, what is of this kind of machine."""
+    return folder / name_of_arithmetic()
+
+
 def _stem_of_kept(relative: str) -> str:
     """How the name of a kept output begins; its SHA-256 follows."""
     return f"{quote(relative, safe='')}."
@@ -335,11 +344,8 @@ def _stem_of_kept(relative: str) -> str:
 def _waiting(folder: Path, journal: Stamp, relative: str) -> Path:
     """Where an output is from its writing until it is moved into the asset. Nothing moves before
     the journal is there: a run that is killed then still finds what was kept."""
-    if relative in journal.outputs:
-        kept = folder / "kept" / f"{_stem_of_kept(relative)}{journal.outputs[relative]}"
-        if kept.is_file():
-            return kept
-    return folder / "staged" / relative
+    name = f"{_stem_of_kept(relative)}{journal.outputs.get(relative)}"
+    return next(folder.glob(f"*/kept/{name}"), folder / "staged" / relative)
 
 
 def _can_publish(asset: Path, folder: Path, journal: Stamp) -> bool:
