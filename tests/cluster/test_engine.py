@@ -103,6 +103,53 @@ def test_a_worker_that_gives_back_in_time_is_left_alone_though_units_wait(
     assert "[cluster.hangs]" not in capfd.readouterr().err
 
 
+def test_a_unit_that_waits_for_the_work_of_others_is_not_late(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import Client
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        return {"found": np.array([piece])}
+
+    client.retire_workers([next(iter(client.nthreads()))])
+    with (
+        Client(client.scheduler.address) as other,
+        workers_of(ClusterOptions(unit_limit=1), client) as workers,
+    ):
+        theirs = other.submit(time.sleep, 4)
+        while not any(other.processing().values()):
+            time.sleep(0.02)
+        assert len(dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "s", 1))) == 1
+        assert theirs.result(timeout=60) is None
+    assert "[cluster.hangs]" not in capfd.readouterr().err
+
+
+def test_a_unit_that_hangs_is_late_though_others_wait_for_it(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import Client, get_worker
+
+    begun, ended = list[Any](), Event()
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        begun.append(get_worker().address)
+        if len(begun) == 1:
+            begun.append(other.submit(time.sleep, 0, workers=[begun[0]]))
+            ended.wait(20)
+        return {"found": np.array([piece])}
+
+    with (
+        Client(client.scheduler.address) as other,
+        workers_of(ClusterOptions(unit_limit=1), client) as workers,
+    ):
+        try:
+            dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1))
+        finally:
+            ended.set()
+    assert capfd.readouterr().err.count("[cluster.hangs]") == 1
+    assert begun[2] != begun[0]
+
+
 def test_without_workers_a_run_ends_though_all_is_sent(
     client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,11 +32,13 @@ from usdbrdf.model.arrays import Array
 
 T = TypeVar("T")
 # Seconds: between looks at what has not come back; for which workers are waited for; in which a
-# name comes from a worker; and in which one that hangs is to be gone.
-_LOOK, _NO_WORKERS, _NAME, _STOPPING = 1.0, 120.0, 60.0, 30.0
+# name comes from a worker; in which one says what it does; and in which one that hangs is to be
+# gone.
+_LOOK, _NO_WORKERS, _NAME, _SAYING, _STOPPING = 1.0, 120.0, 60.0, 5.0, 30.0
 # How often a unit may fail with its worker, or for what a machine lacks, until that is believed.
 _TRIES = 5
-# What calls of a client raise where the scheduler is gone.
+# What calls of a client raise where time runs out, and where the scheduler is gone.
+_LATE = (TimeoutError, asyncio.TimeoutError)
 _GONE = (OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 
 
@@ -61,7 +63,7 @@ class DaskWorkers:
         self._client, self._shared, self._limit = client, shared_folder, unit_limit_s
         self._stores: dict[str, Store] = {}
         self._address = str(client.scheduler.address)
-        # What each worker had to do at the last look, and since when it gave nothing back.
+        # What of ours each worker had to do at the last look, and since when none came back.
         self._at_work: dict[str, tuple[frozenset[Any], float]] = {}
 
     def elsewhere(self) -> int:
@@ -140,7 +142,7 @@ class DaskWorkers:
         if not threads:
             try:
                 self._client.wait_for_workers(1, timeout=_NO_WORKERS)
-            except (TimeoutError, *_GONE) as error:
+            except (*_LATE, *_GONE) as error:
                 raise EnvironmentFailure(
                     f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
                     "scheduler, then run the same command again; finished work is kept. "
@@ -182,18 +184,31 @@ class DaskWorkers:
             raise self._gone()
         self._at_once()
         found = self._asked(self._client.processing)
+        ours = {future.key: sent for future, sent in out.items()}
         now, before = time.monotonic(), self._at_work
         self._at_work = {}
         for worker, keys in found.items():
-            held = frozenset(keys)
+            held = frozenset(key for key in keys if key in ours)
+            if len(held) < len(keys):
+                held = self._begun(held)
             earlier, since = before.get(worker, (held, now))
             if held:
                 self._at_work[worker] = (held, since if earlier <= held else now)
-        ours = {future.key: sent for future, sent in out.items()}
         for worker, (held, since) in [*self._at_work.items()]:
-            late = [ours[key] for key in held if key in ours]
-            if late and now - since > self._limit:
-                self._give_up(worker, late)
+            if now - since > self._limit:
+                self._give_up(worker, [ours[key] for key in held])
+
+    def _begun(self, held: frozenset[Any]) -> frozenset[Any]:
+        """What is being worked on of the units that a worker has beside the work of others, for
+        which the rest may wait as long as that takes; all where it does not say."""
+        if not held:
+            return held
+        ask = self._client.scheduler.call_stack
+        try:
+            told = self._client.sync(ask, keys=[*held], callback_timeout=_SAYING)
+        except (*_LATE, *_GONE, KeyError):  # or it is gone, which the next look will tell
+            return held
+        return held & {key for stacks in told.values() for key in stacks}
 
     def _give_up(self, worker: str, late: list[_Sent]) -> None:
         """Restart a worker that hangs, unless others hung at its units before."""
