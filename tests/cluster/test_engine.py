@@ -34,15 +34,15 @@ def client() -> Iterator[Any]:
 
 @pytest.fixture
 def as_ours(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Any]:
-    """Makes a function one that workers may be told of."""
+    """Makes a function or class one that workers may be told of."""
 
     from usdbrdf.cluster import unit as module
 
-    def named(unit: Any) -> Any:
-        unit.__module__, unit.__qualname__ = module.__name__, "of_this_test"
-        monkeypatch.setattr(module, "of_this_test", unit, raising=False)
+    def named(thing: Any) -> Any:
+        thing.__module__, thing.__qualname__ = module.__name__, thing.__name__
+        monkeypatch.setattr(module, thing.__name__, thing, raising=False)
         monkeypatch.setattr(module, "_shared", module._Kept(1))
-        return unit
+        return thing
 
     return named
 
@@ -240,6 +240,30 @@ def test_a_photograph_of_an_object_store_is_called_by_its_own_name(
         with pytest.raises(ImageRefused) as refused:
             dict(workers.results(unit, (damaged, sound), {"0": 0}, tmp_path / "shared", 1))
     assert str(refused.value) == str(alone.value)
+
+
+def test_a_later_task_reads_photographs_from_its_own_place_in_an_object_store(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    """Though workers know its reader of them from an earlier task, whose place is gone."""
+
+    class Reader:
+        def __init__(self, paths: tuple[Path, ...]) -> None:
+            self.paths = paths
+
+    def unit(shared: Reader, piece: int) -> dict[str, Array]:
+        return {"pixels": read_radiance(shared.paths[piece])}
+
+    as_ours(Reader)
+    photographs = tmp_path / "0.exr", tmp_path / "1.exr"
+    client.retire_workers([next(iter(client.nthreads()))])
+    with workers_of(ClusterOptions(shared_folder=f"file://{tmp_path}/objects"), client) as workers:
+        for i, photograph in enumerate(photographs):
+            write_exr(photograph, np.full((4, 4, 3), i, np.float32))
+        for i, task in enumerate((tmp_path / "shade", tmp_path / "fit")):
+            results = workers.results(as_ours(unit), Reader(photographs), {"a": i}, task, 1)
+            assert next(results)[1]["pixels"].max() == i
+            workers.forget(task)
 
 
 def test_a_photograph_of_which_a_worker_has_a_bad_copy_is_told_with_the_worker(

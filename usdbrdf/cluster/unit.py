@@ -74,7 +74,8 @@ def done(address: str, work: str, piece: Document) -> str:
     store: Store = _stores.get(address, lambda: Store(files_at(address, _copies(address))))
 
     def value(document: Document) -> Any:
-        return restored(document, store, lambda told, make: _scenes.get(str(told), make))
+        # One that is known from another store would open its files there, where they may be gone.
+        return restored(document, store, lambda told, make: _scenes.get(f"{address}/{told}", make))
 
     def read() -> Any:
         told = store.document(work)
