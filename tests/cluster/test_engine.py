@@ -150,6 +150,33 @@ def test_a_unit_that_hangs_is_late_though_others_wait_for_it(
     assert begun[2] != begun[0]
 
 
+def test_a_name_that_does_not_come_is_no_end_of_the_scheduler(
+    client: Any,
+    as_ours: Callable[[Any], Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    from distributed import Future, TimeoutError
+
+    result, asked = Future.result, []
+
+    def late_once(future: Any, timeout: float) -> Any:
+        asked.append(timeout)
+        if len(asked) == 1:
+            raise TimeoutError
+        return result(future, timeout)
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        return {"found": np.array([piece])}
+
+    monkeypatch.setattr(Future, "result", late_once)
+    with workers_of(client=client) as workers:
+        found = dict(workers.results(as_ours(unit), None, {"0": 7}, tmp_path / "shared", 1))
+    assert found["0"]["found"] == 7
+    assert "did not say in 60 s" in capfd.readouterr().err
+
+
 def test_without_workers_a_run_ends_though_all_is_sent(
     client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -154,7 +154,7 @@ class DaskWorkers:
     def _name(self, future: Future, files: Files) -> str:
         """What a worker called the result of its unit; its failures in our words."""
         if future.status != "error":
-            return str(self._asked(lambda: future.result(timeout=_NAME)))
+            return self._asked(lambda: self._named(future))
         error = future.exception()
         if isinstance(error, KilledWorker):
             worker = getattr(error.last_worker, "address", "unknown")
@@ -177,6 +177,16 @@ class DaskWorkers:
                 "whether it sees the folder of the asset or --shared-folder. [cluster.worker]"
             ) from error
         raise error
+
+    def _named(self, future: Future) -> str:
+        """A worker that has died since takes its answer with it, and Dask waits for another."""
+        try:
+            return str(future.result(timeout=_NAME))
+        except _LATE as error:
+            raise EnvironmentFailure(
+                f"{self._address}: a worker did not say in {_NAME:.0f} s what it found. See "
+                "whether it has died, or its network is overloaded. [cluster.worker]"
+            ) from error
 
     def _look_after(self, out: dict[Future, _Sent]) -> None:
         """Restart workers that give nothing back for too long: what they had goes to others."""
