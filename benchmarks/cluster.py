@@ -144,7 +144,7 @@ class Bench:
         asset = self.fresh("scheduler")
 
         def strike(process: subprocess.Popen[bytes]) -> None:
-            while not list(asset.glob(".usdbrdf/work/shade-*/checkpoints/tile-*")):
+            while not list(asset.glob(".usdbrdf/work/shade-*/*/checkpoints/tile-*")):
                 time.sleep(0.1)
             process.kill()
 
@@ -173,7 +173,7 @@ class Bench:
         return status, contents(asset)
 
     def _cut(self, asset: Path, cut: Callable[[], None]) -> None:
-        while not list(asset.glob(".usdbrdf/work/shade-*/checkpoints/tile-*")):
+        while not list(asset.glob(".usdbrdf/work/shade-*/*/checkpoints/tile-*")):
             time.sleep(0.1)
         cut()
 

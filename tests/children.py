@@ -109,7 +109,7 @@ class Children:
                 )  # fmt: skip
         request = {
             "folder": str(folder), "parent": task["parent"],
-            "environment": {**os.environ, "TMPDIR": str(folder),
+            "environment": {**os.environ, **product._ONE_THREAD, "TMPDIR": str(folder),
                             "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
             "path": ["", *map(os.path.abspath, sys.path)],
             "modules": [task["function"].partition(":")[0],

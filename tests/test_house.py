@@ -96,7 +96,7 @@ IMPORTERS: dict[str, set[str]] = {
     "filelock": {"job/ownership.py"},
     "flip_evaluator": {"evaluation/metrics.py"},
     "fsspec": {"cluster/object_store.py"},
-    "llvmlite": {"kernel.py", "cluster/unit.py", "transport/"},
+    "llvmlite": {"kernel.py", "job/arithmetic.py", "transport/"},
     "matplotlib": {"evaluation/"},
     "mitsuba": {"relighting/"},
     "msgspec": {"files/documents.py"},

@@ -34,15 +34,15 @@ def client() -> Iterator[Any]:
 
 @pytest.fixture
 def as_ours(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], Any]:
-    """Makes a function one that workers may be told of."""
+    """Makes a function or class one that workers may be told of."""
 
     from usdbrdf.cluster import unit as module
 
-    def named(unit: Any) -> Any:
-        unit.__module__, unit.__qualname__ = module.__name__, "of_this_test"
-        monkeypatch.setattr(module, "of_this_test", unit, raising=False)
+    def named(thing: Any) -> Any:
+        thing.__module__, thing.__qualname__ = module.__name__, thing.__name__
+        monkeypatch.setattr(module, thing.__name__, thing, raising=False)
         monkeypatch.setattr(module, "_shared", module._Kept(1))
-        return unit
+        return thing
 
     return named
 
@@ -101,6 +101,80 @@ def test_a_worker_that_gives_back_in_time_is_left_alone_though_units_wait(
         pieces = {f"piece-{i}": i for i in range(3)}
         assert len(dict(workers.results(as_ours(unit), None, pieces, tmp_path / "s", 1))) == 3
     assert "[cluster.hangs]" not in capfd.readouterr().err
+
+
+def test_a_unit_that_waits_for_the_work_of_others_is_not_late(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import Client
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        return {"found": np.array([piece])}
+
+    client.retire_workers([next(iter(client.nthreads()))])
+    with (
+        Client(client.scheduler.address) as other,
+        workers_of(ClusterOptions(unit_limit=1), client) as workers,
+    ):
+        theirs = other.submit(time.sleep, 4)
+        while not any(other.processing().values()):
+            time.sleep(0.02)
+        assert len(dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "s", 1))) == 1
+        assert theirs.result(timeout=60) is None
+    assert "[cluster.hangs]" not in capfd.readouterr().err
+
+
+def test_a_unit_that_hangs_is_late_though_others_wait_for_it(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from distributed import Client, get_worker
+
+    begun, ended = list[Any](), Event()
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        begun.append(get_worker().address)
+        if len(begun) == 1:
+            begun.append(other.submit(time.sleep, 0, workers=[begun[0]]))
+            ended.wait(20)
+        return {"found": np.array([piece])}
+
+    with (
+        Client(client.scheduler.address) as other,
+        workers_of(ClusterOptions(unit_limit=1), client) as workers,
+    ):
+        try:
+            dict(workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1))
+        finally:
+            ended.set()
+    assert capfd.readouterr().err.count("[cluster.hangs]") == 1
+    assert begun[2] != begun[0]
+
+
+def test_a_name_that_does_not_come_is_no_end_of_the_scheduler(
+    client: Any,
+    as_ours: Callable[[Any], Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    from distributed import Future, TimeoutError
+
+    result, asked = Future.result, []
+
+    def late_once(future: Any, timeout: float) -> Any:
+        asked.append(timeout)
+        if len(asked) == 1:
+            raise TimeoutError
+        return result(future, timeout)
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        return {"found": np.array([piece])}
+
+    monkeypatch.setattr(Future, "result", late_once)
+    with workers_of(client=client) as workers:
+        found = dict(workers.results(as_ours(unit), None, {"0": 7}, tmp_path / "shared", 1))
+    assert found["0"]["found"] == 7
+    assert "did not say in 60 s" in capfd.readouterr().err
 
 
 def test_without_workers_a_run_ends_though_all_is_sent(
@@ -193,6 +267,30 @@ def test_a_photograph_of_an_object_store_is_called_by_its_own_name(
         with pytest.raises(ImageRefused) as refused:
             dict(workers.results(unit, (damaged, sound), {"0": 0}, tmp_path / "shared", 1))
     assert str(refused.value) == str(alone.value)
+
+
+def test_a_later_task_reads_photographs_from_its_own_place_in_an_object_store(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    """Though workers know its reader of them from an earlier task, whose place is gone."""
+
+    class Reader:
+        def __init__(self, paths: tuple[Path, ...]) -> None:
+            self.paths = paths
+
+    def unit(shared: Reader, piece: int) -> dict[str, Array]:
+        return {"pixels": read_radiance(shared.paths[piece])}
+
+    as_ours(Reader)
+    photographs = tmp_path / "0.exr", tmp_path / "1.exr"
+    client.retire_workers([next(iter(client.nthreads()))])
+    with workers_of(ClusterOptions(shared_folder=f"file://{tmp_path}/objects"), client) as workers:
+        for i, photograph in enumerate(photographs):
+            write_exr(photograph, np.full((4, 4, 3), i, np.float32))
+        for i, task in enumerate((tmp_path / "shade", tmp_path / "fit")):
+            results = workers.results(as_ours(unit), Reader(photographs), {"a": i}, task, 1)
+            assert next(results)[1]["pixels"].max() == i
+            workers.forget(task)
 
 
 def test_a_photograph_of_which_a_worker_has_a_bad_copy_is_told_with_the_worker(

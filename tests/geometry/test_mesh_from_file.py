@@ -11,6 +11,7 @@ import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
+from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file, model_from_file
 
 _SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -25,6 +26,14 @@ def test_ply_comes_back_bit_for_bit_with_its_labels(tmp_path):
     assert mesh.face_label is not None
     np.testing.assert_array_equal(mesh.face_label, face_object)
     assert mesh.kept is None
+
+
+def test_a_container_of_little_memory_is_no_limit_on_addresses(tmp_path, monkeypatch):
+    """Of which libraries take more than they fill: here 0.3 GB, and on many cores more."""
+    points, triangles, face_object, _ = room_mesh()
+    write_ply(tmp_path / "mesh.ply", points, triangles, face_object)
+    monkeypatch.setattr(bounds, "machine_bytes", lambda: 128 << 20)
+    assert len(mesh_from_file(tmp_path / "mesh.ply").points) == len(points)
 
 
 def test_quads_become_two_triangles_in_place_and_keep_their_label(tmp_path):

@@ -50,6 +50,10 @@ def note(arrays, parameters):
         file.write(str(os.getpid()))
     time.sleep(600)
 
+def spin(arrays, parameters):
+    while True:
+        pass
+
 def leave(arrays, parameters):
     print("no memory for a thread", file=sys.stderr, flush=True)
     os._exit(1)
@@ -70,6 +74,10 @@ def litter(arrays, parameters):
 
 def hungry(arrays, parameters):
     return {"x": np.ones(1 << 32)}
+
+def threads(arrays, parameters):
+    from threadpoolctl import threadpool_info
+    return {"threads": np.array([pool["num_threads"] for pool in threadpool_info()])}
 
 def objects(arrays, parameters):
     return {"x": np.array([object()])}
@@ -152,6 +160,12 @@ def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):
         child("hang", timeout_s=0.2, note=str(note))
     assert late.value.exit_code == 4
     assert all(_ended(int(pid)) for pid in note.read_text().split())
+
+
+def test_computing_without_end_is_told_from_waiting(child):
+    crashed = pytest.raises(CrashedChild, match=r"for longer than it may.+\[child\.endless\]$")
+    with crashed, module.child("toy_children:spin", {}, {}, 600, "spinning", cpu_limit_s=2) as end:
+        end()
 
 
 def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
@@ -259,6 +273,12 @@ def test_a_memory_limit_above_that_of_the_shell_is_no_fault(child):
         assert child("double", {"x": np.ones(2)}, memory_limit_bytes=1 << 40, factor=2)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def test_blas_keeps_to_one_thread_in_a_child(child, monkeypatch):
+    """Each takes addresses, of which there may be few on machines with many cores."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    assert child("threads", memory_limit_bytes=3 << 30)["threads"].tolist() == [1]
 
 
 def test_a_child_imports_nothing_but_what_its_function_needs():

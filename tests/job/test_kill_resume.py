@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import shutil
 import signal
 
 import pytest
 
-from usdbrdf.job.ownership import edited_files
+from usdbrdf.errors import InputRefused
+from usdbrdf.job import task as task_module
+from usdbrdf.job.ownership import edited_files, reading
 
 FAULTS = (
     [f"toy:checkpoint:{k}" for k in (1, 3, 4, 9)]
@@ -68,6 +71,34 @@ def test_other_parameters_after_a_killed_publish(tmp_path, toy, toy_process, has
     assert hashes(asset) == undisturbed
 
 
+@pytest.mark.fault("R2")
+@pytest.mark.parametrize("moves", [0, 3])
+def test_what_ran_before_a_stopped_publish_and_what_was_stopped_both_end_it(
+    tmp_path, toy, hashes, undisturbed, monkeypatch, moves
+):
+    """Of the outputs that it has moved one is new and the others have the bytes of before."""
+    asset, left = tmp_path / "room", iter(range(moves))
+    toy.run_toy(asset, textures=2)
+    before, move = hashes(asset), task_module.move
+
+    def some(*places):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        move(*places)
+
+    monkeypatch.setattr(task_module, "move", some)
+    with pytest.raises(KeyboardInterrupt):
+        toy.run_toy(asset)
+    monkeypatch.undo()
+    shutil.copytree(asset, tmp_path / "again")
+    with pytest.raises(InputRefused, match=r"\[asset\.unfinished\]"), reading(asset):
+        pass
+    assert not toy.run_toy(asset, textures=2).reran
+    assert hashes(asset) == before
+    assert toy.run_toy(tmp_path / "again").reason == "publish interrupted"
+    assert hashes(tmp_path / "again") == undisturbed
+
+
 def test_file_edited_after_a_killed_publish_is_regenerated(tmp_path, toy, toy_process, hashes):
     asset = tmp_path / "room"
     assert toy_process(asset, fault="kill@toy:mid_publish:1").returncode == -9
@@ -88,7 +119,7 @@ def test_finished_pieces_are_not_computed_again(tmp_path, toy, toy_process):
 def test_damaged_checkpoint_is_computed_again(tmp_path, toy, toy_process, hashes, undisturbed):
     asset = tmp_path / "room"
     toy_process(asset, fault="kill@toy:checkpoint:6")
-    stored = sorted((asset / ".usdbrdf/work").glob("toy-*/checkpoints/*.npz"))
+    stored = sorted((asset / ".usdbrdf/work").glob("toy-*/*/checkpoints/*.npz"))
     assert [path.name[:5] for path in stored] == ["sum@0", "sum@0"] + 3 * ["tile%"]
     for path in stored[1:3]:  # the newer state and the first tile
         content = bytearray(path.read_bytes())
@@ -105,7 +136,7 @@ def test_checkpoint_that_is_whole_but_not_what_was_saved_is_computed_again(
 ):
     asset = tmp_path / "room"
     toy_process(asset, fault="kill@toy:checkpoint:3")
-    first, _, last = sorted((asset / ".usdbrdf/work").glob("toy-*/checkpoints/*.npz"))
+    first, _, last = sorted((asset / ".usdbrdf/work").glob("toy-*/*/checkpoints/*.npz"))
     first.write_bytes(last.read_bytes())  # arrays that can be read, of another tile
     toy.run_toy(asset)
     computed = ast.literal_eval(asset.with_suffix(".computed").read_text())

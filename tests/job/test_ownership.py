@@ -184,7 +184,7 @@ def test_outputs_that_a_first_step_finished_stay_unless_the_input_is_refused(
 
     def work(content):
         with owned_folder(asset):
-            kept = asset / ".usdbrdf/work/ingest-1/kept"
+            kept = asset / ".usdbrdf/work/ingest-1/2/kept"
             kept.mkdir(parents=True, exist_ok=True)
             found = (kept / "frame.exr").is_file()
             (kept / "frame.exr").write_text(content)

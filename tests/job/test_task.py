@@ -10,6 +10,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.job import arithmetic as arithmetic_module
 from usdbrdf.job import stamp as stamp_module
 from usdbrdf.job import task as task_module
 from usdbrdf.job.task import run_task
@@ -262,7 +263,7 @@ def test_outputs_that_take_long_are_made_once(tmp_path):
         run(2)
     assert made == ["a", "b/c"]
     assert not (asset / "frames").exists()
-    kept = next((asset / ".usdbrdf/work").glob("toy-*/kept/*a.exr*"))
+    kept = next((asset / ".usdbrdf/work").glob("toy-*/*/kept/*a.exr*"))
     kept.write_text("damaged")
     assert run(3).reran
     assert made == ["a", "b/c", "a", "d"]
@@ -274,6 +275,74 @@ def test_outputs_that_take_long_are_made_once(tmp_path):
     run(3, seed=1)
     assert (asset / "frames/a.exr").read_text() == "a 1"
     assert list((asset / ".usdbrdf/work").iterdir()) == []
+
+
+@pytest.mark.fault("R2")
+@pytest.mark.parametrize("stop", ["write_stamp", "move", "flush_folder"])
+def test_outputs_that_took_long_are_not_made_again_after_a_stop_at_publishing(
+    tmp_path, monkeypatch, stop
+):
+    """Before the journal is written, and before the first output is moved, or after all are."""
+    asset, made = tmp_path / "room", []
+    (asset / ".usdbrdf").mkdir(parents=True)
+
+    def work(run):
+        for name in ("a", "b/c"):
+            run.output_kept(
+                f"frames/{name}.exr", lambda place, name=name: made.append(place.write_text(name))
+            )
+        run.output("layers/a.usda").write_text("x")
+        return {}
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    task = {"order": 20, "parameters": {}, "inputs": {}, "work": work}
+    monkeypatch.setattr(task_module, stop, stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_task(asset, "toy", **task)
+    monkeypatch.undo()
+    assert run_task(asset, "toy", **task).reran
+    assert len(made) == 2
+    assert (asset / "frames/b/c.exr").read_text() == "b/c"
+    assert (asset / "layers/a.usda").read_text() == "x"
+    assert list((asset / ".usdbrdf/work").iterdir()) == []
+
+
+def test_no_kind_of_machine_goes_on_with_the_pieces_of_another(tmp_path, monkeypatch):
+    """But with its own, where both try in turn; what either has finished is finished for both."""
+    asset, made = tmp_path / "room", []
+    (asset / ".usdbrdf").mkdir(parents=True)
+
+    def piece(machine, name):
+        made.append(f"{name} of {machine}")
+        return {"found": np.arange(3)}
+
+    def run_on(machine, stops):
+        def work(run):
+            for name in ("a", "b"):
+                run.checkpoint(name, lambda name=name: piece(machine, name))
+                run.output_kept(f"{name}.exr", lambda place: place.write_text(machine))
+                if stops:
+                    raise KeyboardInterrupt
+            return {}
+
+        processor = {"processor": machine}
+        monkeypatch.setattr(arithmetic_module, "arithmetic", lambda: processor)
+        return run_task(asset, "toy", order=20, parameters={}, inputs={}, work=work)
+
+    for machine in ("zen", "lake"):
+        with pytest.raises(KeyboardInterrupt):
+            run_on(machine, stops=True)
+    with monkeypatch.context() as patched:
+        patched.setattr(task_module, "move", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_on("zen", stops=False)
+    assert made == ["a of zen", "a of lake", "b of zen"]
+    assert run_on("lake", stops=False).reason == "publish interrupted"
+    assert not run_on("lake", stops=False).reran
+    assert [(asset / f"{name}.exr").read_text() for name in "ab"] == ["zen", "zen"]
+    assert len(made) == 3
 
 
 def _threads_of_blas() -> set[int]:

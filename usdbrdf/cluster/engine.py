@@ -22,20 +22,23 @@ from usdbrdf.cluster.described import described
 from usdbrdf.cluster.object_store import address_for, files_at
 from usdbrdf.cluster.options import is_url
 from usdbrdf.cluster.store import Files, Store, Wanted
-from usdbrdf.cluster.unit import Stranger, Unread, arithmetic, done
+from usdbrdf.cluster.unit import Stranger, Unread, done
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.images import read_radiance
+from usdbrdf.job.arithmetic import arithmetic
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import Unit
 from usdbrdf.model.arrays import Array
 
 T = TypeVar("T")
 # Seconds: between looks at what has not come back; for which workers are waited for; in which a
-# name comes from a worker; and in which one that hangs is to be gone.
-_LOOK, _NO_WORKERS, _NAME, _STOPPING = 1.0, 120.0, 60.0, 30.0
+# name comes from a worker; in which one says what it does; and in which one that hangs is to be
+# gone.
+_LOOK, _NO_WORKERS, _NAME, _SAYING, _STOPPING = 1.0, 120.0, 60.0, 5.0, 30.0
 # How often a unit may fail with its worker, or for what a machine lacks, until that is believed.
 _TRIES = 5
-# What calls of a client raise where the scheduler is gone.
+# What calls of a client raise where time runs out, and where the scheduler is gone.
+_LATE = (TimeoutError, asyncio.TimeoutError)
 _GONE = (OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 
 
@@ -60,7 +63,7 @@ class DaskWorkers:
         self._client, self._shared, self._limit = client, shared_folder, unit_limit_s
         self._stores: dict[str, Store] = {}
         self._address = str(client.scheduler.address)
-        # What each worker had to do at the last look, and since when it gave nothing back.
+        # What of ours each worker had to do at the last look, and since when none came back.
         self._at_work: dict[str, tuple[frozenset[Any], float]] = {}
 
     def elsewhere(self) -> int:
@@ -139,7 +142,7 @@ class DaskWorkers:
         if not threads:
             try:
                 self._client.wait_for_workers(1, timeout=_NO_WORKERS)
-            except (TimeoutError, *_GONE) as error:
+            except (*_LATE, *_GONE) as error:
                 raise EnvironmentFailure(
                     f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
                     "scheduler, then run the same command again; finished work is kept. "
@@ -151,7 +154,7 @@ class DaskWorkers:
     def _name(self, future: Future, files: Files) -> str:
         """What a worker called the result of its unit; its failures in our words."""
         if future.status != "error":
-            return str(self._asked(lambda: future.result(timeout=_NAME)))
+            return self._asked(lambda: self._named(future))
         error = future.exception()
         if isinstance(error, KilledWorker):
             worker = getattr(error.last_worker, "address", "unknown")
@@ -175,24 +178,47 @@ class DaskWorkers:
             ) from error
         raise error
 
+    def _named(self, future: Future) -> str:
+        """A worker that has died since takes its answer with it, and Dask waits for another."""
+        try:
+            return str(future.result(timeout=_NAME))
+        except _LATE as error:
+            raise EnvironmentFailure(
+                f"{self._address}: a worker did not say in {_NAME:.0f} s what it found. See "
+                "whether it has died, or its network is overloaded. [cluster.worker]"
+            ) from error
+
     def _look_after(self, out: dict[Future, _Sent]) -> None:
         """Restart workers that give nothing back for too long: what they had goes to others."""
         if self._client.status != "running":
             raise self._gone()
         self._at_once()
         found = self._asked(self._client.processing)
+        ours = {future.key: sent for future, sent in out.items()}
         now, before = time.monotonic(), self._at_work
         self._at_work = {}
         for worker, keys in found.items():
-            held = frozenset(keys)
+            held = frozenset(key for key in keys if key in ours)
+            if len(held) < len(keys):
+                held = self._begun(held)
             earlier, since = before.get(worker, (held, now))
             if held:
                 self._at_work[worker] = (held, since if earlier <= held else now)
-        ours = {future.key: sent for future, sent in out.items()}
         for worker, (held, since) in [*self._at_work.items()]:
-            late = [ours[key] for key in held if key in ours]
-            if late and now - since > self._limit:
-                self._give_up(worker, late)
+            if now - since > self._limit:
+                self._give_up(worker, [ours[key] for key in held])
+
+    def _begun(self, held: frozenset[Any]) -> frozenset[Any]:
+        """What is being worked on of the units that a worker has beside the work of others, for
+        which the rest may wait as long as that takes; all where it does not say."""
+        if not held:
+            return held
+        ask = self._client.scheduler.call_stack
+        try:
+            told = self._client.sync(ask, keys=[*held], callback_timeout=_SAYING)
+        except (*_LATE, *_GONE, KeyError):  # or it is gone, which the next look will tell
+            return held
+        return held & {key for stacks in told.values() for key in stacks}
 
     def _give_up(self, worker: str, late: list[_Sent]) -> None:
         """Restart a worker that hangs, unless others hung at its units before."""

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import RLock
 from typing import Any
 
-import llvmlite.binding
 from distributed import get_worker
 from threadpoolctl import threadpool_limits
 
@@ -21,27 +17,11 @@ from usdbrdf.cluster.described import Document, restored
 from usdbrdf.cluster.object_store import files_at
 from usdbrdf.cluster.store import Store
 from usdbrdf.errors import EnvironmentFailure, ImageRefused
-from usdbrdf.identity import tasks_identity
+from usdbrdf.job.arithmetic import arithmetic
 
 # What a worker keeps for its next units: of tasks that are done nothing is needed any more, and of
 # their scenes, which cost most, seldom more than one.
 _KEPT_SHARED, _KEPT_SCENES = 2, 2
-# Whose numbers become ours.
-_RECKONING = ("embreex", "llvmlite", "numba", "numpy", "scipy")
-
-
-@cache
-def arithmetic() -> dict[str, str]:
-    """What the bytes of a result depend on beside its unit: our code, who computes, and on which
-    processor, since libraries choose their loops by it."""
-    told = {"usdbrdf's code": tasks_identity(), "Python": platform.python_version()}
-    for name in _RECKONING:
-        try:
-            told[name] = version(name)
-        except PackageNotFoundError:
-            told[name] = "unknown"
-    told["processor"] = f"{llvmlite.binding.get_host_cpu_name()} ({sys.platform})"
-    return told
 
 
 class Stranger(EnvironmentFailure):
@@ -94,7 +74,8 @@ def done(address: str, work: str, piece: Document) -> str:
     store: Store = _stores.get(address, lambda: Store(files_at(address, _copies(address))))
 
     def value(document: Document) -> Any:
-        return restored(document, store, lambda told, make: _scenes.get(str(told), make))
+        # One that is known from another store would open its files there, where they may be gone.
+        return restored(document, store, lambda told, make: _scenes.get(f"{address}/{told}", make))
 
     def read() -> Any:
         told = store.document(work)

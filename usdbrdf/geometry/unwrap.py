@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused, LateChild
+from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused
 from usdbrdf.job.child import child
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
@@ -27,8 +27,11 @@ from usdbrdf.model.scene import Scene, SceneObject
 # new ones, with two mip levels.
 _GAP, PADDING = 2, 4
 MAX_SIDE = 16384
-# What charts may take: at least, and for each triangle.
-_SECONDS, _SECONDS_OF_FACE = 120.0, 2e-3
+# What charts may take of computing: at least, and for each triangle. It lies far beyond what ends,
+# or the atlas would tell of the machine's speed: 40,000 triangles of a surface with noise take 22 s
+# on a slow one, twice as many four times as long. And how many times that of wall time, where
+# others are at work.
+_SECONDS, _SECONDS_OF_FACE, _BUSY = 600.0, 1e-2, 10
 # Children at work: xatlas takes one core, and each holds all the geometry.
 _AT_ONCE = min(4, os.cpu_count() or 1)
 # Triangles for which another one starts: it takes most of a second to import what it needs.
@@ -165,8 +168,9 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """UVs of every object in its own atlas: corner_uv (F, 3, 2) in [0, 1], v up, and the atlas
     size in texels of each object, (num_objects, 2) int32 width, height.
 
-    An object on which xatlas crashes or hangs has its triangles packed one by one. Raises
-    InputRefused when an atlas would be larger than 16,384 texels on a side.
+    An object on which xatlas crashes or computes without end has its triangles packed one by one.
+    Raises InputRefused when an atlas would be larger than 16,384 texels on a side, and LateChild
+    where the machine is too busy to tell.
     """
 
     def too_large(obj: SceneObject, said: str) -> InputRefused:
@@ -222,12 +226,13 @@ def _child(
 ) -> AbstractContextManager[Callable[[], dict[str, Array]]]:
     """``unwrap_objects``, where it may crash or hang as xatlas does on some meshes."""
     faces = int(arrays["count"].sum())
-    seconds = _SECONDS + _SECONDS_OF_FACE * faces
-    return child(f"{__name__}:unwrap_objects", arrays, {}, seconds, label)
+    limit = math.ceil(_SECONDS + _SECONDS_OF_FACE * faces)
+    function = f"{__name__}:unwrap_objects"
+    return child(function, arrays, {}, _BUSY * limit, label, cpu_limit_s=limit)
 
 
 def _one_by_one(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
-    """The same with a child for each object; one that still crashes or hangs has each of its
+    """The same with a child for each object; one that still crashes or does not end has each of its
     triangles packed by itself, and the user hears of it."""
     corner_uv = np.zeros((len(scene.triangles), 3, 2), np.float32)
     resolution = np.zeros((len(scene.objects), 2), np.int32)
@@ -240,7 +245,7 @@ def _one_by_one(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
             with _child(arrays, f"unwrapping <{obj.prim_path}>") as result:
                 found = result()
             corner_uv[obj.faces], resolution[i] = found["corner_uv"], found["resolution"][0]
-        except (CrashedChild, LateChild) as error:
+        except CrashedChild as error:
             warn(
                 f"<{obj.prim_path}>: its {obj.num_faces} triangles are packed one by one, which "
                 f"wastes texels: {str(error).rpartition('. ')[0]}. Clean that part of the mesh. "

@@ -33,6 +33,8 @@ from usdbrdf.model.arrays import Array
 
 # Not "-m": runpy warns of modules that are imported already, and those would be last words.
 _START = "from usdbrdf.job.child import main; main()"
+# BLAS's threads would only wait for each other, and each takes addresses, which may be limited.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _ERROR_TOLD = 97  # exit status of a child that left an error.json
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -68,6 +70,7 @@ def child(
     label: str,
     *,
     memory_limit_bytes: int | None = None,
+    cpu_limit_s: int | None = None,
 ) -> Iterator[Callable[[], dict[str, Array]]]:
     """A child process at work on ``function`` ("package.module:name"), called as f(arrays,
     parameters); parameters must be JSON. What the block is given waits for it to end and gives the
@@ -76,10 +79,13 @@ def child(
     timeout_s            wall time that is waited for it
     label                what it does, for messages: "unwrap of <chair>"
     memory_limit_bytes   of address space (RLIMIT_AS), unlimited if None
+    cpu_limit_s          of computing (RLIMIT_CPU), which says more of the input and less of who
+                         else is at work on the machine; unlimited if None
 
     A UsdBrdfError raised there is raised by the waiting, with its class. Death by a signal is a
-    CrashedChild, an InputRefused; running out of time a LateChild, an EnvironmentFailure as running
-    out of memory, SIGKILL and what cannot be imported there are.
+    CrashedChild, an InputRefused, and so is computing for too long; running out of wall time a
+    LateChild, an EnvironmentFailure as running out of memory, SIGKILL and what cannot be imported
+    there are.
     """
     with scratch_folder() as folder:
         with environment_failures(label):
@@ -91,6 +97,7 @@ def child(
                 "parent": os.getpid(),
                 "alarm_s": math.ceil(timeout_s) + _GRACE_SECONDS,
                 "memory_limit_bytes": memory_limit_bytes,
+                "cpu_limit_s": cpu_limit_s,
             }
             (folder / "task.json").write_text(json_text(task), "utf-8")
         with _started(folder, label) as process:
@@ -107,7 +114,7 @@ def _started(folder: Path, label: str) -> Iterator[subprocess.Popen[bytes]]:
             [sys.executable, "-c", _START, str(folder)],
             cwd=folder,
             # What a crash leaves in the folder of temporary files goes with ours.
-            env={**os.environ, "PYTHONPATH": search, "TMPDIR": str(folder)},
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": search, "TMPDIR": str(folder)},
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=said,
@@ -158,6 +165,11 @@ def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
             "and the limits of this shell (ulimit -a). [child.start]"
         )
     how = signal.Signals(-status).name
+    if -status == signal.SIGXCPU:
+        return CrashedChild(
+            f"{label} computed for longer than it may and was stopped. Simplify the input. "
+            "[child.endless]"
+        )
     return CrashedChild(f"{label} crashed ({how}).{said} Repair the input. [child.crashed]")
 
 
@@ -171,10 +183,8 @@ def main() -> None:
     if os.getppid() != task["parent"]:
         os.kill(os.getpid(), signal.SIGKILL)
     signal.alarm(task["alarm_s"])
-    if task["memory_limit_bytes"] is not None:
-        limits = (task["memory_limit_bytes"], *resource.getrlimit(resource.RLIMIT_AS))
-        limit = min(limit for limit in limits if limit != resource.RLIM_INFINITY)
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    _limit(resource.RLIMIT_AS, task["memory_limit_bytes"])
+    _limit(resource.RLIMIT_CPU, task["cpu_limit_s"])
     try:
         with environment_failures(task["label"]):
             arrays = load_arrays(folder / "arrays.npz")
@@ -193,6 +203,15 @@ def main() -> None:
         (folder / "error.json").write_text(json.dumps(told), "utf-8")
         _leave(_ERROR_TOLD)
     _leave(0)
+
+
+def _limit(resource_number: int, most: int | None) -> None:
+    """Lower a limit of this process to so much, unless the shell's is lower. The hard one stays:
+    who reaches that of computing is killed without a word."""
+    if most is not None:
+        soft, hard = resource.getrlimit(resource_number)
+        limit = min(limit for limit in (most, soft, hard) if limit != resource.RLIM_INFINITY)
+        resource.setrlimit(resource_number, (limit, hard))
 
 
 def _leave(status: int) -> NoReturn:

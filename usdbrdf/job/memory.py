@@ -46,10 +46,15 @@ def resident_bytes() -> int:
     return int(psutil.Process().memory_info().rss)
 
 
+def addresses_of_libraries() -> int:
+    """Bytes of addresses that are no memory, up to which libraries reserve some on this machine."""
+    return _ADDRESSES + _ADDRESSES_OF_CORE * (os.cpu_count() or 1)
+
+
 def refuse_few_addresses() -> None:
     """EnvironmentFailure where the shell (``ulimit -v``) leaves too little to start at all."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    needed = _ADDRESSES + _ADDRESSES_OF_CORE * (os.cpu_count() or 1)
+    needed = addresses_of_libraries()
     if limit != resource.RLIM_INFINITY and limit < needed:
         raise EnvironmentFailure(
             f"the limit on address space is {limit / GIB:.2g} GiB, and the libraries alone take up "

@@ -359,7 +359,7 @@ def _removed_if_unused(asset: Path, made: Sequence[Path]) -> Iterator[None]:
         with suppress(OSError):
             unused = [entry.name for entry in asset.iterdir()] == [STATE_FOLDER]
             # What an interrupted first step has finished is what the same command goes on from.
-            unused &= isinstance(error, InputRefused) or not any(state.glob("work/*/kept/*"))
+            unused &= isinstance(error, InputRefused) or not any(state.glob("work/*/*/kept/*"))
             if unused and state in made:
                 for name in ("stamps", "work", "cache"):
                     shutil.rmtree(state / name, ignore_errors=True)

@@ -1,10 +1,11 @@
 """Run a task so that it can be killed at any moment and started again by the same command.
 
 Work happens in ``.usdbrdf/work/<task>-<fingerprint>``: checkpoints of finished pieces, each a file
-that carries its own hash in its name, and the outputs under their final names. Only complete,
-verified outputs are published; a journal written before the first replacement lets the next run
-finish a publish that was interrupted half-way. The stamp comes last. Hold ``folder_lock`` around
-it: nothing here expects company.
+that carries its own hash in its name, and the outputs under their final names. Each kind of machine
+has pieces of its own there: those of two differ in their last bits, and no run is to give a mixture
+(see ``job.arithmetic``). Only complete, verified outputs are published; a journal written before
+the first replacement lets the next run, wherever that is, finish a publish that was interrupted
+half-way. The stamp comes last. Hold ``folder_lock`` around it: nothing here expects company.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
 from usdbrdf.files.paths import inside
+from usdbrdf.job.arithmetic import name_of_arithmetic
 from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.progress import progress
 from usdbrdf.job.stamp import (
@@ -93,9 +95,10 @@ class TaskRun:
         shutil.rmtree(self.staged, ignore_errors=True)
         self.staged.mkdir(parents=True)
         self.kept: dict[str, Path] = {}
-        self._kept = folder / "kept"
-        self._kept.mkdir(exist_ok=True)
-        self._checkpoints = folder / "checkpoints"
+        own = _own(folder)
+        self._kept = own / "kept"
+        self._kept.mkdir(parents=True, exist_ok=True)
+        self._checkpoints = own / "checkpoints"
         self._checkpoints.mkdir(exist_ok=True)
         self._files: dict[tuple[str, int | None], Path] = {}
         # When a running computation's state was saved last, and how long that took: the first is
@@ -125,28 +128,30 @@ class TaskRun:
         """The same, written by ``write``, unless an interrupted run of the task got so far: for
         outputs each of which takes long."""
         relative = check_relative(relative)
-        stem = quote(relative, safe="")
-        for path in self._kept.glob(f"{glob_escape(stem)}.*"):
-            if sha256_of(path) == path.name.removeprefix(f"{stem}."):
+        stem = _stem_of_kept(relative)
+        for path in self._kept.glob(f"{glob_escape(stem)}*"):
+            if sha256_of(path) == path.name.removeprefix(stem):
                 self.kept[relative] = path
         if relative not in self.kept:
             with temporary_beside(self._kept / Path(relative).name) as staged:
                 write(staged)
-                self.kept[relative] = self._kept / f"{stem}.{sha256_of(staged)}"
+                self.kept[relative] = self._kept / f"{stem}{sha256_of(staged)}"
                 publish(staged, self.kept[relative])
         if relative not in self.outputs:
             self.outputs.append(relative)
 
-    def gather(self) -> None:
-        """Bring the kept outputs to the others, when all is done."""
-        for relative, path in self.kept.items():
-            place = self.staged / relative
-            place.parent.mkdir(parents=True, exist_ok=True)
-            move(path, place)
-
     def output_once(self, relative: str) -> Path:
         """The same for a file that is the artist's once it exists: it is never replaced."""
         return self._place(relative, self.once)
+
+    def hashes(self) -> dict[str, str]:
+        """The SHA-256 of every output; UsdBrdfError where one was not written."""
+        places = {relative: self.staged / relative for relative in (*self.outputs, *self.once)}
+        places |= self.kept
+        for relative, place in places.items():
+            if not place.is_file():
+                raise UsdBrdfError(f"the task {self.name} did not write {relative}. [task.output]")
+        return {relative: sha256_of(places[relative]) for relative in self.outputs}
 
     def _place(self, relative: str, register: list[str]) -> Path:
         relative = check_relative(relative)
@@ -274,7 +279,8 @@ def run_task(
     folder = work_folder / f"{name}-{wanted.fingerprint}"
     stamp, journal = stamp_path(asset, order, name), journal_path(asset, name)
     with environment_failures(name):
-        for place in (stamp.parent, *(folder / name for name in ("staged", "checkpoints", "kept"))):
+        places = folder / "staged", *(_own(folder) / part for part in ("checkpoints", "kept"))
+        for place in (stamp.parent, *places):
             inside(asset, place)
         for place in (stamp.parent, work_folder):
             place.mkdir(parents=True, exist_ok=True)
@@ -286,13 +292,14 @@ def run_task(
                 workers.forget(path / _FOR_WORKERS)
                 shutil.rmtree(path, ignore_errors=True)
         if reason is None:
-            if interrupted:
-                journal.unlink()
+            done = read_stamp(stamp)
+            if noted and done and not interrupted:
+                _undo(asset, noted, done)
+            journal.unlink(missing_ok=True)
             workers.forget(folder / _FOR_WORKERS)
             shutil.rmtree(folder, ignore_errors=True)
-            done = read_stamp(stamp)
             return TaskResult(summary=done.summary if done else {}, reran=False, reason="done")
-        if noted and interrupted and _can_publish(asset, folder / "staged", noted):
+        if noted and interrupted and _can_publish(asset, folder, noted):
             _publish(asset, folder, noted, order)
             return TaskResult(summary=noted.summary, reran=True, reason="publish interrupted")
         run = TaskRun(asset, name, folder, workers)
@@ -301,11 +308,7 @@ def run_task(
         with threadpool_limits(limits=1, user_api="blas"):
             summary = json.loads(json_text(work(run)))
         workers.forget(folder / _FOR_WORKERS)
-        run.gather()
-        for relative in (*run.outputs, *run.once):
-            if not (run.staged / relative).is_file():
-                raise UsdBrdfError(f"the task {name} did not write {relative}. [task.output]")
-        outputs = {relative: sha256_of(run.staged / relative) for relative in run.outputs}
+        outputs = run.hashes()
         # The hashes of this task's files as they may lie there now, and of what is about to be
         # replaced, such as an empty layer that another task put there.
         earlier = hashes_in([read_stamp(stamp), noted])
@@ -328,7 +331,24 @@ def run_task(
         return TaskResult(summary=summary, reran=True, reason=reason)
 
 
-def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
+def _own(folder: Path) -> Path:
+    """Of a task's folder, what is of this kind of machine."""
+    return folder / name_of_arithmetic()
+
+
+def _stem_of_kept(relative: str) -> str:
+    """How the name of a kept output begins; its SHA-256 follows."""
+    return f"{quote(relative, safe='')}."
+
+
+def _waiting(folder: Path, journal: Stamp, relative: str) -> Path:
+    """Where an output is from its writing until it is moved into the asset. Nothing moves before
+    the journal is there: a run that is killed then still finds what was kept."""
+    name = f"{_stem_of_kept(relative)}{journal.outputs.get(relative)}"
+    return next(folder.glob(f"*/kept/{name}"), folder / "staged" / relative)
+
+
+def _can_publish(asset: Path, folder: Path, journal: Stamp) -> bool:
     """Whether every output of an interrupted publish is in the asset or still waits, intact. What
     waits and is not goes: the asset may have the same from an earlier run."""
 
@@ -336,12 +356,14 @@ def _can_publish(asset: Path, staged: Path, journal: Stamp) -> bool:
         return file.is_file() and sha256_of(file) == sha256
 
     for relative, sha256 in journal.outputs.items():
-        if not intact(staged / relative, sha256):
-            (staged / relative).unlink(missing_ok=True)
+        waiting = _waiting(folder, journal, relative)
+        if not intact(waiting, sha256):
+            waiting.unlink(missing_ok=True)
             if not intact(asset / relative, sha256):
                 return False
     return all(
-        (asset / relative).is_file() or (staged / relative).is_file() for relative in journal.once
+        (asset / relative).is_file() or _waiting(folder, journal, relative).is_file()
+        for relative in journal.once
     )
 
 
@@ -351,11 +373,11 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
 
     def moved(relative: str) -> Path:
         """The folder of an output that has been moved there, or had been already."""
-        staged, final = folder / "staged" / relative, asset / relative
+        waiting, final = _waiting(folder, journal, relative), asset / relative
         inside(asset, final.parent)
-        if staged.is_file():
+        if waiting.is_file():
             final.parent.mkdir(parents=True, exist_ok=True)
-            move(staged, final)
+            move(waiting, final)
         return final.parent
 
     def rank(relative: str) -> int:
@@ -377,6 +399,14 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
     noted.unlink()
     flush_folder(noted.parent)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def _undo(asset: Path, journal: Stamp, done: Stamp) -> None:
+    """Delete what a publish for other parameters put beside the outputs of the finished task before
+    it was stopped; of those it had replaced none, or the task would not count as finished."""
+    moved = {relative: [sha256] for relative, sha256 in journal.outputs.items()}
+    for changed in _retire(asset, replace(done, earlier=moved)):
+        flush_folder(changed)
 
 
 def _retire(asset: Path, journal: Stamp) -> set[Path]:

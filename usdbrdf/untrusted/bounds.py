@@ -15,14 +15,14 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.job.child import run_child
-from usdbrdf.job.memory import machine_bytes
+from usdbrdf.job.memory import addresses_of_libraries, machine_bytes
 from usdbrdf.model.arrays import Array
 
 _GIB = 1 << 30
 
 
 class Limits(NamedTuple):
-    """What one file may take: its own bytes, seconds of wall time, bytes of addresses."""
+    """What one file may take: its own bytes, seconds of wall time, bytes of memory."""
 
     file_bytes: int
     seconds: float
@@ -74,7 +74,8 @@ def read_in_child(
         {"reader": reader, "path": str(path.resolve()), "more": dict(parameters or {})},
         seconds,
         f"{path}: reading this {kind}",
-        memory_limit_bytes=min(memory_bytes, machine_bytes()),
+        # What can be limited is addresses, of which libraries take more than they fill.
+        memory_limit_bytes=min(memory_bytes, machine_bytes()) + addresses_of_libraries(),
     )
     value = unpacked(found, (returns, *parts))
     assert isinstance(value, returns)
