@@ -120,9 +120,9 @@ def test_trimesh_reads_the_same_surfaces(room, exported):
     chair = there["Stuhl_No_1"].material
     assert chair.diffuse == pytest.approx(here["Stuhl_No_1"].material.diffuse, abs=5e-3)
     assert chair.roughness.max() == pytest.approx(0.5)
-    # trimesh knows no strength: the colour is what it was over its largest value.
-    expected = here["lamp"].material.emission / 8
-    assert there["lamp"].material.emission == pytest.approx(expected, abs=5e-3)
+    # Its strength is 8, and a texture has 8 bits.
+    expected = here["lamp"].material.emission
+    assert there["lamp"].material.emission == pytest.approx(expected, abs=8 * 5e-3)
 
 
 def test_equal_assets_give_equal_bytes(room, exported, tmp_path):
