@@ -154,6 +154,25 @@ def surface(**inputs):
     )
 
 
+def test_glass_is_there_and_lets_all_light_pass(tmp_path):
+    green = np.full((2, 2, 3), (0.1, 0.5, 0.2), np.float32)
+    pane = surface(diffuse=green, ior=1.4)
+    pane = replace(pane, material=replace(pane.material, clear=True))
+    write_glb(tmp_path / "pane.glb", [pane, surface()], None, pytest.fail)
+    tree = document(tmp_path / "pane.glb")
+    clear, opaque = tree["materials"]
+    assert clear["extensions"]["KHR_materials_transmission"] == {"transmissionFactor": 1}
+    assert clear["extensions"]["KHR_materials_ior"]["ior"] == pytest.approx(1.4, rel=1e-4)
+    assert clear["pbrMetallicRoughness"]["baseColorFactor"][:3] == [1, 1, 1]
+    # Viewers without transmission show a faint pane; alpha 0 would be no surface at all.
+    assert 0.1 < clear["pbrMetallicRoughness"]["baseColorFactor"][3] < 0.5
+    assert clear["alphaMode"] == "BLEND"
+    assert "baseColorTexture" not in clear["pbrMetallicRoughness"]
+    assert "KHR_materials_transmission" in tree["extensionsUsed"]
+    assert opaque["extensions"].keys() == {"KHR_materials_ior"}
+    assert "alphaMode" not in opaque
+
+
 @pytest.mark.parametrize("ior", [1.0, 1.33, 1.789])
 def test_index_of_refraction(ior):
     found = gltf_material(surface(ior=ior), None, pytest.fail)
