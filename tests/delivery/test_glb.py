@@ -120,9 +120,9 @@ def test_trimesh_reads_the_same_surfaces(room, exported):
     chair = there["Stuhl_No_1"].material
     assert chair.diffuse == pytest.approx(here["Stuhl_No_1"].material.diffuse, abs=5e-3)
     assert chair.roughness.max() == pytest.approx(0.5)
-    # trimesh knows no strength: the colour is what it was over its largest value.
-    expected = here["lamp"].material.emission / 8
-    assert there["lamp"].material.emission == pytest.approx(expected, abs=5e-3)
+    # Its strength is 8, and a texture has 8 bits.
+    expected = here["lamp"].material.emission
+    assert there["lamp"].material.emission == pytest.approx(expected, abs=8 * 5e-3)
 
 
 def test_equal_assets_give_equal_bytes(room, exported, tmp_path):
@@ -152,6 +152,25 @@ def surface(**inputs):
         corner_normals=np.tile(np.float32([0, 0, 1]), (1, 3, 1)),
         material=preview_material(**maps),
     )
+
+
+def test_glass_is_there_and_lets_all_light_pass(tmp_path):
+    green = np.full((2, 2, 3), (0.1, 0.5, 0.2), np.float32)
+    pane = surface(diffuse=green, ior=1.4)
+    pane = replace(pane, material=replace(pane.material, clear=True))
+    write_glb(tmp_path / "pane.glb", [pane, surface()], None, pytest.fail)
+    tree = document(tmp_path / "pane.glb")
+    clear, opaque = tree["materials"]
+    assert clear["extensions"]["KHR_materials_transmission"] == {"transmissionFactor": 1}
+    assert clear["extensions"]["KHR_materials_ior"]["ior"] == pytest.approx(1.4, rel=1e-4)
+    assert clear["pbrMetallicRoughness"]["baseColorFactor"][:3] == [1, 1, 1]
+    # Viewers without transmission show a faint pane; alpha 0 would be no surface at all.
+    assert 0.1 < clear["pbrMetallicRoughness"]["baseColorFactor"][3] < 0.5
+    assert clear["alphaMode"] == "BLEND"
+    assert "baseColorTexture" not in clear["pbrMetallicRoughness"]
+    assert "KHR_materials_transmission" in tree["extensionsUsed"]
+    assert opaque["extensions"].keys() == {"KHR_materials_ior"}
+    assert "alphaMode" not in opaque
 
 
 @pytest.mark.parametrize("ior", [1.0, 1.33, 1.789])

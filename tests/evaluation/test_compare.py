@@ -124,6 +124,13 @@ def test_assets_without_a_common_object_are_refused(room, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_assets_that_are_merely_textured_are_refused(tmp_path):
+    asset = textured(make_capture(tmp_path / "scan"), tmp_path / "a")
+    with pytest.raises(InputRefused, match=r"a has no irradiance and no albedo.*\[compare.maps\]"):
+        usdbrdf.compare(asset, asset, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_assets_in_different_places_are_refused(room):
     _, atlas = measured_atlas(room.asset)
     far = measured_atlas(room.asset)[1]

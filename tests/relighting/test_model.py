@@ -23,7 +23,7 @@ from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.model.light import SkyLight
 from usdbrdf.model.material import Surface
 from usdbrdf.options import Insert, RelightOptions
-from usdbrdf.relighting.relit_scene import relit_scene, surfaces_from_model
+from usdbrdf.relighting.relit_scene import relit_scene, surfaces_from_model, with_material
 from usdbrdf.relighting.render import mitsuba_variant
 from usdbrdf.untrusted import bounds
 
@@ -358,3 +358,88 @@ def test_a_part_that_ends_after_the_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(content)
     with pytest.raises(InputRefused, match=r"ends \d+ bytes after the file.*\[mesh\.read\]$"):
         surfaces_from_model(tmp_path / "a.glb")
+
+
+def _glb_of(path: Path, stuff: dict[str, Any], colours: Any = None, picture: Any = None) -> Surface:
+    """What is read of a box of a material as its GLB says it."""
+    box = _box()
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((8, 2)), material=PBRMaterial(name="a", baseColorTexture=picture)
+    )
+
+    def change(document: dict[str, Any]) -> None:
+        inner = document["materials"][0].get("pbrMetallicRoughness", {})
+        kept = {k: inner[k] for k in ("baseColorTexture",) if k in inner}
+        inner = kept | stuff.pop("pbrMetallicRoughness", {})
+        document["materials"] = [{"pbrMetallicRoughness": inner, **stuff}]
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        if colours is not None:
+            attributes["COLOR_0"] = attributes.pop("_COLOUR")
+
+    if colours is not None:
+        box.vertex_attributes["_COLOUR"] = np.tile(np.array(colours, np.float32), (8, 1))
+    (found,) = surfaces_from_model(_changed_glb(path, change, box))
+    return found
+
+
+def test_what_a_glb_does_not_say_of_its_material_is_one(tmp_path: Path) -> None:
+    said = {"pbrMetallicRoughness": {"baseColorFactor": [1, 0.2, 0, 1]}}
+    found = _glb_of(tmp_path / "a.glb", said).material
+    assert found.roughness.ravel() == pytest.approx([1])
+    assert found.f0.ravel() == pytest.approx([1, 0.2, 0])
+    assert not found.diffuse.any()
+    (without,) = surfaces_from_model(_changed_glb(tmp_path / "b.glb", lambda document: None))
+    assert without.material.f0.ravel() == pytest.approx([1, 1, 1])
+    assert without.material.roughness.ravel() == pytest.approx([1])
+
+
+def test_extensions_of_a_glb_material(tmp_path: Path) -> None:
+    said = {
+        "pbrMetallicRoughness": {"metallicFactor": 0},
+        "emissiveFactor": [1, 0.5, 0],
+        "extensions": {
+            "KHR_materials_emissive_strength": {"emissiveStrength": 40.0},
+            "KHR_materials_ior": {"ior": 2.0},
+        },
+    }
+    found = _glb_of(tmp_path / "a.glb", said).material
+    assert found.emission.ravel() == pytest.approx([40, 20, 0])
+    assert found.f0.ravel() == pytest.approx([1 / 9] * 3)
+    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": -1}}
+    with pytest.raises(InputRefused, match=r"b\.glb: .*emissiveStrength -1.*\[mesh\.read\]$"):
+        _glb_of(tmp_path / "b.glb", {"extensions": strength})
+
+
+def test_vertex_colours_of_a_glb_are_linear_and_multiply_its_base_colour(tmp_path: Path) -> None:
+    colour = [0.5, 0.001, 2.0]  # which glTF clamps
+    matte = {"baseColorFactor": [0.2, 1, 1, 1], "metallicFactor": 0}
+    found = _glb_of(tmp_path / "a.glb", {"pbrMetallicRoughness": matte}, colour)
+    assert found.corner_colour is not None
+    assert found.corner_colour[0, 0] == pytest.approx([0.1, 0.001, 1])
+    assert found.corner_f0 is None
+    metal = _glb_of(tmp_path / "b.glb", {}, colour)
+    assert metal.corner_f0 is not None
+    assert metal.corner_f0[0, 0] == pytest.approx([0.5, 0.001, 1], rel=1e-4)
+    # What was metal shows the same colours as a dielectric.
+    plain = with_material(metal, Insert(model=tmp_path / "b.glb", ior=1.5))
+    assert plain.corner_f0 is None
+    assert plain.corner_colour is not None
+    assert plain.corner_colour[0, 0] == pytest.approx([0.5, 0.001, 1], rel=1e-4)
+
+
+def test_beside_a_picture_the_mean_of_vertex_colours_counts(tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image", reason="textures of GLB need pillow")
+    picture = image.fromarray(np.full((2, 2, 3), 255, np.uint8))
+    matte = {"pbrMetallicRoughness": {"metallicFactor": 0}}
+    found = _glb_of(tmp_path / "a.glb", matte, [0.5, 0.25, 1], picture)
+    assert found.corner_colour is None
+    assert found.material.diffuse[1, 1] == pytest.approx([0.5, 0.25, 1])
+
+
+def test_vertex_colours_without_a_material_are_linear_too(tmp_path: Path) -> None:
+    box = _box()
+    box.visual.vertex_colors = np.tile(np.array([[255, 128, 51, 255]], np.uint8), (8, 1))
+    box.export(tmp_path / "a.glb")
+    (found,) = surfaces_from_model(tmp_path / "a.glb")
+    assert found.corner_f0 is not None
+    assert found.corner_f0[0, 0] == pytest.approx([1, 128 / 255, 0.2], abs=1e-6)

@@ -3,8 +3,9 @@
 trimesh knows no extensions, keeps colours as bytes and takes materials with equal pictures for one;
 so each material is written again, by its name, into the document that it is about to save:
 KHR_materials_ior holds the reflectance at normal incidence, KHR_materials_emissive_strength the
-radiance, 1 in the scene's unit being 1 here. The units and the diffuse term, which both models
-reduce by the Fresnel factor, are those of UsdPreviewSurface.
+radiance, 1 in the scene's unit being 1 here, and KHR_materials_transmission says what is clear.
+The units and the diffuse term, which both models reduce by the Fresnel factor, are those of
+UsdPreviewSurface.
 """
 
 from __future__ import annotations
@@ -27,12 +28,16 @@ from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.images import resized
 from usdbrdf.geometry.normal_maps import corner_tangents
 from usdbrdf.model.arrays import Byte, Float
-from usdbrdf.model.material import Material, Surface
+from usdbrdf.model.material import Material, Surface, constant_map
 
 PRIM = "usdPrim"  # of a node: the path of the prim that it was
 # trimesh writes other attributes of vertices under names that begin with a line.
 _TANGENT = "_TANGENT"
 IOR, STRENGTH = "KHR_materials_ior", "KHR_materials_emissive_strength"
+TRANSMISSION = "KHR_materials_transmission"
+# Of what is clear: viewers that know no transmission show a faint pane. Others weaken its
+# reflections by it, but 0 would be no surface at all, and 1 a white wall where it is not known.
+_PANE = 0.25
 _WRAP = {"clamp": 33071, "repeat": 10497, "mirror": 33648}
 _LINEAR, _LINEAR_MIPMAP = 9729, 9987
 
@@ -99,8 +104,10 @@ def gltf_material(
     """The material of a surface; ``warn`` is told what glTF cannot say."""
     material, said = surface.material, f"<{surface.name}>: in .glb"
     base = material.diffuse if material.base is None else material.base
+    if material.clear:  # glTF would tint by it what passes
+        base = constant_map(1.0)
     colour = np.ones(3)
-    if surface.corner_colour is not None:
+    if surface.corner_colour is not None and not material.clear:
         colour = surface.corner_colour.mean(axis=(0, 1))
         warn(f"{said} its display colours become their mean.")
     pictures: dict[str, Byte] = {}
@@ -125,12 +132,17 @@ def gltf_material(
     numbers: dict[str, Any] = {
         "pbrMetallicRoughness": {
             **factors,
-            "baseColorFactor": [*map(float, np.clip(colour, 0, 1)), float(not material.clear)],
+            "baseColorFactor": [
+                *map(float, np.clip(colour, 0, 1)),
+                _PANE if material.clear else 1.0,
+            ],
         },
         **({"alphaMode": "BLEND"} if material.clear else {}),
         "doubleSided": surface.two_sided,
         "extensions": {IOR: {"ior": ior}},
     }
+    if material.clear:
+        numbers["extensions"][TRANSMISSION] = {"transmissionFactor": 1.0}
     if material.emits:
         # A colour of at most 1 and its strength: radiance = strength * factor * texture.
         emission = _small(material.emission, max_size)

@@ -81,7 +81,7 @@ def agreement(
     """What ``compare`` returns of two assets of these names, but for the list of files; and A with
     the albedo of B, B with that of A, of the last set of maps that both have.
 
-    Raises InputRefused where the assets share no texel.
+    Raises InputRefused where the assets share no texel, or no set of maps.
     """
     forth, back = matched(a, b), matched(b, a)
     if not (forth[1].any() and back[1].any()):
@@ -89,6 +89,7 @@ def agreement(
             f"{', '.join(names)}: no texel was seen three times in both. Compare captures that "
             "show the same surfaces. [compare.surface]"
         )
+    shared = _shared_sets(a, b, names)
     for name, same in ((names[0], forth[0]), (names[1], back[0])):
         if same.missing:
             warn(f"only {name} has {', '.join(same.missing)}. [compare.objects]")
@@ -99,15 +100,36 @@ def agreement(
         "missing": [list(forth[0].missing), list(back[0].missing)],
     }
     rows: list[Row] = []
-    for key, maps in _SETS.items():
-        if not all(atlas.has(name) for atlas in (a, b) for name in maps):
-            continue
+    for key, maps in shared.items():
         pair = relit(a, b, forth, maps), relit(b, a, back, maps)
         errors = _errors(*pair, forth[1], back[1])
         found[key] = {name: error._asdict() for name, error in errors.items()}
         rows += _object_rows(key, *pair)
     found["objects"] = rows
     return found, pair
+
+
+def _shared_sets(
+    a: AssetMaps, b: AssetMaps, names: tuple[str, str]
+) -> dict[str, tuple[str, str, str]]:
+    """Those of ``_SETS`` that both assets have; InputRefused where that is none: radiance under
+    different light says nothing without irradiance."""
+    shared = {
+        key: maps
+        for key, maps in _SETS.items()
+        if all(atlas.has(name) for atlas in (a, b) for name in maps)
+    }
+    if not shared:
+        lacking = [
+            f"{name} has no {' and no '.join(missing)}"
+            for name, atlas in zip(names, (a, b), strict=True)
+            if (missing := [aov for aov in _SETS["lit"] if not atlas.has(aov)])
+        ]
+        raise InputRefused(
+            f"{'; '.join(lacking)}: without these maps nothing of two lightings can be compared. "
+            "Run `usdbrdf shade` on such assets first. [compare.maps]"
+        )
+    return shared
 
 
 def comparison_line(found: dict[str, Any]) -> str:

@@ -165,3 +165,31 @@ def preview_material(
     mixed = np.asarray(dielectric + metallic * (base - dielectric), np.float32)
     diffuse = np.asarray(base * (1 - metallic), np.float32)
     return replace(plain, diffuse=diffuse, f0=mixed, base=base, metallic=metallic)
+
+
+def with_corner_colours(
+    surface: Surface, colours: Float, metallic: float, ior: float = 1.5
+) -> Surface:
+    """The surface in base colours (F, 3, 3) of its corners, in place of its maps'; what is metal
+    of it reflects them in its lobe."""
+    material = replace(surface.material, diffuse=constant_map(1.0))
+    if not metallic:
+        return replace(surface, material=material, corner_colour=colours, corner_f0=None)
+    dielectric = normal_reflectance(ior)
+    f0 = np.asarray(dielectric + np.float32(metallic) * (colours - dielectric), np.float32)
+    mean = constant_map(*(float(value) for value in f0.reshape(-1, 3).mean(axis=0)))
+    return replace(
+        surface,
+        corner_colour=colours * np.float32(1 - metallic),
+        corner_f0=f0,
+        material=replace(material, f0=mean),
+    )
+
+
+def corner_base_colours(surface: Surface) -> Float | None:
+    """What ``with_corner_colours`` was given."""
+    metallic = surface.material.metallic
+    if surface.corner_f0 is None or surface.corner_colour is None or metallic is None:
+        return surface.corner_colour
+    share = metallic.flat[0]
+    return surface.corner_f0 if share == 1 else surface.corner_colour / np.float32(1 - share)

@@ -19,9 +19,10 @@ from usdbrdf.model.material import (
     Material,
     Surface,
     constant_map,
-    normal_reflectance,
+    corner_base_colours,
     preview_material,
     turned_up,
+    with_corner_colours,
 )
 from usdbrdf.options import Insert, RelightOptions
 from usdbrdf.transport.rays import RayScene
@@ -184,20 +185,17 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
         emission=material.emission,
         ior=ior,
     )
-    material = replace(mixed, wrap=material.wrap, lobe=material.lobe)
-    colour = surface.corner_colour
-    if colour is None or not metallic.any():
-        return replace(surface, material=material, corner_f0=None)
-    # A metal takes the colours of the corners.
-    metal, dielectric = float(metallic[0, 0, 0]), normal_reflectance(ior)
-    f0 = dielectric + np.float32(metal) * (colour - dielectric)
-    mean = constant_map(*(float(value) for value in f0.reshape(-1, 3).mean(axis=0)))
-    return replace(
+    colours = corner_base_colours(surface)
+    surface = replace(
         surface,
-        corner_colour=colour * np.float32(1 - metal),
-        corner_f0=np.asarray(f0, np.float32),
-        material=replace(material, diffuse=constant_map(1.0), f0=mean),
+        material=replace(mixed, wrap=material.wrap, lobe=material.lobe),
+        corner_colour=colours,
+        corner_f0=None,
     )
+    if colours is None or not metallic.any():
+        return surface
+    # A metal takes the colours of the corners.
+    return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), ior)
 
 
 def placed(

@@ -22,8 +22,20 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Bool, Float, Int
-from usdbrdf.model.material import Material, Surface, constant_map, preview_material
+from usdbrdf.model.material import (
+    Material,
+    Surface,
+    constant_map,
+    preview_material,
+    with_corner_colours,
+)
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
+from usdbrdf.untrusted.mesh_gltf import (
+    emissive_strength,
+    index_of_refraction,
+    taken_colours,
+    with_numbered_materials,
+)
 from usdbrdf.untrusted.mesh_text import binary_ply_of_polygons, obj_counted_forwards
 
 SUFFIXES = (".ply", ".obj", ".glb")
@@ -74,9 +86,10 @@ def mesh_from_file(path: Path) -> FileMesh:
 def model_from_file(path: Path) -> tuple[Surface, ...]:
     """The meshes of a file with their materials, in the file's own axes and units.
 
-    Base colour, its texture, vertex colours, metalness, roughness and emission are read; images
-    and 8-bit colours are sRGB, as these formats say. What an OBJ or GLB names must lie in its
-    folder. Corner normals are NaN where the file brings none.
+    Base colour, its texture, vertex colours, metalness, roughness, emission and a GLB's index of
+    refraction are read. Images are sRGB, and so are vertex colours but a GLB's, which are linear;
+    beside maps the mean of these counts. What an OBJ or GLB names must lie in its folder. Corner
+    normals are NaN where the file brings none.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
@@ -283,22 +296,27 @@ def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
     if path.suffix.lower() == ".obj":
         file = obj_counted_forwards(file)
+    gltf = None
+    if path.suffix.lower() == ".glb":
+        file, gltf = with_numbered_materials(file)
     stored = load(file, resolver=beside)
     if beside.refused:
         raise beside.refused[0]
     # Normals are kept apart: a mesh of trimesh makes them up where there are none.
     meshes = list(stored["geometry"].values()) if "geometry" in stored else [stored]
     normals = [mesh.pop("vertex_normals", None) for mesh in meshes]
+    colours = [None if gltf is None else taken_colours(mesh) for mesh in meshes]
     for mesh in meshes:
         mesh["process"] = False
     scene = trimesh.load_scene(stored)
-    normals_of = dict(zip(scene.geometry, normals, strict=True))
+    given = dict(zip(scene.geometry, zip(normals, colours, strict=True), strict=True))
     found = []
     for node in sorted(scene.graph.nodes_geometry):
         world_from_node, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            surface = _surface(f"{path.name}:{node}", mesh, normals_of[name])
+            own_normals, own_colours = given[name]
+            surface = _surface(f"{path.name}:{node}", mesh, own_normals, own_colours, gltf)
             found.append(surface.moved(np.asarray(world_from_node)))
     return found
 
@@ -326,68 +344,103 @@ class _FilesBeside:
     __getitem__ = get
 
 
-def _surface(name: str, mesh: Any, normals: Any) -> Surface:
+def _surface(
+    name: str, mesh: Any, normals: Any, colours: Any, gltf: list[dict[str, Any]] | None
+) -> Surface:
+    """gltf  the materials of a GLB, whose vertex colours are given; None of other formats"""
     points = np.asarray(mesh.vertices, np.float64)
     triangles = np.ascontiguousarray(mesh.faces, np.int32)
     uv = getattr(mesh.visual, "uv", None)
     corner_uv = None
     if uv is not None and len(uv) == len(points):
         corner_uv = np.asarray(uv, np.float32)[triangles]
-    material = _material(mesh.visual, textured=corner_uv is not None)
-    corner_colour = None
-    if mesh.visual.kind == "vertex":
-        colours = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / np.float32(255)
-        corner_colour = to_working_space(colours[None], "srgb_rec709_scene")[0][triangles]
-        material = _plain_material(diffuse=constant_map(1.0), roughness=material.roughness)
+    if gltf is None and mesh.visual.kind == "vertex":
+        stored = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / np.float32(255)
+        colours = to_working_space(stored[None], "srgb_rec709_scene")[0]
+    if colours is not None and len(colours) != len(points):
+        colours = None
+    inputs = _inputs(mesh.visual, gltf, textured=corner_uv is not None)
+    if inputs is None:
+        inputs = _defaults(gltf is not None, coloured=colours is not None)
     corner_normals = np.full((*triangles.shape, 3), np.nan, np.float32)
     if normals is not None and len(normals) == len(points):
         given = np.asarray(normals, np.float32)[triangles]
         length = np.linalg.norm(given, axis=-1, keepdims=True)
         if np.isfinite(given).all() and (length > 1e-6).all():
             corner_normals = np.asarray(given / length, np.float32)
-    return Surface(
+    surface = Surface(
         name=name,
         points=points,
         triangles=triangles,
         corner_normals=corner_normals,
         corner_uv=corner_uv,
-        corner_colour=corner_colour,
-        material=material,
+        material=inputs.material,
+    )
+    return surface if colours is None else _coloured(surface, inputs, colours[triangles])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Inputs:
+    """Those of ``preview_material``."""
+
+    diffuse: Float
+    metallic: Float
+    roughness: Float
+    emission: Float
+    ior: float = _IOR
+
+    @property
+    def material(self) -> Material:
+        # The default of OBJ and of glTF, whose samplers the reader does not keep.
+        return replace(preview_material(**vars(self)), wrap="repeat")
+
+
+def _coloured(surface: Surface, inputs: _Inputs, colours: Float) -> Surface:
+    """The surface with its base colour times ``colours`` (F, 3, 3). A renderer has colours of
+    corners or a map; beside maps their mean counts."""
+    if inputs.diffuse.shape[:2] == inputs.metallic.shape[:2] == (1, 1):
+        metallic = float(inputs.metallic[0, 0, 0])
+        return with_corner_colours(surface, inputs.diffuse * colours, metallic, inputs.ior)
+    mean = colours.mean(axis=(0, 1), dtype=np.float32)
+    return replace(surface, material=replace(inputs, diffuse=inputs.diffuse * mean).material)
+
+
+def _defaults(gltf: bool, *, coloured: bool) -> _Inputs:
+    """Where a file has no material; glTF says that it is then one of white metal."""
+    return _Inputs(
+        diffuse=constant_map(1.0 if gltf or coloured else _GREY),
+        metallic=constant_map(float(gltf))[..., :1],
+        roughness=constant_map(1.0 if gltf else _ROUGHNESS)[..., :1],
+        emission=constant_map(0.0),
     )
 
 
-def _plain_material(*, diffuse: Float, roughness: Float) -> Material:
-    """No metal, no light."""
-    black = constant_map(0.0)
-    return preview_material(
-        diffuse=diffuse, metallic=black[..., :1], roughness=roughness, emission=black, ior=_IOR
-    )
-
-
-def _material(visual: Any, *, textured: bool) -> Material:
+def _inputs(visual: Any, gltf: list[dict[str, Any]] | None, *, textured: bool) -> _Inputs | None:
+    """None where there is no material."""
     stored = getattr(visual, "material", None)
     if visual.kind != "texture" or stored is None:
-        roughness = constant_map(_ROUGHNESS)[..., :1]
-        return _plain_material(diffuse=constant_map(_GREY), roughness=roughness)
+        return None
     if hasattr(stored, "to_pbr"):  # the OBJ's Phong-like one
         stored = stored.to_pbr()
     base = _factor(stored.baseColorFactor, 3, 1.0)
-    metal_rough = _image(stored.metallicRoughnessTexture) if textured else None
-    metallic = _factor(stored.metallicFactor, 1, 1.0 if metal_rough is not None else 0.0)
-    roughness = _factor(stored.roughnessFactor, 1, 1.0 if metal_rough is not None else _ROUGHNESS)
+    # glTF's are 1 where it says nothing.
+    metallic = _factor(stored.metallicFactor, 1, 0.0 if gltf is None else 1.0)
+    roughness = _factor(stored.roughnessFactor, 1, _ROUGHNESS if gltf is None else 1.0)
     emission = _factor(stored.emissiveFactor, 3, 0.0)
     if textured and (picture := _image(stored.baseColorTexture)) is not None:
         base = base * to_working_space(picture, "srgb_rec709_scene")
     if textured and (picture := _image(stored.emissiveTexture)) is not None:
         emission = emission * to_working_space(picture, "srgb_rec709_scene")
-    if metal_rough is not None:  # glTF: roughness in green, metalness in blue
-        roughness = roughness * metal_rough[..., 1:2]
-        metallic = metallic * metal_rough[..., 2:3]
-    mixed = preview_material(
-        diffuse=base, metallic=metallic, roughness=roughness, emission=emission, ior=_IOR
-    )
-    # The default of OBJ and of glTF, whose samplers the reader does not keep.
-    return replace(mixed, wrap="repeat")
+    if textured and (picture := _image(stored.metallicRoughnessTexture)) is not None:
+        # glTF: roughness in green, metalness in blue
+        roughness = roughness * picture[..., 1:2]
+        metallic = metallic * picture[..., 2:3]
+    found = _Inputs(diffuse=base, metallic=metallic, roughness=roughness, emission=emission)
+    if not gltf:
+        return found
+    said = gltf[int(stored.name)]
+    strength = np.float32(emissive_strength(said))
+    return replace(found, emission=emission * strength, ior=index_of_refraction(said))
 
 
 def _factor(value: Any, channels: int, fallback: float) -> Float:

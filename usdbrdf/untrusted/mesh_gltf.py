@@ -1,0 +1,66 @@
+"""What trimesh does not keep of a GLB: its materials' extensions, its vertex colours as stored."""
+
+from __future__ import annotations
+
+import json
+import struct
+from io import BytesIO
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from usdbrdf.model.arrays import Float
+
+_HEAD = 12  # bytes before the first part; each part begins with 8 more
+
+
+def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, Any]]]:
+    """The GLB with its materials' numbers for their names, by which they are known again when
+    trimesh has read them; and the materials of its document."""
+    content = file.read()
+    start = _HEAD + 8
+    end = start + int.from_bytes(content[_HEAD : _HEAD + 4], "little")
+    document = json.loads(content[start:end])
+    materials: list[dict[str, Any]] = document.get("materials", [])
+    if materials:
+        document["materials"] = [m | {"name": str(i)} for i, m in enumerate(materials)]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    size = start + len(text) + len(content) - end
+    head = struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON")
+    return BytesIO(head + text + content[end:]), materials
+
+
+def emissive_strength(material: dict[str, Any]) -> float:
+    """The factor on the emission, 1 where the material says none."""
+    strength = float(_extension(material, "emissive_strength").get("emissiveStrength", 1))
+    if not 0 <= strength < np.inf:
+        raise ValueError(f"emissiveStrength {strength:g}")
+    return strength
+
+
+def index_of_refraction(material: dict[str, Any]) -> float:
+    """1.5 where the material says none. 0 is glTF's infinite one: it reflects all."""
+    ior = float(_extension(material, "ior").get("ior", 1.5))
+    if not (ior == 0 or 1 <= ior < np.inf):
+        raise ValueError(f"ior {ior:g}")
+    return ior
+
+
+def _extension(material: dict[str, Any], name: str) -> dict[str, Any]:
+    found: dict[str, Any] = material.get("extensions", {}).get(f"KHR_materials_{name}", {})
+    return found
+
+
+def taken_colours(mesh: dict[str, Any]) -> Float | None:
+    """COLOR_0 of what trimesh makes a mesh of, linear, (V, 3) float32, taken out of it: the mesh
+    would have it as bytes. Beside a material trimesh puts it elsewhere."""
+    stored = mesh.pop("vertex_colors", None)
+    if stored is None and "visual" in mesh:
+        stored = mesh["visual"].vertex_attributes.get("color")
+    if stored is None:
+        return None
+    colours = np.asarray(stored)[:, :3]
+    whole = 1 if colours.dtype.kind == "f" else np.iinfo(colours.dtype).max
+    # The specification has them clamped.
+    return np.asarray(np.clip(np.nan_to_num(colours) / whole, 0, 1), np.float32)
