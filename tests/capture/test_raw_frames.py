@@ -25,7 +25,7 @@ PATCHES = np.array([[0.3, 0.3, 0.3], [0.4, 0.2, 0.15], [0.1, 0.25, 0.12], [0.12,
 SIDE = 32
 
 
-def write_dng(path, exposure_s, *, light=1.0, neutral=None, clipped=False):
+def write_dng(path, exposure_s, *, light=1.0, neutral=None, clipped=False, more=()):
     """Patches in a row, RGGB, exposed so that at 1/50 s a radiance of 1 is half of the range."""
     white = CAMERA @ XYZ @ np.ones(3)
     neutral = white / white.max() if neutral is None else neutral
@@ -54,6 +54,7 @@ def write_dng(path, exposure_s, *, light=1.0, neutral=None, clipped=False):
         (50728, "2I", 3, ratios(neutral), True),  # AsShotNeutral
         (33434, "2I", 1, (1, round(1 / exposure_s)), True),
         (34855, "H", 1, 100, True),
+        *more,
     ]
     tifffile.imwrite(path, codes, photometric=32803, planarconfig=1, extratags=tags, metadata=None)
 
@@ -108,6 +109,38 @@ def test_colours_exposures_and_clipping_come_out_right(capture, tmp_path, capsys
     assert (tmp_path / "developed/mesh.ply").is_file()
     mask = tmp_path / "developed" / document["frames"][1]["mask_path"]
     assert mask.read_bytes() == (capture / "masks/0001.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("stated", "left", "size"),
+    [
+        ((112, 24), 10, (112, 24)),
+        ((56, 12), 10, (112, 24)),
+        (None, 10, (112, 24)),
+        ((124, 30), 4, (124, 30)),
+        ((24, 112), 4, (124, 30)),
+    ],
+)
+def test_frames_are_the_part_of_the_sensor_that_the_intrinsics_are_for(
+    tmp_path, stated, left, size
+):
+    """Of a sensor with margins and a border, whose camera was held upright."""
+    made = make_capture(tmp_path / "capture", frames=1, size=(4 * SIDE, SIDE))
+    active, origin, cropped = (2, 4, SIDE, 4 * SIDE), (6, 2), (112, 24)
+    more = [(50829, "I", 4, active, True), (50719, "I", 2, origin, True)]
+    more += [(50720, "I", 2, cropped, True), (274, "H", 1, 6, True)]
+    write_dng(made.folder / "frames/0000.dng", 1 / 50, more=more)
+    with edited(made.folder / "transforms.json") as document:
+        document["frames"][0]["file_path"] = "frames/0000.dng"
+        document.update(zip("wh", stated or (None, None), strict=True))
+    develop_raw(made.folder, tmp_path / "developed")
+    (written,) = (tmp_path / "developed/frames").iterdir()
+    pixels = read_radiance(written)
+    assert pixels.shape[1::-1] == size
+    # Beside each border between two patches there is one of them alone, where it lay.
+    for i in range(1, 4):
+        before, behind = (pixels[6:-6, SIDE * i - left + k].mean(0) for k in (-5, 4))
+        assert np.allclose(before / behind, PATCHES[i - 1] / PATCHES[i], rtol=0.02)
 
 
 def test_what_cannot_be_developed_is_refused(capture, tmp_path, monkeypatch):

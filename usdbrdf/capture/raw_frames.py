@@ -2,12 +2,15 @@
 
 Black level, saturation, mosaic and the camera's matrix are LibRaw's. All frames get one white
 balance, the median of what the camera set: by its own for each frame one surface would have many
-colours. Radiance has one unit for all frames, which has no other meaning.
+colours. Radiance has one unit for all frames, which has no other meaning. The sensor's border is
+left out as in the camera's own JPEGs, of which intrinsics mostly are; like these as they are
+stored, frames have the sensor's orientation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +54,8 @@ def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
         numbered = progress(list(enumerate(files)), total=len(files), label="raw", unit="frames")
         for i, file in numbered:
             name = f"frames/{i:05d}_{file.stem}.exr"
-            pixels, saturation, share = developed_raw(raw_picture(file), balance, scales[i])
+            picture = _as_stated(raw_picture(file), _stated_size(document, entries[i]))
+            pixels, saturation, share = developed_raw(picture, balance, scales[i])
             write_exr(staged / name, pixels, half=not needs_float(pixels))
             clipped.append(share)
             kept = {k: v for k, v in entries[i].items() if k != "noise_floor_radiance"}
@@ -93,6 +97,29 @@ def developed_raw(picture: RawPicture, balance: Double, scale: float) -> tuple[F
     pixels = np.where(full, np.maximum(pixels, 1), np.maximum(pixels, 0))
     radiance = (pixels * np.float32(scale)).astype(np.float32)
     return radiance, float(scale), float(full.any(axis=2).mean())
+
+
+def _stated_size(
+    document: Mapping[str, Any], entry: Mapping[str, Any]
+) -> tuple[float, float] | None:
+    """Width and height that a frame's intrinsics are for, where it or the document says."""
+    width, height = (entry.get(key, document.get(key)) for key in "wh")
+    if isinstance(width, int | float) and isinstance(height, int | float):
+        return width, height
+    return None
+
+
+def _as_stated(picture: RawPicture, size: tuple[float, float] | None) -> RawPicture:
+    """The picture without the border that its file states, if ``size`` is that of the rest, or of a
+    smaller image of its shape, or not known; else all of the sensor, which some programs develop.
+    """
+    left, top, width, height = picture.crop
+    rows, columns = picture.sensor.shape[:2]
+    across, down = size or (width, height)
+    if (across, down) == (columns, rows) or abs(width * down - height * across) >= across:
+        return picture
+    inside = picture.sensor[top : top + height, left : left + width]
+    return replace(picture, sensor=inside, crop=(0, 0, width, height))
 
 
 def _raw_file(source: Path, entry: dict[str, Any]) -> Path:

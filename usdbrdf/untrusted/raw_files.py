@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,8 @@ class RawPicture:
 
     sensor         (H, W, 3) float32: the three channels in the sensor's own colours and
                    orientation, 0 at its black level and 1 at saturation, before any white balance
+    crop           left, top, width and height of the part of it that the file says is the picture,
+                   as the camera's own JPEG shows it; all of it where the file says nothing
     white_balance  (3,) float64, factors as shot, of which green's is 1
     rec709_from_camera  (3, 3) float64, of balanced channels; white stays white
     exposure       time in seconds x ISO / 100 / f-number^2, as far as the file tells; NaN without
@@ -34,6 +37,7 @@ class RawPicture:
     """
 
     sensor: Float
+    crop: tuple[int, int, int, int]
     white_balance: Double
     rec709_from_camera: Double
     exposure: float
@@ -63,7 +67,7 @@ def read_here(path: Path) -> RawPicture:
                     "to a scene-linear EXR. [raw.colours]"
                 )
             matrix = _rec709_from_camera(path, raw.rgb_xyz_matrix[:3], raw.color_matrix[:, :3])
-            shot = raw.other
+            shot, sizes = raw.other, raw.sizes
             # The largest factor is 1 then: no channel is cut off below its own saturation.
             codes = raw.postprocess(
                 output_color=rawpy.ColorSpace.raw,
@@ -88,10 +92,25 @@ def read_here(path: Path) -> RawPicture:
     exposure = time * ((speed if speed > 0 else 100) / 100) / (number if number > 0 else 1) ** 2
     return RawPicture(
         sensor=sensor,
+        crop=_crop(sizes, *sensor.shape[:2]),
         white_balance=given / given[1],
         rec709_from_camera=matrix,
         exposure=exposure if known else math.nan,
     )
+
+
+def _crop(sizes: Any, rows: int, columns: int) -> tuple[int, int, int, int]:
+    """``RawPicture.crop`` of so many rows and columns, which are the sensor without its margins;
+    LibRaw counts from its corner, margins and all, and says 0 where the file states none."""
+    left = sizes.crop_left_margin - sizes.left_margin
+    top = sizes.crop_top_margin - sizes.top_margin
+    width, height = sizes.crop_width, sizes.crop_height
+    inside = 0 <= left <= columns - width and 0 <= top <= rows - height
+    # Pixels that are not square, and sensors that are turned by 45 degrees, have been resampled.
+    as_stored = (rows, columns) == (sizes.height, sizes.width)
+    if not (inside and as_stored and width > 0 and height > 0):
+        return 0, 0, columns, rows
+    return left, top, width, height
 
 
 def _rec709_from_camera(path: Path, camera_from_xyz: Double, given: Double) -> Double:
