@@ -7,7 +7,7 @@ import pytest
 
 from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.material.seen_through import Through, radiance_behind, seen_through
-from usdbrdf.material.verdict import MOST_CONTRADICTED, LobeEstimate
+from usdbrdf.material.verdict import MOST_OF_MEASURED, LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, points_of_texels
@@ -117,7 +117,7 @@ def test_the_share_that_shows_through_is_found(lit: LitScene, share: float, seed
     found = _through(lit, share, seed)
     assert abs(found.share - share) < max(3 * found.error, 0.01)
     assert found.error < 0.05
-    assert (found.at_least > MOST_CONTRADICTED) == (share > MOST_CONTRADICTED)
+    assert (found.at_least > MOST_OF_MEASURED) == (share > MOST_OF_MEASURED)
 
 
 def test_behind_what_looks_alike_from_everywhere_nothing_tells(lit: LitScene):

@@ -12,6 +12,7 @@ from usdbrdf.material.verdict import (
     MAX_PSI_ERROR,
     MIN_EVIDENCE,
     MOST_CONTRADICTED,
+    MOST_OF_MEASURED,
     NEUTRAL,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
@@ -51,14 +52,19 @@ def test_psi_at_the_end_of_its_range_is_a_bound_and_no_measurement(psi: float):
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_what_views_contradict_is_no_measurement(share: float):
-    found = verdict_on_views(_lobe(contradiction=share * MOST_CONTRADICTED), True)
-    assert found.status == ("measured" if share < 1 else "prior")
+@pytest.mark.parametrize("sure", [False, True])
+def test_what_views_contradict_is_no_measurement(share: float, sure: bool):
+    """Of what has no lobe anyway, more of it is needed to say that it is seen through."""
+    most = MOST_OF_MEASURED if sure else MOST_CONTRADICTED
+    psi_error = (0.5 if sure else 1.1) * MAX_PSI_ERROR
+    given = _lobe(contradiction=share * most, psi_error=psi_error, psi_median=0.8)
+    found = verdict_on_views(given, True)
+    assert found.status == ("measured" if share < 1 and sure else "prior")
     if share > 1:
         # What shows is what comes nearest to the views.
         assert (found.phi, found.psi) == (0.1, 0.8)
         assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
-        assert found.contradiction == share * MOST_CONTRADICTED
+        assert found.contradiction == share * most
     else:
         assert math.isnan(found.contradiction)
 

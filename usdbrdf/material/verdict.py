@@ -185,6 +185,7 @@ def usual_lobe(class_name: str, label: str) -> tuple[float, float] | None:
 MIN_EVIDENCE = calibration.number("verdict.min_evidence")
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
 MOST_CONTRADICTED = calibration.number("verdict.most_contradicted")
+MOST_OF_MEASURED = calibration.number("verdict.most_contradicted_of_measured")
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
@@ -253,7 +254,8 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     phi = lobe.phi if sure[0] == "high" else lobe.phi_median
     psi = lobe.psi if sure[1] == "high" else lobe.psi_median
     contradiction = math.nan
-    if lobe.contradiction > MOST_CONTRADICTED:
+    clear = sure == ("high", "high")
+    if lobe.contradiction > (MOST_OF_MEASURED if clear else MOST_CONTRADICTED):
         contradiction, sure = lobe.contradiction, ("none", "none")
     status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
     return Verdict(
