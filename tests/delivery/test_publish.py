@@ -288,7 +288,12 @@ def test_components_have_the_number_of_their_version(room, tmp_path):
         assert {*stage.GetDefaultPrim().GetAssetInfo()} >= {"version", "payloadAssetDependencies"}
         found = {p.GetAssetInfo().get("version") for p in stage.TraverseAll() if p.GetAssetInfo()}
         assert found == {version}
-    # Nothing but the root says which version it is: the same again is none.
+        alone = Usd.Stage.Open(str(dest / version / room.asset.component("Stuhl_No_1")))
+        told = alone.GetDefaultPrim().GetAssetInfo()
+        assert (told["version"], told["name"]) == (version, "Stuhl_No_1")
+        assert any(prim.IsA(UsdGeom.Mesh) for prim in alone.TraverseAll())
+        assert next(changes(dest / version), None) is None
+    # What says which version it is counts for no change: the same again is none.
     assert publish(room.asset.folder, dest)["new"] is False
 
 

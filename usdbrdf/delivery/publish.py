@@ -14,6 +14,7 @@ from typing import Any
 
 from pxr import Sdf
 
+from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
@@ -190,6 +191,10 @@ def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) ->
     for path, sha256 in files.items():
         if path != root:
             said.update(f"{path}\0{sha256}\n".encode())
+    # Afterwards, for the number is no content.
+    for own in {asset.component(path.name) for path in components} & files.keys():
+        _tell_alone(folder / own, version)
+        files[own] = sha256_of(folder / own)
     manifest = Manifest(
         name=asset.name,
         version=version,
@@ -226,11 +231,18 @@ def _identifier(template: str | None, name: str, version: str) -> str:
 
 
 def _unpublished(asset: Asset) -> list[Sdf.Path]:
-    """Components, which get the version's number where the root layer says its own: other layers
-    are the same in every version that says the same."""
+    """Components, which get the version's number where the root layer says its own, and in their
+    own files: other layers are the same in every version that says the same."""
     stage = open_edited(asset)
     known = ((prim.GetPath(), prim.GetAssetInfo().get("version")) for prim in stage.TraverseAll())
     return [path for path, version in known if version == UNPUBLISHED]
+
+
+def _tell_alone(file: Path, version: str) -> None:
+    """The file of an object, which composes without the root layer's opinions of it."""
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))
+    _tell(layer.GetPrimAtPath(f"/{layer.defaultPrim}"), version=version)
+    export(layer, file, folder=file.parent)
 
 
 def _tell(prim: Sdf.PrimSpec, **info: object) -> None:
