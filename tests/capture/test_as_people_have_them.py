@@ -160,6 +160,23 @@ def test_frames_of_another_folder_are_named_by_it(made, tmp_path):
     assert {path.parent for path in scan.frames.image_paths} == {(tmp_path / "radiance").resolve()}
 
 
+def test_radiance_beside_the_jpegs_that_are_named_is_taken(made):
+    """But not what has no colours, as depths."""
+    _as_photographs(made, ".jpg")
+    for i in range(12):
+        _write_bytes(made.folder / f"photographs/{i:04d}.exr", read_exr(made.image(i))[..., :1])
+    assert not _read(made, assume_srgb=True).frames.radiometric
+    for i in range(12):
+        shutil.copy(made.image(i), made.folder / f"photographs/{i:04d}.exr")
+    (made.folder / "photographs/0004.jpg").unlink()
+    scan = _read(made)
+    assert scan.frames.radiometric
+    assert {path.suffix for path in scan.frames.image_paths} == {".exr"}
+    (told,) = (s for s in scan.warnings if "radiance beside them" in s)
+    assert "11 of the JPEGs" in told
+    assert "'0000.exr' for '0000.jpg'. [capture.file]" in told
+
+
 def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):
     """Which may be its depths."""
     _as_photographs(made, ".jpg")

@@ -60,6 +60,19 @@ def test_cameras_of_the_table(tmp_path, room, header, separator):
     assert (scan.adapter, scan.up_axis) == ("realityscan", "Z")
 
 
+def test_radiance_beside_the_pictures_is_taken_with_their_masks(tmp_path, room):
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"IMG_{i:04d}.exr", image)
+        write_image(folder / "masks" / f"IMG_{i:04d}.jpg.png", np.ones_like(image))
+    scan = read_scan(folder, IngestOptions())
+    assert {path.suffix for path in scan.frames.photographs} == {".exr"}
+    assert scan.frames.radiometric
+    assert all(scan.frames.masks)
+    assert [s for s in scan.warnings if "10 of the JPEGs" in s and "[capture.file]" in s]
+    assert not [s for s in scan.warnings if "[capture.unused]" in s]
+
+
 @pytest.mark.parametrize("as_attributes", [False, True])
 def test_cameras_of_sidecars(tmp_path, room, as_attributes):
     folder = write_sidecars(tmp_path / "scan", room, as_attributes=as_attributes)

@@ -76,7 +76,8 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     many_cameras(stage, room, unit=0.01)
     stage.Save()
     for i, image in enumerate(room.images):
-        write_image(tmp_path / "shot" / "images" / f"IMG-{i:03d}.exr", image)
+        for kind in ("exr", "jpg"):
+            write_image(tmp_path / "shot" / "images" / f"IMG-{i:03d}.{kind}", image)
         write_image(tmp_path / "shot" / "images" / "thumbnails" / f"{i:03d}.png", image)
     assert choose_adapter(tmp_path / "shot").name == "usd"
     scan = read_scan(tmp_path / "shot" / "room.usda", IngestOptions())

@@ -210,7 +210,7 @@ def refuse_photographs(
         other = next(p for p in paths if p not in photographs)
         raise InputRefused(
             f"{photographs[0]}: a low dynamic range image in one capture with {other.name}. "
-            "Use images of one kind. [capture.ldr]"
+            "Use images of one kind; radiance beside a JPEG is taken for it. [capture.ldr]"
         )
     if not assume_srgb:
         kind = photographs[0].suffix[1:].upper()

@@ -19,6 +19,7 @@ from usdbrdf.capture.formats.named_pictures import (
     mesh_beside,
     pictures_of,
     scan_of,
+    warn_of_radiance,
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
@@ -63,6 +64,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "e57unpack do), or name the folder with --frames. [capture.frames]"
         )
     records = frame_records(taken, pictures, findings)
+    warn_of_radiance(pictures.instead, findings, source)
     mesh = partial(
         mesh_beside,
         folder,

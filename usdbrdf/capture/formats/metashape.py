@@ -25,6 +25,7 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
+    warn_of_radiance,
     warn_of_unused,
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
@@ -68,6 +69,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     pictures = pictures_of(folder, options)
     refuse_without_pictures(pictures, source)
     records = frame_records(source, pictures, options, findings)
+    warn_of_radiance(pictures.instead, findings, source)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     mesh = partial(
         mesh_beside,

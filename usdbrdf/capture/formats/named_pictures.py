@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,8 +22,9 @@ from usdbrdf.capture.parts import (
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
+from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -35,6 +36,9 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
+# Poses are found of JPEGs, and their radiance, beside them, is taken instead. PNG has its depths or
+# normals there more often.
+_JPEG, _RADIANCE = (".jpg", ".jpeg"), (".exr", ".hdr")
 # Where programs put the pictures, beside what they say of them.
 _FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
@@ -69,16 +73,19 @@ def rigid_pose(rotation: Double, centre: Double) -> Double:
 class Pictures:
     """The pictures below some folder, to be asked for by the names that documents have for them.
 
-    folder  absolute; nothing outside it is found
-    paths   all of them, absolute, sorted
+    folder   absolute; nothing outside it is found
+    paths    all of them, absolute, sorted
+    instead  of JPEGs that were asked for the radiance beside them, which was taken
     """
 
     folder: Path
     paths: tuple[Path, ...]
+    instead: dict[Path, Path] = field(default_factory=dict)
 
     def named(self, label: str) -> Path | None:
         """The picture of this name: by its path below the folder, else by the end of its path, else
-        by its name alone, each with its suffix or another; None where there is none or several."""
+        by its name alone, each with its suffix or another; of a JPEG that has some beside it its
+        radiance; None where there is none or several."""
         wanted = PurePosixPath(label.replace("\\", "/").lstrip("./"))
         stem = wanted.with_suffix("") if wanted.suffix.lower() in SUFFIXES else wanted
         searches: tuple[Callable[[PurePosixPath], bool], ...] = (
@@ -91,21 +98,21 @@ class Pictures:
         candidates = self._by_stem.get(stem.name, ())
         for search in searches:
             found = [path for path, relative in candidates if search(relative)]
-            best = min((_nearness(path) for path in found), default=0)
-            found = [path for path in found if _nearness(path) == best]
             if found:
-                return found[0] if len(found) == 1 else None
+                path = nearest_to_radiance(found)
+                return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
         return None
 
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
-        """``mask_beside`` of a picture by its path below the pictures' folder, else by its name
-        alone, where no other folder has a picture of this name."""
-        relative = picture.relative_to(self.folder).as_posix()
-        found = mask_beside(folder, relative, options)
-        if found is not None or relative == picture.name:
-            return found
-        alike = {path.parent for path, _ in self._by_stem[picture.stem]}
-        return mask_beside(folder, picture.name, options) if len(alike) == 1 else None
+        """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
+        pictures' folder, else by its name alone, where no other folder has a picture of it."""
+        alike = [path for path, _ in self._by_stem[picture.stem]]
+        beside = [path for path in alike if path.parent == picture.parent]
+        names = [path.relative_to(self.folder).as_posix() for path in beside]
+        if len(beside) == len(alike):
+            names += [path.name for path in beside]
+        masks = (mask_beside(folder, name, options) for name in dict.fromkeys(names))
+        return next((mask for mask in masks if mask is not None), None)
 
     @cached_property
     def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
@@ -128,6 +135,44 @@ class Pictures:
 
 def _nearness(path: Path) -> int:
     return SUFFIXES.index(path.suffix.lower())
+
+
+def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
+    """Of pictures that may be the one that is meant; None where several of one kind are."""
+    best = min(map(_nearness, found), default=0)
+    nearest = [path for path in found if _nearness(path) == best]
+    return nearest[0] if len(nearest) == 1 else None
+
+
+def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -> Path:
+    """A picture, or of a JPEG the radiance beside it, of those ``alike`` in name, which is noted in
+    ``instead``."""
+    if path.suffix.lower() in _JPEG:
+        radiance = [p for p in alike if p.parent == path.parent and _is_radiance(p)]
+        if found := nearest_to_radiance(radiance):
+            instead[path] = found
+            return found
+    return path
+
+
+def _is_radiance(path: Path) -> bool:
+    """Whether a picture beside a JPEG is its radiance: without colours it is its depths."""
+    if path.suffix.lower() not in _RADIANCE:
+        return False
+    try:
+        return {"r", "g", "b"} <= {name.lower() for name in image_size(path)[2]}
+    except ImageRefused:  # of which the reader of its pixels will tell
+        return True
+
+
+def warn_of_radiance(instead: Mapping[Path, Path], findings: Findings, source: Path) -> None:
+    """One sentence where radiance was taken instead of JPEGs that are there."""
+    if instead:
+        jpeg, radiance = next(iter(instead.items()))
+        findings.warn(
+            f"{source.name}: {len(instead)} of the JPEGs that it names have radiance beside them, "
+            f"which is taken instead, first {radiance.name!r} for {jpeg.name!r}. [capture.file]"
+        )
 
 
 def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
@@ -161,18 +206,20 @@ class Pictured:
     """The pictures that a document names by paths below a folder.
 
     otherwise  names of those that are there under another one alone, and the files that were taken
+    instead    of JPEGs that it names the radiance beside them, which was taken
     """
 
     folder: Path
     options: CaptureOptions
     otherwise: dict[str, Path] = field(default_factory=dict)
+    instead: dict[Path, Path] = field(default_factory=dict)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
 
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
-        beside it whose name differs in nothing but case and kind of picture, radiance first: poses
-        are found of JPEGs whose radiance is developed later. Of ``--frames``, the picture there
-        that has its name. None where there is none. InputRefused for what leads out."""
+        beside it whose name differs in nothing but case and kind of picture, radiance first; of a
+        JPEG that is there too, the radiance beside it. Of ``--frames``, the picture there that has
+        its name. None where there is none. InputRefused for what leads out."""
         if self.options.frames is not None:
             return self._of_frames.named(name)
         whole = f"{below}/{name}" if below else name
@@ -180,24 +227,23 @@ class Pictured:
         if "\\" in name and not path.is_file():
             whole = whole.replace("\\", "/")
             path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
-        if path.is_file():
-            return path
         beside = self._in_folder(path.parent)
         alike = beside.get(_stem(path.name), [])
+        if path.is_file():
+            return _or_radiance(path, alike, self.instead)
         suffix = path.suffix.lower()
         if any(one.suffix.lower() == suffix for found in beside.values() for one in found):
             # Where some are of the kind that is named, what is of another may be their depths.
-            alike = [one for one in alike if one.suffix.lower() == suffix]
-        best = min(map(_nearness, alike), default=0)
-        nearest = [one for one in alike if _nearness(one) == best]
-        if len(nearest) != 1:
-            return None
-        if path.name not in (nearest[0].name, nearest[0].stem):
-            self.otherwise[name] = nearest[0]
-        return nearest[0]
+            alike = [one for one in alike if one.suffix.lower() == suffix or _is_radiance(one)]
+        nearest = nearest_to_radiance(alike)
+        if nearest and path.name not in (nearest.name, nearest.stem):
+            self.otherwise[name] = nearest
+        return nearest
 
     def warn_of_others(self, findings: Findings, source: Path) -> None:
-        """One sentence where pictures were taken for others."""
+        """One sentence each where pictures were taken for others, and radiance for JPEGs."""
+        frames = self._of_frames.instead if self.options.frames is not None else {}
+        warn_of_radiance(self.instead | frames, findings, source)
         if self.otherwise:
             name, path = next(iter(self.otherwise.items()))
             findings.warn(
@@ -367,10 +413,12 @@ def warn_of_unused(
     pictures: Pictures, used: Iterable[Path], findings: Findings, source: Path
 ) -> None:
     """One sentence where pictures have no camera."""
-    left = set(pictures.paths) - set(used)
+    # Of a JPEG and its radiance one is used.
+    known = {path.with_suffix("") for path in used}
+    left = [path for path in pictures.paths if path.with_suffix("") not in known]
     if left:
         findings.count("pictures_without_camera", len(left))
         findings.warn(
             f"{source.name}: {len(left)} of {len(pictures.paths)} pictures have no camera, first "
-            f"{min(left).name!r}. [capture.unused]"
+            f"{left[0].name!r}. [capture.unused]"
         )

@@ -29,6 +29,7 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
+    warn_of_radiance,
     warn_of_unused,
 )
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -93,6 +94,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         replace(r, mask_path=pictures.mask_of(r.image_path, folder, options)) for r in records
     ]
     records.sort(key=lambda record: record.image_path)
+    warn_of_radiance(pictures.instead, findings, source)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     mesh = partial(
         mesh_beside,

@@ -22,6 +22,7 @@ from usdbrdf.capture.formats.named_pictures import (
     pictures_of,
     refuse_without_pictures,
     scan_of,
+    warn_of_radiance,
 )
 from usdbrdf.capture.parts import LabelTable
 from usdbrdf.errors import InputRefused
@@ -75,6 +76,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 mask_path=mask if mask.is_file() else None,
             )
         )
+    warn_of_radiance(pictures.instead, findings, source)
     records.sort(key=lambda record: record.image_path)
     mesh = partial(
         mesh_beside, folder, options, f"scans/{_MESH}", how=f"Download scans/{_MESH} of this scene"

@@ -19,6 +19,7 @@ from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
+    nearest_to_radiance,
     path_in_capture,
     pictures_of,
     refuse_without_pictures,
@@ -151,7 +152,7 @@ def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path |
         if math.isnan(shot.time):
             same = by_identifier.get(prim, [])
             exact = pictures.named(prim) or pictures.named(shot.camera.label)
-            return exact or (same[0] if len(same) == 1 else None)
+            return exact or nearest_to_radiance(same)
         if prim not in numbered:
             starts = re.compile(rf"{prim}\D?\d+")
             own = (p for p in pictures.paths if p.parent.name == prim or starts.fullmatch(p.stem))
