@@ -69,8 +69,16 @@ def test_radiance_beside_the_pictures_is_taken_with_their_masks(tmp_path, room):
     assert {path.suffix for path in scan.frames.photographs} == {".exr"}
     assert scan.frames.radiometric
     assert all(scan.frames.masks)
-    assert [s for s in scan.warnings if "10 of the JPEGs" in s and "[capture.file]" in s]
+    assert [s for s in scan.warnings if "10 of the photographs" in s and "[capture.file]" in s]
     assert not [s for s in scan.warnings if "[capture.unused]" in s]
+
+
+@pytest.mark.parametrize("kind", ["CR2", "HEIC"])
+def test_pictures_may_be_called_after_what_the_camera_wrote(tmp_path, room, kind):
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    table = folder / "registration.csv"
+    table.write_text(table.read_text().replace(".jpg", f".{kind}"))
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
 @pytest.mark.parametrize("as_attributes", [False, True])
