@@ -88,6 +88,24 @@ def test_cameras_of_sidecars(tmp_path, room, as_attributes):
     assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
+def test_sidecars_lie_beside_their_pictures_in_any_folder_of_these(tmp_path, room):
+    """One name in several folders, an XMP without a picture, and one of another program's."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=True)
+    images = folder / "images"
+    for i in range(10):
+        (images / "rig" / f"{i % 2}").mkdir(parents=True, exist_ok=True)
+        for kind in ("jpg", "xmp"):
+            place = images / "rig" / f"{i % 2}" / f"IMG_{i // 2}.{kind}"
+            (images / f"IMG_{i:04d}.{kind}").rename(place)
+    (images / "rig" / "0" / "IMG_4.jpg").unlink()
+    (images / "rig" / "IMG.xmp").write_text('<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
+    assert choose_adapter(folder).name == "realityscan"
+    scan = read_scan(folder, OPTIONS)
+    order = [0, 2, 4, 6, 1, 3, 5, 7, 9]
+    assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
+    assert [s for s in scan.warnings if "'rig/0/IMG_4': no picture" in s]
+
+
 def write_sidecars(folder, room, *, as_attributes):
     """XMP beside each picture, its values as attributes or as elements; returns the folder."""
     write_pictures(folder, room)

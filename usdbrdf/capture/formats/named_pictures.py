@@ -43,7 +43,7 @@ _OF_CAMERAS = RAW_SUFFIXES | _HEIF
 # normals there more often.
 _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", ".hdr")
 # Where programs put the pictures, beside what they say of them.
-_FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = (
     "Name the folder of the pictures with --frames, or put them inside this one and name them "
@@ -192,7 +192,7 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
                 "[usage.option]"
             )
         return _below(options.frames.resolve(), deep=True)
-    for name in usual or _FOLDERS:
+    for name in usual or FOLDERS:
         place = path_in_capture(folder, name, options) if name else folder
         if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
             return found
