@@ -123,6 +123,9 @@ def test_names_of_colmaps_images_may_hold_anything(made, kind):
         ("frames/{:04d}.jpg", "", True),
         ("Pictures/IMG {:04d}.exr", "Pictures/Img {:04d}.EXR", True),
         ("frame.{:04d}", "frame.{:04d}.exr", False),
+        ("frames/{:04d}.CR2", "", True),
+        ("frames/{:04d}.HEIC", "", True),
+        ("frames/{:04d}.nef", "frames/{:04d}.NEF.exr", True),
     ],
 )
 def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, told):
@@ -173,8 +176,23 @@ def test_radiance_beside_the_jpegs_that_are_named_is_taken(made):
     assert scan.frames.radiometric
     assert {path.suffix for path in scan.frames.image_paths} == {".exr"}
     (told,) = (s for s in scan.warnings if "radiance beside them" in s)
-    assert "11 of the JPEGs" in told
+    assert "11 of the photographs" in told
     assert "'0000.exr' for '0000.jpg'. [capture.file]" in told
+
+
+def test_what_a_camera_wrote_need_not_be_there_but_may(made):
+    """Radiance is taken for it, and of HEIF, which nothing here reads, a JPEG too."""
+    _as_photographs(made, ".jpg")
+    for i in range(12):
+        (made.folder / f"photographs/{i:04d}.HEIC").write_bytes(b"no picture")
+        (made.folder / f"photographs/{i:04d}.dng").write_bytes(b"no picture")
+    _rename(made, "photographs/{:04d}.HEIC")
+    assert {p.suffix for p in _read(made, assume_srgb=True).frames.image_paths} == {".jpg"}
+    _rename(made, "photographs/{:04d}.dng")
+    with pytest.raises(InputRefused, match=r"develop-raw"):
+        _read(made, assume_srgb=True)
+    _rename(made, "photographs/{:04d}.dng", files="photographs/{:04d}.exr")
+    assert _read(made).frames.radiometric
 
 
 def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):

@@ -69,8 +69,16 @@ def test_radiance_beside_the_pictures_is_taken_with_their_masks(tmp_path, room):
     assert {path.suffix for path in scan.frames.photographs} == {".exr"}
     assert scan.frames.radiometric
     assert all(scan.frames.masks)
-    assert [s for s in scan.warnings if "10 of the JPEGs" in s and "[capture.file]" in s]
+    assert [s for s in scan.warnings if "10 of the photographs" in s and "[capture.file]" in s]
     assert not [s for s in scan.warnings if "[capture.unused]" in s]
+
+
+@pytest.mark.parametrize("kind", ["CR2", "HEIC"])
+def test_pictures_may_be_called_after_what_the_camera_wrote(tmp_path, room, kind):
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    table = folder / "registration.csv"
+    table.write_text(table.read_text().replace(".jpg", f".{kind}"))
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
 @pytest.mark.parametrize("as_attributes", [False, True])
@@ -78,6 +86,24 @@ def test_cameras_of_sidecars(tmp_path, room, as_attributes):
     folder = write_sidecars(tmp_path / "scan", room, as_attributes=as_attributes)
     assert choose_adapter(folder).name == "realityscan"
     assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def test_sidecars_lie_beside_their_pictures_in_any_folder_of_these(tmp_path, room):
+    """One name in several folders, an XMP without a picture, and one of another program's."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=True)
+    images = folder / "images"
+    for i in range(10):
+        (images / "rig" / f"{i % 2}").mkdir(parents=True, exist_ok=True)
+        for kind in ("jpg", "xmp"):
+            place = images / "rig" / f"{i % 2}" / f"IMG_{i // 2}.{kind}"
+            (images / f"IMG_{i:04d}.{kind}").rename(place)
+    (images / "rig" / "0" / "IMG_4.jpg").unlink()
+    (images / "rig" / "IMG.xmp").write_text('<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
+    assert choose_adapter(folder).name == "realityscan"
+    scan = read_scan(folder, OPTIONS)
+    order = [0, 2, 4, 6, 1, 3, 5, 7, 9]
+    assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
+    assert [s for s in scan.warnings if "'rig/0/IMG_4': no picture" in s]
 
 
 def write_sidecars(folder, room, *, as_attributes):

@@ -88,6 +88,19 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
 
 
+def test_cameras_find_their_pictures_by_the_prims_above(tmp_path, room):
+    """As of Blender, whose data are called otherwise, or after another object."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    for i, pose in enumerate(room.world_from_camera):
+        above = UsdGeom.Xform.Define(stage, f"/shots/IMG_{i:03d}")
+        above.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        camera = UsdGeom.Camera.Define(stage, f"/shots/IMG_{i:03d}/IMG_00{9 if i == 0 else ''}")
+        _set_lens(camera, room.intrinsics[i])
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", room.images[i])
+    stage.Save()
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, names=room.names)
+
+
 def moving_camera(stage, room, names=None):
     camera = UsdGeom.Camera.Define(stage, "/room/camera")
     op = camera.AddTransformOp()

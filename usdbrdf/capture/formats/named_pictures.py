@@ -24,7 +24,7 @@ from usdbrdf.capture.parts import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
-from usdbrdf.files.images import image_size
+from usdbrdf.files.images import RAW_SUFFIXES, image_size
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -36,11 +36,14 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
-# Poses are found of JPEGs, and their radiance, beside them, is taken instead. PNG has its depths or
+# What cameras write and nothing here reads: documents name it, and what was made of it is there.
+_HEIF = frozenset((".heic", ".heif", ".hif"))
+_OF_CAMERAS = RAW_SUFFIXES | _HEIF
+# Poses are found of these, and their radiance, beside them, is taken instead. PNG has its depths or
 # normals there more often.
-_JPEG, _RADIANCE = (".jpg", ".jpeg"), (".exr", ".hdr")
+_PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", ".hdr")
 # Where programs put the pictures, beside what they say of them.
-_FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
+FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = (
     "Name the folder of the pictures with --frames, or put them inside this one and name them "
@@ -75,7 +78,7 @@ class Pictures:
 
     folder   absolute; nothing outside it is found
     paths    all of them, absolute, sorted
-    instead  of JPEGs that were asked for the radiance beside them, which was taken
+    instead  of photographs that were asked for the radiance beside them, which was taken
     """
 
     folder: Path
@@ -84,10 +87,13 @@ class Pictures:
 
     def named(self, label: str) -> Path | None:
         """The picture of this name: by its path below the folder, else by the end of its path, else
-        by its name alone, each with its suffix or another; of a JPEG that has some beside it its
-        radiance; None where there is none or several."""
+        by its name alone, each with its suffix or another; of a photograph with radiance beside
+        it that; None where there is none or several."""
         wanted = PurePosixPath(label.replace("\\", "/").lstrip("./"))
-        stem = wanted.with_suffix("") if wanted.suffix.lower() in SUFFIXES else wanted
+        known = [name for name in _names_without_suffix(wanted.name) if name in self._by_stem]
+        if not known:
+            return None
+        stem = wanted.parent / known[0]
         searches: tuple[Callable[[PurePosixPath], bool], ...] = (
             lambda p: p == wanted,
             lambda p: p.with_suffix("") == stem,
@@ -95,7 +101,7 @@ class Pictures:
             lambda p: p.with_suffix("").parts[-len(stem.parts) :] == stem.parts,
             lambda p: True,
         )
-        candidates = self._by_stem.get(stem.name, ())
+        candidates = self._by_stem[stem.name]
         for search in searches:
             found = [path for path, relative in candidates if search(relative)]
             if found:
@@ -145,9 +151,9 @@ def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
 
 
 def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -> Path:
-    """A picture, or of a JPEG the radiance beside it, of those ``alike`` in name, which is noted in
-    ``instead``."""
-    if path.suffix.lower() in _JPEG:
+    """A picture, or of a photograph the radiance beside it, of those ``alike`` in name, which is
+    noted in ``instead``."""
+    if path.suffix.lower() in _PHOTOGRAPHS:
         radiance = [p for p in alike if p.parent == path.parent and _is_radiance(p)]
         if found := nearest_to_radiance(radiance):
             instead[path] = found
@@ -156,7 +162,7 @@ def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -
 
 
 def _is_radiance(path: Path) -> bool:
-    """Whether a picture beside a JPEG is its radiance: without colours it is its depths."""
+    """Whether a picture beside a photograph is its radiance: without colours it is its depths."""
     if path.suffix.lower() not in _RADIANCE:
         return False
     try:
@@ -166,12 +172,13 @@ def _is_radiance(path: Path) -> bool:
 
 
 def warn_of_radiance(instead: Mapping[Path, Path], findings: Findings, source: Path) -> None:
-    """One sentence where radiance was taken instead of JPEGs that are there."""
+    """One sentence where radiance was taken instead of photographs that are there."""
     if instead:
-        jpeg, radiance = next(iter(instead.items()))
+        photograph, radiance = next(iter(instead.items()))
         findings.warn(
-            f"{source.name}: {len(instead)} of the JPEGs that it names have radiance beside them, "
-            f"which is taken instead, first {radiance.name!r} for {jpeg.name!r}. [capture.file]"
+            f"{source.name}: {len(instead)} of the photographs that it names have radiance beside "
+            f"them, which is taken instead, first {radiance.name!r} for {photograph.name!r}. "
+            "[capture.file]"
         )
 
 
@@ -185,7 +192,7 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
                 "[usage.option]"
             )
         return _below(options.frames.resolve(), deep=True)
-    for name in usual or _FOLDERS:
+    for name in usual or FOLDERS:
         place = path_in_capture(folder, name, options) if name else folder
         if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
             return found
@@ -205,8 +212,8 @@ def _below(folder: Path, *, deep: bool) -> Pictures:
 class Pictured:
     """The pictures that a document names by paths below a folder.
 
-    otherwise  names of those that are there under another one alone, and the files that were taken
-    instead    of JPEGs that it names the radiance beside them, which was taken
+    otherwise  names of those that are not there, or not read here, and the files that were taken
+    instead    of photographs that it names the radiance beside them, which was taken
     """
 
     folder: Path
@@ -218,8 +225,9 @@ class Pictured:
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
         beside it whose name differs in nothing but case and kind of picture, radiance first; of a
-        JPEG that is there too, the radiance beside it. Of ``--frames``, the picture there that has
-        its name. None where there is none. InputRefused for what leads out."""
+        photograph that is there too, the radiance beside it, of HEIF any. Of ``--frames``, the
+        picture there that has its name. None where there is none. InputRefused for what leads out.
+        """
         if self.options.frames is not None:
             return self._of_frames.named(name)
         whole = f"{below}/{name}" if below else name
@@ -228,8 +236,9 @@ class Pictured:
             whole = whole.replace("\\", "/")
             path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
         beside = self._in_folder(path.parent)
-        alike = beside.get(_stem(path.name), [])
-        if path.is_file():
+        names = _names_without_suffix(path.name.lower())
+        alike = next((beside[stem] for stem in names if stem in beside), [])
+        if path.is_file() and not (alike and path.suffix.lower() in _HEIF):
             return _or_radiance(path, alike, self.instead)
         suffix = path.suffix.lower()
         if any(one.suffix.lower() == suffix for found in beside.values() for one in found):
@@ -241,15 +250,15 @@ class Pictured:
         return nearest
 
     def warn_of_others(self, findings: Findings, source: Path) -> None:
-        """One sentence each where pictures were taken for others, and radiance for JPEGs."""
+        """One sentence each where pictures were taken for others, and radiance for photographs."""
         frames = self._of_frames.instead if self.options.frames is not None else {}
         warn_of_radiance(self.instead | frames, findings, source)
         if self.otherwise:
             name, path = next(iter(self.otherwise.items()))
             findings.warn(
-                f"{source.name}: {len(self.otherwise)} pictures are there under another name alone "
-                f"and are taken for those that it names, first {path.name!r} for {name!r}. "
-                "[capture.file]"
+                f"{source.name}: {len(self.otherwise)} pictures of other names are taken for those "
+                f"that it names, which are not there or not read, first {path.name!r} for "
+                f"{name!r}. [capture.file]"
             )
 
     @cached_property
@@ -260,14 +269,18 @@ class Pictured:
         if folder not in self._listed:
             of_stem = self._listed[folder] = {}
             for path in _below(folder, deep=False).paths if folder.is_dir() else ():
-                of_stem.setdefault(_stem(path.name), []).append(path)
+                of_stem.setdefault(path.stem.lower(), []).append(path)
         return self._listed[folder]
 
 
-def _stem(name: str) -> str:
-    """A picture's name in lower case, without its suffix if that is one of a picture."""
-    stem, _, suffix = name.lower().rpartition(".")
-    return stem if f".{suffix}" in SUFFIXES else name.lower()
+def _names_without_suffix(name: str) -> tuple[str, ...]:
+    """What the files of a picture may be called, but for their suffix, the first that is there. Of
+    a camera's file, IMG_1.CR2, some programs that develop it make IMG_1.CR2.jpg."""
+    stem, _, kind = name.rpartition(".")
+    kind = f".{kind.lower()}"
+    if kind in _OF_CAMERAS:
+        return name, stem
+    return (stem,) if kind in SUFFIXES else (name,)
 
 
 def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
@@ -413,7 +426,7 @@ def warn_of_unused(
     pictures: Pictures, used: Iterable[Path], findings: Findings, source: Path
 ) -> None:
     """One sentence where pictures have no camera."""
-    # Of a JPEG and its radiance one is used.
+    # Of a photograph and its radiance one is used.
     known = {path.with_suffix("") for path in used}
     left = [path for path in pictures.paths if path.with_suffix("") not in known]
     if left:

@@ -11,9 +11,10 @@ OpenCV's axes, and the camera's position.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
+    FOLDERS,
     Pictures,
     drop_without_picture,
     mesh_beside,
@@ -50,7 +52,7 @@ _EXPORT = 'Export the registration as "Internal/External camera parameters"'
 
 def matches(path: Path) -> bool:
     """A CSV of cameras or XMP files of this program, or a folder with such."""
-    return bool(_tables(path)) or any(_is_sidecar(file) for file in _sidecars(path)[:1])
+    return bool(_tables(path)) or bool(_sidecars(path))
 
 
 def _tables(path: Path) -> list[Path]:
@@ -65,9 +67,11 @@ def _is_table(file: Path) -> bool:
 
 
 def _sidecars(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return []
-    return sorted(path.glob("*.xmp")) or sorted(path.glob("*/*.xmp"))
+    """XMP files of this program in a folder, else in those below it and all below its pictures'."""
+    deep = (path / name for name in FOLDERS if name)
+    below = chain(path.glob("*/*.xmp"), *(folder.rglob("*.xmp") for folder in deep))
+    found = (sorted({*files}) for files in (path.glob("*.xmp"), below))
+    return next((files for files in found if any(map(_is_sidecar, files))), [])
 
 
 def _is_sidecar(file: Path) -> bool:
@@ -78,7 +82,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
     tables, findings = _tables(path), Findings()
     folder = path if path.is_dir() else path.parent
-    if len(tables) > 1 or not (tables or _sidecars(path)):
+    sidecars = [] if tables else _sidecars(path)
+    if len(tables) > 1 or not (tables or sidecars):
         raise InputRefused(
             f"{path}: {len(tables) or 'no'} CSV exports of cameras. {_EXPORT}, and name that file. "
             "[capture.format]"
@@ -89,7 +94,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     if tables:
         records = list(records_of_table(source, pictures, findings))
     else:
-        records = list(records_of_sidecars(_sidecars(path), pictures, findings))
+        records = list(records_of_sidecars(sidecars, pictures, findings))
     records = [
         replace(r, mask_path=pictures.mask_of(r.image_path, folder, options)) for r in records
     ]
@@ -125,7 +130,7 @@ def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> It
         pose = rigid_pose(_axes(*(float(a or 0) for a in angles)), np.array(place, np.float64))
         centre = [number_in(row, *names) or 0.0 for names in (("px", "px_norm"), ("py", "py_norm"))]
         terms = [number_in(row, term) or 0.0 for term in ("k1", "k2", "k3", "k4", "t1", "t2")]
-        yield from _record(name, pose, focal, centre, terms, pictures, findings)
+        yield from _record(name, pictures.named(name), pose, focal, centre, terms, findings)
 
 
 def _axes(heading: float, pitch: float, roll: float) -> Double:
@@ -142,7 +147,9 @@ def records_of_sidecars(
     files: list[Path], pictures: Pictures, findings: Findings
 ) -> Iterator[FrameRecord]:
     """The cameras of XMP files, each beside its picture or of its name."""
+    all_files = set(files)
     for file in files:
+        name, image = _name_and_picture(file, all_files, pictures)
         described = read_xml(file).find(f".//{_DESCRIBED}")
         said = _sidecar_values(described) if described is not None else {}
         rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
@@ -160,7 +167,7 @@ def records_of_sidecars(
             )
         if rotation is None or place is None or focal is None or not focal > 0:
             findings.drop(
-                file.stem, "its XMP has no rotation, position and focal length", "capture.pose"
+                name, "its XMP has no rotation, position and focal length", "capture.pose"
             )
             continue
         centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
@@ -168,7 +175,20 @@ def records_of_sidecars(
         pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
         bent = list(terms) if terms is not None and model != "perspective" else [0.0] * 6
         squeeze = number_in(said, "AspectRatio") or 1.0
-        yield from _record(file.stem, pose, focal, centre, bent, pictures, findings, squeeze)
+        yield from _record(name, image, pose, focal, centre, bent, findings, squeeze)
+
+
+def _name_and_picture(
+    file: Path, all_files: Collection[Path], pictures: Pictures
+) -> tuple[str, Path | None]:
+    """Of the camera of an XMP file: the picture beside it, else the one of its name elsewhere that
+    has no XMP of its own."""
+    inside = file.is_relative_to(pictures.folder)
+    place = file.relative_to(pictures.folder) if inside else Path(file.parent.name, file.name)
+    name = place.with_suffix("").as_posix()
+    image = pictures.named(name)
+    own = file if image is None else image.with_suffix(".xmp")
+    return name, image if own == file or own not in all_files else None
 
 
 def _sidecar_values(described: Element) -> dict[str, str]:
@@ -187,16 +207,15 @@ def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:
 
 def _record(
     name: str,
+    image: Path | None,
     pose: Double,
     focal: float,
     centre: list[float],
     terms: list[float],
-    pictures: Pictures,
     findings: Findings,
     squeeze: float = 1.0,
 ) -> Iterator[FrameRecord]:
     """terms: k1 to k4, t1, t2; squeeze: the vertical focal length over the horizontal one."""
-    image = pictures.named(name)
     if image is None:
         drop_without_picture(name, findings)
         return

@@ -1,13 +1,15 @@
 """Any USD stage as a capture: its cameras are the photographs, its meshes the surface.
 
 A camera that names a picture (a back plate) has that one. Others find theirs by name: one of many
-by its prim's name, one that moves by the number of each of its time samples.
+by its prim's name, one that moves by the number of each of its time samples. Blender and others
+write the camera's data as a prim below that of the camera, whose name may be the picture's.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +26,7 @@ from usdbrdf.capture.formats.named_pictures import (
     pictures_of,
     refuse_without_pictures,
     scan_of,
+    warn_of_radiance,
 )
 from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -118,6 +121,7 @@ def _records(
         pictures = pictures_of(stage.parent, options)
         refuse_without_pictures(pictures, stage)
         named = _by_name(shots, pictures)
+        warn_of_radiance(pictures.instead, findings, stage)
         if not any(image for _, image in named):
             first = min(pictures.paths).name
             raise InputRefused(
@@ -138,8 +142,35 @@ def _records(
 
 
 def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path | None]]:
-    """Each camera's picture: by its own name if it stands still, else by the number of its time,
-    among those in a folder of its name, or whose names begin with it, if it is not alone."""
+    """Each camera's picture, by its own name or by that of the prim above: first by the one that
+    more of them have a picture by."""
+    by_own = _found(shots, _own_names(shots), pictures)
+    by_parent = _found(shots, _names_above(shots), pictures)
+    first, second = sorted((by_own, by_parent), key=lambda found: -len({*found} - {None}))
+    taken = set(first)
+    return [
+        (shot, a or (b if b not in taken else None))
+        for shot, a, b in zip(shots, first, second, strict=True)
+    ]
+
+
+def _own_names(shots: list[_Shot]) -> list[tuple[str, ...]]:
+    return [(shot.camera.path.rpartition("/")[2], shot.camera.label) for shot in shots]
+
+
+def _names_above(shots: list[_Shot]) -> list[tuple[str, ...]]:
+    """The name of each camera's parent, if it has no other camera below it."""
+    count = Counter(path.rpartition("/")[0] for path in {shot.camera.path for shot in shots})
+    parents = (shot.camera.path.rpartition("/")[0] for shot in shots)
+    return [(path.rpartition("/")[2],) if path and count[path] == 1 else () for path in parents]
+
+
+def _found(
+    shots: list[_Shot], names_of_shots: list[tuple[str, ...]], pictures: Pictures
+) -> list[Path | None]:
+    """The picture of each camera that has these names: by one of them if it stands still, else by
+    the number of its time, among those in a folder of its first name, or whose names begin with
+    that, if it is not alone."""
     by_identifier: dict[str, list[Path]] = {}
     for path in pictures.paths:
         for identifier in _identifiers(path.stem):
@@ -147,20 +178,19 @@ def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path |
     alone = len({shot.camera.path for shot in shots}) == 1
     numbered: dict[str, dict[int, Path]] = {}
 
-    def found(shot: _Shot) -> Path | None:
-        prim = shot.camera.path.rpartition("/")[2]
+    def found(shot: _Shot, first: str, names: tuple[str, ...]) -> Path | None:
         if math.isnan(shot.time):
-            same = by_identifier.get(prim, [])
-            exact = pictures.named(prim) or pictures.named(shot.camera.label)
-            return exact or nearest_to_radiance(same)
-        if prim not in numbered:
-            starts = re.compile(rf"{prim}\D?\d+")
-            own = (p for p in pictures.paths if p.parent.name == prim or starts.fullmatch(p.stem))
+            exact = next(filter(None, map(pictures.named, names)), None)
+            return exact or nearest_to_radiance(by_identifier.get(first, []))
+        if first not in numbered:
+            starts = re.compile(rf"{first}\D?\d+")
+            own = (p for p in pictures.paths if p.parent.name == first or starts.fullmatch(p.stem))
             paths = pictures.paths if alone else tuple(own)
-            numbered[prim] = Pictures(folder=pictures.folder, paths=paths).numbered()
-        return numbered[prim].get(round(shot.time)) if shot.time == round(shot.time) else None
+            numbered[first] = Pictures(folder=pictures.folder, paths=paths).numbered()
+        return numbered[first].get(round(shot.time)) if shot.time == round(shot.time) else None
 
-    return [(shot, found(shot)) for shot in shots]
+    named = zip(shots, names_of_shots, strict=True)
+    return [found(shot, names[0], names) if names else None for shot, names in named]
 
 
 def _identifiers(stem: str) -> set[str]:
