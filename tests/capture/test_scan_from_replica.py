@@ -11,7 +11,7 @@ import pytest
 from tests.format_truth import FRAMES, HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
 from usdbrdf.asset.layout import Asset
-from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.ingest import ingest
@@ -98,6 +98,32 @@ def test_what_lies_beside_the_folder_is_an_input(scene, room, tmp_path):
     assert not ingest(scene, asset, OPTIONS).reran
     write_ply(scene.parent / "room0_mesh.ply", room.points, room.triangles[::-1])
     assert ingest(scene, asset, OPTIONS).reran
+
+
+def test_the_labels_beside_a_mesh_from_elsewhere_are_inputs(scene, room, tmp_path):
+    published = tmp_path / "published"
+    published.mkdir()
+    write_ply(published / "mesh.ply", room.points, room.triangles)
+    write_semantics(published, room)
+    asset = Asset(tmp_path / "asset", "room0")
+    options = IngestOptions(assume_srgb=True, mesh=published / "mesh.ply")
+    assert ingest(scene, asset, options).reran
+    assert not ingest(scene, asset, options).reran
+    (published / "glass.sur").write_text("[]")
+    assert ingest(scene, asset, options).reran
+    info = published / "habitat" / "info_semantic.json"
+    info.write_text(info.read_text().replace("box", "crate"))
+    assert ingest(scene, asset, options).reran
+
+
+@pytest.mark.parametrize("adapter", ["nice-slam", "replica"])
+def test_all_that_is_read_beside_a_scene_is_named(scene, room, adapter):
+    write_semantics(scene.parent, room)
+    (scene.parent / "glass.sur").write_text("[]")
+    named = files_beside(choose_adapter(scene, adapter), scene, None)
+    names = {file.name for file in named}
+    labels = {"info_semantic.json", "mesh_semantic.ply", "glass.sur"}
+    assert names == {"cam_params.json", "room0_mesh.ply"} | labels
 
 
 def test_the_other_frames_keep_their_poses(scene, room):

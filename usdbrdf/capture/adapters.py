@@ -224,11 +224,12 @@ def _loaded(point: EntryPoint) -> Adapter:
     )
 
 
-def files_beside(adapter: Adapter, path: Path) -> list[Path]:
-    """What an adapter reads outside of the capture's folder, as its ``beside(path)`` says; most
-    have none."""
-    beside = getattr(adapter.module, "beside", None)
-    return sorted(beside(path)) if beside is not None else []
+def files_beside(adapter: Adapter, path: Path, mesh: Path | None) -> list[Path]:
+    """What an adapter reads outside of the capture's folder, as its ``beside(path)`` says, and
+    beside the user's mesh, as its ``beside_mesh(mesh)`` says; most have neither."""
+    named = {"beside": path} | ({} if mesh is None else {"beside_mesh": mesh})
+    asked = ((getattr(adapter.module, name, None), place) for name, place in named.items())
+    return sorted({file for beside, place in asked if beside is not None for file in beside(place)})
 
 
 def read_with(adapter: Adapter, path: Path, options: CaptureOptions) -> Scan:

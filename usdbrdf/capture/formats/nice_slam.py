@@ -20,7 +20,7 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     scan_of,
 )
-from usdbrdf.capture.formats.replica_semantics import semantics_beside
+from usdbrdf.capture.formats.replica_semantics import semantic_files, semantics_beside
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import number_rows
@@ -98,8 +98,14 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def beside(path: Path) -> list[Path]:
     """The files that this format keeps beside a scene's folder, as far as they are there."""
     folder = path.resolve()
-    names = ("cam_params.json", f"{folder.name}_mesh.ply")
-    return [file for name in names if (file := folder.parent / name).is_file()]
+    mesh = folder.parent / f"{folder.name}_mesh.ply"
+    own = [file for file in (folder.parent / "cam_params.json", mesh) if file.is_file()]
+    return own + (beside_mesh(mesh) if mesh in own else [])
+
+
+def beside_mesh(mesh: Path) -> list[Path]:
+    """The files that say the objects of a mesh of Replica, as far as they are there."""
+    return semantic_files(mesh)
 
 
 def _camera(folder: Path, findings: Findings) -> dict[str, float]:

@@ -16,6 +16,8 @@ from usdbrdf.options import CaptureOptions
 
 NAME = "replica"
 DESCRIPTION = DESCRIPTIONS[NAME]
+# Frames are read as those of the renders, with what lies beside these.
+beside, beside_mesh = nice_slam.beside, nice_slam.beside_mesh
 
 
 def matches(path: Path) -> bool:

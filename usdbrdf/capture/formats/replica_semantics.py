@@ -26,6 +26,12 @@ from usdbrdf.untrusted.replica_files import labelled_faces
 _GAP = 0.01
 
 
+def semantic_files(mesh: Path) -> list[Path]:
+    """What ``semantics_beside`` a mesh reads, as far as it is there."""
+    names = ("habitat/info_semantic.json", "habitat/mesh_semantic.ply", "glass.sur")
+    return [file for name in names if (file := mesh.parent / name).is_file()]
+
+
 def semantics_beside(mesh: Path) -> Callable[[FileMesh], LabelTable] | None:
     """What knows the objects of a scene's mesh.ply by the files that lie beside it; None where
     these are missing."""
