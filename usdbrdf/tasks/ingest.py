@@ -64,10 +64,7 @@ def ingest(
     chosen = {
         name: choose_adapter(path, adapter, plugins=plugins) for name, path in captures.items()
     }
-    beside = {
-        name: (path, files_beside(chosen[name], path, options.mesh))
-        for name, path in captures.items()
-    }
+    beside = {k: (p, files_beside(chosen[k], p, options.mesh)) for k, p in captures.items()}
     inputs, places = inputs_of_captures(beside, options, asset)
     # Our own adapters change with the version of the code, which every stamp holds.
     if packages := sorted({one.package for one in chosen.values() if one.package}):
