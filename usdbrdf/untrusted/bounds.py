@@ -22,7 +22,7 @@ _GIB = 1 << 30
 
 
 class Limits(NamedTuple):
-    """What one file may take: its own bytes, seconds of wall time, bytes of memory."""
+    """What one file may take: its own bytes, seconds of wall time, bytes of addresses."""
 
     file_bytes: int
     seconds: float
@@ -75,7 +75,7 @@ def read_in_child(
         seconds,
         f"{path}: reading this {kind}",
         # What can be limited is addresses, of which libraries take more than they fill.
-        memory_limit_bytes=min(memory_bytes, machine_bytes()) + addresses_of_libraries(),
+        memory_limit_bytes=min(memory_bytes, machine_bytes() + addresses_of_libraries()),
     )
     value = unpacked(found, (returns, *parts))
     assert isinstance(value, returns)
