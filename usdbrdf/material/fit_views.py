@@ -327,7 +327,7 @@ def with_doubts_of_light(
     off = error_by_doubt(sampled(), kind, phi, psi, seed)
     if metal is not None:
         metal = metal._replace(f0_error=math.hypot(metal.f0_error, F0_OF_PSI * off))
-        off *= found.psi / psi
+        off *= found.psi / psi if psi > 0 else 1.0
     psi_error = min(math.hypot(found.psi_error, off), float(NOTHING_KNOWN))
     above = math.hypot(found.psi_upper - found.psi, _UPPER * off)
     upper = min(max(found.psi_upper, found.psi + above), 1.0)
@@ -349,8 +349,7 @@ def with_what_shows_through(
 
 def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:
     """By how much psi would be off if all light were by its standard error: what a lobe would then
-    mirror more, or less, as the samples tell psi; at most psi itself, that of a lobe of which all
-    mirrors light that is not there, where its base mirrors nothing."""
+    mirror more, or less, as the samples tell psi; psi itself where they do not."""
     model = ViewModel(sampled.samples)
     first = 3 * (_SEED_OF_DOUBT + seed)
     lobes = [sampled.lobe(kind, phi, first + n)[1] for n in range(2)]
