@@ -40,11 +40,12 @@ def emissive_strength(material: dict[str, Any]) -> float:
 
 
 def index_of_refraction(material: dict[str, Any]) -> float:
-    """1.5 where the material says none. 0 is glTF's infinite one: it reflects all."""
+    """1.5 where the material says none, or none that a surface has. 0 is glTF's infinite one: it
+    reflects all. Where a specular colour limits what an index would reflect, as converters write
+    them together, the index by itself says nothing."""
     ior = float(_extension(material, "ior").get("ior", 1.5))
-    if not (ior == 0 or 1 <= ior < np.inf):
-        raise ValueError(f"ior {ior:g}")
-    return ior
+    known = (ior == 0 or 1 <= ior < np.inf) and not _extension(material, "specular")
+    return ior if known else 1.5
 
 
 def _extension(material: dict[str, Any], name: str) -> dict[str, Any]:
