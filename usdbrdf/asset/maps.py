@@ -219,9 +219,13 @@ class AssetMaps:
 
     @property
     def light(self) -> Float:
-        """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and of lamps what shading found (of
-        those that clipped in every frame L_d is only a lower bound)."""
-        return np.where(self.emissive[:, None], self.emission, self.lit)
+        """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and what shading found of lamps (of
+        those that clipped in every frame L_d is only a lower bound) and of what no frame shows."""
+        light = np.where(self.emissive[:, None], self.emission, self.lit)
+        if self.has("hidden"):
+            hidden = ~(self.coverage.observed | self.emissive)
+            light[hidden] = self.map_where_present("hidden", 3)[hidden]
+        return light
 
     def environment(self, asked: Surroundings) -> Environment:
         """The light from outside: a file's, none, or what the shading task found or was given."""

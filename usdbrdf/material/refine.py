@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from usdbrdf import calibration
 from usdbrdf.ahead import ahead
@@ -24,8 +23,9 @@ from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces, ref
 from usdbrdf.material.sample_specular import TILE_SIDE, specular_of_samples
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.base_color import Reflection, base_color_of
+from usdbrdf.shading.hidden_light import LEAK, beside_seen
 from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import frames_in_view, samples_from_frames, spread_order
@@ -57,8 +57,6 @@ _MOST_SAMPLES = 24
 # and what it is lit by, with and without what its surface keeps.
 _OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
 _OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=44, pixel=450)
-# Texels around what was seen that are no more than so many times as bright as their fill.
-_RIM, _LEAK = 3, 2.0
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
 OF_NOISE_FLOOR = calibration.number("refine.noise_of_floor")
@@ -69,9 +67,11 @@ class LightBefore(Protocol):
     """What texturing and shading know of T texels; each is read when it is needed.
 
     lit         (T, 3) W/(m^2 sr): L_d with the specular light in it
+    light       (T, 3) W/(m^2 sr): what S is of: the same with what shines and what hidden surfaces
+                reflect
     samples     (T,): how many frames measured each texel
     emission    (T, 3) W/(m^2 sr): what shines by itself, zero elsewhere; emissive (T,): it does
-    irradiance  (T, 3) W/m^2: S with ``lit`` as the light; traced_irradiance: before the lightmap
+    irradiance  (T, 3) W/m^2: S with ``light`` as the light; traced_irradiance: before the lightmap
                 filter, where there was one
     irradiance_error  (T,): standard deviation of S by its rays, relative to it; asked for where
                 several lightings are weighed
@@ -79,6 +79,8 @@ class LightBefore(Protocol):
 
     @property
     def lit(self) -> Float: ...
+    @property
+    def light(self) -> Float: ...
     @property
     def samples(self) -> Float: ...
     @property
@@ -149,7 +151,8 @@ def refined_light(
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
-    beside_seen = [_beside_seen(texels, one.before) for one in lightings]
+    looked_at = [one.before.coverage.observed | one.before.emissive for one in lightings]
+    besides = [beside_seen(texels, one) & ~one for one in looked_at]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
         """Base colour, and of each lighting L_d with what it reflects where nobody looked or all
@@ -169,11 +172,10 @@ def refined_light(
         ]
         base_color = base_color_of(texels, shown)
         light = []
-        for one, beside in zip(shown, beside_seen, strict=True):
+        for one, beside in zip(shown, besides, strict=True):
             hidden = base_color * one.irradiance / np.pi
-            # Beyond the foot of a wall it may lie in the sun, and is read together with what was
-            # seen before it.
-            leaks = beside & (hidden.mean(axis=1) > _LEAK * one.radiance.mean(axis=1))
+            # As in ``light_of_hidden``.
+            leaks = beside & (hidden.mean(axis=1) > LEAK * one.radiance.mean(axis=1))
             hidden = np.where(leaks[:, None], one.radiance, hidden)
             told = one.measured | one.emissive
             light.append(np.where(told[:, None], one.radiance, hidden))
@@ -184,7 +186,7 @@ def refined_light(
     if lightings[0].lit.lobe == DIELECTRIC:
         seen[~metal] = share_seen(lobes.phi, lobes.psi)[owner[~metal], None]
     for (name, lit, before, _), diffuse in zip(lightings, first, strict=True):
-        change = np.where(before.emissive[:, None], 0, diffuse - before.lit).astype(np.float32)
+        change = np.where(before.emissive[:, None], 0, diffuse - before.light).astype(np.float32)
         traced = before.traced_irradiance if lightmap_filter == OIDN else before.irradiance
         own = run.part(name)
         refined = refined_irradiance(own, lit, traced, change, lobes, lightmap_filter, seed)
@@ -199,16 +201,6 @@ def refined_light(
         Refined(diffuse=own.astype(np.float32), irradiance=incoming, base_color=base_color)
         for own, incoming in zip(shown, irradiance, strict=True)
     ]
-
-
-def _beside_seen(texels: Texels, before: LightBefore) -> Bool:
-    """Texels (T,) that no frame shows and that are read together with seen ones, or lie before
-    those: the last ones before a wall few frames show."""
-    shown, found = before.coverage.observed | before.emissive, np.zeros(len(texels), np.bool_)
-    for i in range(len(texels.resolution)):
-        near = binary_dilation(texels.image(i, shown), np.ones((3, 3)), iterations=_RIM)
-        found[texels.of_object(i)] = texels.from_image(i, near)
-    return found & ~shown
 
 
 def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tuple[Float, Float]:

@@ -13,6 +13,8 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.inpaint import inpaint
 
 NEUTRAL = calibration.number("albedo.unseen")
+# What comes from a surface, in units of what reaches it, above which it shines by itself.
+EMITTER_RATIO = calibration.number("emitters.ratio")
 _DARK = calibration.number("albedo.dark")
 _OF_LIGHTING = calibration.number("albedo.error_of_lighting")
 _TINY = float(np.finfo(np.float32).tiny)
@@ -41,7 +43,7 @@ def albedo_map(
     need not be; emissive (T,): it shines by itself, and its albedo is 0. Objects of which nothing
     is known are NEUTRAL.
     """
-    albedo, tells = _albedo(radiance, irradiance, known & ~emissive)
+    albedo, tells = albedo_where_lit(radiance, irradiance, known & ~emissive)
     over = (albedo > 1).any(axis=1) & tells
     return _filled_in(texels, np.clip(albedo, 0, 1), tells, known, emissive), over
 
@@ -84,7 +86,7 @@ def base_color_of(texels: Texels, lightings: Sequence[Reflection]) -> Float:
         return only.as_bright_as_bounds(albedo_map(texels, *seen)[0])
     total, weights = np.zeros((len(texels), 3), np.float32), np.zeros(len(texels), np.float32)
     for one in lightings:
-        albedo, tells = _albedo(one.radiance, one.irradiance, one.measured & ~one.emissive)
+        albedo, tells = albedo_where_lit(one.radiance, one.irradiance, one.measured & ~one.emissive)
         weight = 1 / (one.error**2 + _OF_LIGHTING**2)
         weight = np.where(tells, weight, 0).astype(np.float32)
         total += weight[:, None] * np.clip(albedo, 0, 1)
@@ -99,7 +101,7 @@ def base_color_of(texels: Texels, lightings: Sequence[Reflection]) -> Float:
     return base_color
 
 
-def _albedo(radiance: Float, irradiance: Float, reflects: Bool) -> tuple[Float, Bool]:
+def albedo_where_lit(radiance: Float, irradiance: Float, reflects: Bool) -> tuple[Float, Bool]:
     """Albedo (T, 3), not clipped, and which texels of those that reflect it is known of."""
     floor = _DARK * float(np.median(irradiance.mean(axis=1)))
     albedo, lit_enough = albedo_from_irradiance(radiance, irradiance, max(floor, _TINY))

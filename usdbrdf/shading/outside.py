@@ -29,6 +29,7 @@ from usdbrdf.shading.asked import (
     irradiance_of_texels,
     looked_around,
 )
+from usdbrdf.shading.hidden_light import light_of_hidden
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -135,7 +136,9 @@ def estimated_outside(
 
     def compute() -> dict[str, Array]:
         seen = surroundings_from_frames(surface.rays, frames, z_up)
-        found = light_from_outside(surface, lit, coverage, seen, z_up, seed)
+        # What hides in a room would shine like what stands in the sun beside it.
+        light = light_of_hidden(surface, lit, coverage, _of_measured(seen, z_up), seed)
+        found = light_from_outside(surface, light, coverage, seen, z_up, seed)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 
     arrays = run.checkpoint("outside", compute)
@@ -207,8 +210,10 @@ def light_from_outside(
     else:
         sun, found = NO_SUN, solved(asked, sky)
         found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
-    radiance = _picture(seen, patches, used, np.exp(found.log_radiance[: len(used)]), z_up)
-    weight = share[used].mean(axis=1)
+    radiance_of_sky = np.exp(found.log_radiance[: len(used)])
+    radiance = _picture(seen, patches, used, radiance_of_sky, z_up)
+    # By the light that each brings: nobody asks how dark dark ground is.
+    weight = share[used].mean(axis=1) * radiance_of_sky.mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
     sky_error = float(np.average(of_sky, weights=weight)) if len(used) else math.nan
     invented = not measured.any() and not shines and not sky_error < _MOST_SKY_ERROR
@@ -227,12 +232,17 @@ def _under_what_was_seen(
     surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
 ) -> Asked:
     """The texels asked with S, W/m^2, of all that frames measured."""
-    known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
-    environment = Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
+    environment = _of_measured(seen, z_up)
     shining = Shining.of(surface, lit, environment)
     irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, seed)
     least = _DARK * np.median(asked.reflected)
     return asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
+
+
+def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
+    """What frames measured, and no light from elsewhere."""
+    known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
+    return Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
 
 
 def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> Asked | None:

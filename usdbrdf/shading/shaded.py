@@ -21,8 +21,9 @@ from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
-from usdbrdf.shading.base_color import albedo_map
+from usdbrdf.shading.base_color import EMITTER_RATIO, albedo_map
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
+from usdbrdf.shading.hidden_light import with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import telling
@@ -34,7 +35,6 @@ from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
-EMITTER_RATIO = calibration.number("emitters.ratio")
 _WHOLE_LAMP = calibration.number("emitters.whole_lamp")
 _MIN_PATCH = calibration.count("emitters.min_texels")
 
@@ -212,7 +212,8 @@ _MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY = 0.05, 0.5, 0.2
 class Shaded:
     """What is known of all texels.
 
-    light           L_d (T, 3) with the estimated radiance of lamps that clipped
+    light           L_d (T, 3) with the estimated radiance of lamps that clipped, and with what
+                    hidden surfaces reflect
     unseen          lamps that no frame shows
     traced          S as it was traced
     relative_error  (T,) float32 of that
@@ -316,6 +317,34 @@ class Shaded:
         }
 
 
+def _light(
+    run: TaskRun,
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    frames: Frames,
+    outside: Outside | None,
+    seed: int,
+    said: Mapping[int, bool],
+) -> tuple[ClippedLight, UnseenLamps]:
+    """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
+    environment = outside.environment if outside else black_environment()
+    lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed)
+    # In the light of what it may be that no frame shows.
+    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, outside, seed, said)
+    lit = unseen.with_light(surface.texels, lit)
+    light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
+    lamps = light.groups.texels_of(light.groups.lamp)
+    lamps |= np.isin(surface.texels.object_index(), unseen.object)
+    if not (light.lit[lamps] != lit[lamps]).any() and not len(unseen.object):
+        return light, unseen
+    # Hidden surfaces send on the light of these as well.
+    lit = with_hidden_light(
+        run, "hidden-lit", surface, light.lit, coverage, environment, seed, lamps
+    )
+    return replace(light, lit=lit), unseen
+
+
 def shade_surface(
     run: TaskRun,
     surface: TexturedScene,
@@ -335,14 +364,7 @@ def shade_surface(
     said     of objects, by number, whether they are lamps, where a person says so
     """
     environment = outside.environment if outside else black_environment()
-    # In the light of what it may be that no frame shows.
-    unseen = estimate_unseen_lamps(
-        run, surface, lit, coverage, frames, outside, sampling.seed, said
-    )
-    lit = unseen.with_light(surface.texels, lit)
-    light = estimate_clipped_light(
-        run, surface, lit, coverage, frames, environment, sampling.seed, said
-    )
+    light, unseen = _light(run, surface, lit, coverage, frames, outside, sampling.seed, said)
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)

@@ -18,6 +18,7 @@ from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.job.units import HERE, Workers
+from usdbrdf.model.arrays import Bool
 from usdbrdf.model.mesh import LAMP, OF_SHADE
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
@@ -54,7 +55,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = [
             replace(item, directive=asked.get(item.identifier, ""))
-            for item in _write_maps(writer, shaded)
+            for item in _write_maps(writer, shaded, maps.coverage.observed)
         ]
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
@@ -81,8 +82,8 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     return task.run(work, workers)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
-    """Every object's pictures, and the record that names them."""
+def _write_maps(writer: MapWriter, shaded: Shaded, observed: Bool) -> list[ShadedObject]:
+    """Every object's pictures, and the record that names them. observed (T,): frames show it."""
     traced = shaded.traced
     maps = {
         "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
@@ -96,6 +97,9 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
         maps["unexplained"] = TexelMap(unexplained, 1.0, "1", colour=False)
     emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
     emitters, objects = shaded.emitters, []
+    hidden = ~observed & ~emitters.emissive
+    light = np.where(hidden[:, None], shaded.light.lit, np.float32(0))
+    of_hidden = {"hidden": TexelMap(light, 1.0, "W/(m^2 sr)")}
     for i, obj in enumerate(writer.scene.objects):
         own = writer.texels.of_object(i)
         mean = partial(writer.texels.mean_of_object, i)
@@ -103,7 +107,12 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
             ShadedObject(
                 prim_path=obj.prim_path,
                 identifier=obj.identifier,
-                aovs=writer.write(i, maps | emission if emitters.emissive[own].any() else maps),
+                aovs=writer.write(
+                    i,
+                    maps
+                    | (emission if emitters.emissive[own].any() else {})
+                    | (of_hidden if hidden[own].any() else {}),
+                ),
                 emitter=bool(emitters.is_lamp[i]),
                 radiance=colour(emitters.radiance[i]),
                 radiance_status=shaded.radiance_status(i),

@@ -1,0 +1,141 @@
+"""The light of what no frame shows: undersides, backs, what stands behind something.
+
+Texturing fills it with the radiance beside it, which knows nothing of the light there: the
+underside of a table would shine like its top in the sun. What was seen of an object tells its
+albedo, and what receives S sends out
+
+    L = albedo S / pi
+
+S is traced at some of the texels with all other light; twice, for hidden surfaces see each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from usdbrdf.job.task import TaskRun
+from usdbrdf.model.arrays import Array, Bool, Float, Long
+from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.options import Sampling
+from usdbrdf.shading.asked import Shining, irradiance_of_texels
+from usdbrdf.shading.base_color import EMITTER_RATIO, NEUTRAL, albedo_where_lit
+from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.transport.environment import Environment
+from usdbrdf.transport.lit_scene import TexturedScene
+
+# Texels at which S is traced, of those that are seen and of those that are not, in all; of one
+# object no fewer than these.
+_TRACED, _OF_OBJECT = 1 << 15, 48
+# Their means are asked for, not what each of them receives.
+_ROUGHLY = Sampling(standard_error=0, max_rays=64)
+_ROUNDS = 2
+_SEED = 0x41D
+_MOSTLY = 0.5
+# Texels around what was seen that are no more than so many times as bright as their fill.
+_RIM, LEAK = 3, 2.0
+
+
+def with_hidden_light(
+    run: TaskRun,
+    name: str,
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    environment: Environment,
+    seed: int,
+    lamps: Bool | None = None,
+) -> Float:
+    """``light_of_hidden``, of which what it changes is kept under ``name``."""
+
+    def compute() -> dict[str, Array]:
+        light = light_of_hidden(surface, lit, coverage, environment, seed, lamps)
+        changed = np.flatnonzero((light != lit).any(axis=1))
+        return {"texel": changed, "light": light[changed]}
+
+    found, light = run.checkpoint(name, compute), lit.copy()
+    light[found["texel"]] = found["light"]
+    return light
+
+
+def light_of_hidden(
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    environment: Environment,
+    seed: int,
+    lamps: Bool | None = None,
+) -> Float:
+    """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame shows what they reflect of it
+    and of the ``environment``. What shines keeps its radiance: ``lamps`` (T,), and objects of which
+    most that was seen is too bright to reflect."""
+    texels = surface.texels
+    shown, tells = coverage.observed, coverage.measured
+    if lamps is not None:
+        shown, tells = shown | lamps, tells & ~lamps
+    seen, hidden = _spread(texels, tells), _spread(texels, ~shown)
+    if not len(hidden) or not len(seen):
+        return lit
+    both, whole = np.concatenate([seen, hidden]), np.ones(len(hidden), np.bool_)
+    beside, light = beside_seen(texels, shown) & ~shown, lit
+    for number in range(_ROUNDS):
+        shining = Shining.of(surface, light, environment)
+        traced = irradiance_of_texels(
+            surface, shining, environment, both, (seed ^ _SEED) + number, _ROUGHLY
+        )
+        albedo, lamp = _albedo(texels, seen, lit[seen], traced[: len(seen)])
+        sent = albedo * _spread_out(texels, hidden, traced[len(seen) :], whole) / np.pi
+        # Beyond the foot of a wall it may lie in the sun, and is read together with what was seen
+        # before it.
+        leaks = beside & (sent.mean(axis=1) > LEAK * lit.mean(axis=1))
+        light = np.where((shown | leaks | lamp)[:, None], lit, sent).astype(np.float32)
+    return light
+
+
+def _albedo(texels: Texels, seen: Long, lit: Float, irradiance: Float) -> tuple[Float, Bool]:
+    """Albedo (T, 3), in units of the known light, by that of the texels ``seen`` (N,), and the
+    texels (T,) of objects most of which shines."""
+    owner, count = texels.object_index(), len(texels.resolution)
+    ratio, known = albedo_where_lit(lit, irradiance, np.ones(len(seen), np.bool_))
+    # Where lamps are not known yet, all reflects more than it receives, seen and hidden alike.
+    usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
+    most = max(1.0, usual / NEUTRAL)
+    reflects = known & (ratio.mean(axis=1) <= EMITTER_RATIO * most)
+    albedo = _spread_out(texels, seen, np.minimum(ratio, most), reflects)
+    num_known, num_reflecting = (
+        np.bincount(owner[seen], kind, count) for kind in (known, reflects)
+    )
+    albedo[(num_reflecting == 0)[owner]] = NEUTRAL
+    return albedo, (num_reflecting < _MOSTLY * num_known)[owner]
+
+
+def beside_seen(texels: Texels, shown: Bool) -> Bool:
+    """Texels (T,) within reach of the ``shown`` ones, with which they are read, or which lie before
+    them: the last ones before a wall few frames show."""
+    found = np.zeros(len(texels), np.bool_)
+    for i in range(len(texels.resolution)):
+        near = binary_dilation(texels.image(i, shown), np.ones((3, 3)), iterations=_RIM)
+        found[texels.of_object(i)] = texels.from_image(i, near)
+    return found
+
+
+def _spread(texels: Texels, which: Bool) -> Long:
+    """Of the texels ``which`` (T,) some of each object, evenly, by its part of their area."""
+    total = float(texels.area[which].sum())
+    chosen = []
+    for i in range(len(texels.resolution)):
+        own = texels.of_object(i)
+        some = own.start + np.flatnonzero(which[own])
+        share = float(texels.area[some].sum()) / max(total, 1e-30)
+        number = min(len(some), max(_OF_OBJECT, round(_TRACED * share)))
+        chosen.append(some[np.linspace(0, len(some) - 1, number).astype(np.int64)])
+    return np.concatenate(chosen) if chosen else np.zeros(0, np.int64)
+
+
+def _spread_out(texels: Texels, index: Long, values: Float, known: Bool) -> Float:
+    """(T, 3) of the values (N, 3) at texels ``index`` (N,), as far as they are ``known`` (N,)."""
+    told = np.zeros(len(texels), np.bool_)
+    told[index[known]] = True
+    whole = np.zeros((len(texels), 3), np.float32)
+    whole[index] = values
+    return inpaint(texels, whole, told)
