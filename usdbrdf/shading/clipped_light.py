@@ -33,6 +33,7 @@ from usdbrdf.shading.clipped_emitters import (
     estimate_clipped_emitters,
     nothing_known,
 )
+from usdbrdf.shading.gloss import mirrored_to_frames
 from usdbrdf.shading.lamp_light import Lamps, looked_at_closely
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -49,6 +50,9 @@ _UNIT = np.float32(calibration.number("lamps.errors.unit"))
 _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 # Lamps that are looked at closely, at most: those with the most light.
 _CLOSELY = 8
+# Texels of a part that are asked whether daylight explains them.
+_ASKED = 128
+_SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 _WALL_PRIOR = calibration.pair("lamps.wall_prior")
 
 
@@ -75,6 +79,11 @@ class ClippedGroups:
     def texels_of(self, which: Bool) -> Bool:
         """(T,): the texels of those of the groups (K,)."""
         return np.asarray(np.append(which, False)[self.group], np.bool_)
+
+    def with_walls(self, which: Bool) -> ClippedGroups:
+        """The same where those of the groups (K,) are no lamps."""
+        wall = self.wall | self.texels_of(which)
+        return replace(self, lamp=self.lamp & ~which, wall=wall)
 
     def as_lamps(self, which: Long) -> Lamps:
         """The groups with the numbers ``which`` (N,), as what is known of lamps that clip."""
@@ -194,6 +203,14 @@ def estimate_clipped_light(
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known."""
     groups = clipped_groups(surface.texels, lit, coverage, said)
+    if groups.lamp.any() and (environment.sun.shines or environment.image.any()):
+
+        def reflecting() -> dict[str, Array]:
+            of_object = np.array([said.get(int(i), False) for i in groups.object])
+            told = reflects_daylight(surface, lit, coverage, frames, groups, environment, seed)
+            return {"wall": told & ~of_object}
+
+        groups = groups.with_walls(run.checkpoint("sunlit", reflecting)["wall"])
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
@@ -216,6 +233,47 @@ def estimate_clipped_light(
     return ClippedLight(
         lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
     )
+
+
+def reflects_daylight(
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    frames: Frames,
+    groups: ClippedGroups,
+    environment: Environment,
+    seed: int,
+) -> Bool:
+    """(K,): of the groups that look like lamps those that clip because daylight falls on them: by
+    the albedo of what was measured of the object, and what a usual dielectric mirrors, some of
+    their texels would be as bright as they are bounded. The lamps' own light is left out."""
+    texels, lamps = surface.texels, np.flatnonzero(groups.lamp)
+    owner = texels.object_index()
+
+    def some(which: Bool) -> Long:
+        index = np.flatnonzero(which)
+        return index[np.linspace(0, len(index) - 1, min(len(index), _ASKED)).astype(np.int64)]
+
+    own = [some(coverage.clipped & (groups.group == k)) for k in lamps]
+    others = [some(coverage.measured & (owner == groups.object[k])) for k in lamps]
+    texel = np.concatenate([*own, *others])
+    rest = np.where(groups.texels_of(groups.lamp)[:, None], np.float32(0), lit)
+    shining = Shining.of(surface, rest, environment)
+    reflected = irradiance_of_texels(surface, shining, environment, texel, seed) / np.pi
+    clipped = np.concatenate(own)
+    mirrored = mirrored_to_frames(surface, rest, environment, frames, clipped, seed)
+    explained, at, beside = np.zeros(len(groups), np.bool_), 0, len(clipped)
+    for k, one, other in zip(lamps, own, others, strict=True):
+        near, far = np.s_[at : at + len(one)], np.s_[beside : beside + len(other)]
+        at, beside = at + len(one), beside + len(other)
+        # Nothing measured of it: it may be as white as anything.
+        albedo = np.ones(3)
+        if len(other):
+            albedo = np.median(lit[other] / np.maximum(reflected[far], 1e-30), axis=0)
+        most = np.minimum(albedo, 1) * reflected[near] + mirrored[near]
+        ratio = most.max(axis=1) / lit[one].max(axis=1)
+        explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > _EXPLAINED
+    return explained
 
 
 def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
