@@ -66,7 +66,8 @@ class Surface:
     triangles       (F, 3) int32, counter-clockwise seen from the front
     corner_normals  (F, 3, 3) float32 unit vectors
     corner_uv       (F, 3, 2) float32, v up; None where the material has no maps
-    corner_colour   (F, 3, 3) float32 to be multiplied on the diffuse map; None where it has none
+    corner_colour   (F, 3, 3) float32, reflectance of the diffuse term in place of the diffuse map,
+                    which is 1 then; None where that holds
     corner_f0       (F, 3, 3) float32 in place of the map of f0; None where that holds
     two_sided       False if the back is black
     """
@@ -170,8 +171,8 @@ def preview_material(
 def with_corner_colours(
     surface: Surface, colours: Float, metallic: float, ior: float = 1.5
 ) -> Surface:
-    """The surface in base colours (F, 3, 3) of its corners, in place of its maps'; what is metal
-    of it reflects them in its lobe."""
+    """The surface in base colours (F, 3, 3) of its corners, in place of its map of them; what is
+    metal of it, a share ``metallic``, reflects them in its lobe, and the rest diffusely."""
     material = replace(surface.material, diffuse=constant_map(1.0))
     if not metallic:
         return replace(surface, material=material, corner_colour=colours, corner_f0=None)

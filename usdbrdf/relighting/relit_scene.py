@@ -186,15 +186,11 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
         ior=ior,
     )
     colours = corner_base_colours(surface)
-    surface = replace(
-        surface,
-        material=replace(mixed, wrap=material.wrap, lobe=material.lobe),
-        corner_colour=colours,
-        corner_f0=None,
-    )
-    if colours is None or not metallic.any():
+    mixed = replace(mixed, wrap=material.wrap, lobe=material.lobe)
+    surface = replace(surface, material=mixed)
+    if colours is None:
         return surface
-    # A metal takes the colours of the corners.
+    # Which stand in place of the map, also of a metal's.
     return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), ior)
 
 
