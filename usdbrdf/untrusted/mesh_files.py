@@ -33,6 +33,7 @@ from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
     index_of_refraction,
+    refuse_false,
     taken_colours,
     with_numbered_materials,
 )
@@ -299,6 +300,7 @@ def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
     gltf = None
     if path.suffix.lower() == ".glb":
         file, gltf = with_numbered_materials(file)
+        refuse_false(gltf, path)
     stored = load(file, resolver=beside)
     if beside.refused:
         raise beside.refused[0]

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from io import BytesIO
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Float
 
 _HEAD = 12  # bytes before the first part; each part begins with 8 more
+_MOST = float(np.finfo(np.float32).max)
+# What is read of extensions, and what it is where a material does not say it.
+_EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
+    ("emissive_strength", "emissiveStrength"): 1.0,
+    ("ior", "ior"): 1.5,
+}
 
 
 def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, Any]]]:
@@ -31,20 +40,43 @@ def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, An
     return BytesIO(head + text + content[end:]), materials
 
 
+def refuse_false(materials: Sequence[dict[str, Any]], path: Path) -> None:
+    """InputRefused where an extension of a material has a value that is no finite number, or less
+    than 0."""
+    for i, material in enumerate(materials):
+        for (name, key), fallback in _EXTENSIONS.items():
+            said = _extension(material, name).get(key, fallback)
+            try:
+                numbers = np.asarray(said, np.float64)
+                sound = numbers.shape == np.shape(fallback)
+                sound = sound and bool(((numbers >= 0) & (numbers < _MOST)).all())
+            except (TypeError, ValueError, OverflowError):
+                sound = False
+            if not sound:
+                called = str(material.get("name", i))[:80]
+                raise InputRefused(
+                    f"{path}: material {called!r} has {key} {str(said)[:80]}, where "
+                    f"KHR_materials_{name} has a finite number of at least 0. Correct it, or "
+                    "remove the extension. [relight.material]"
+                )
+
+
+def _said(material: dict[str, Any], extension: str, key: str) -> Any:
+    """The value, once it is known to be sound, or what it is where the material says none."""
+    return _extension(material, extension).get(key, _EXTENSIONS[extension, key])
+
+
 def emissive_strength(material: dict[str, Any]) -> float:
     """The factor on the emission, 1 where the material says none."""
-    strength = float(_extension(material, "emissive_strength").get("emissiveStrength", 1))
-    if not 0 <= strength < np.inf:
-        raise ValueError(f"emissiveStrength {strength:g}")
-    return strength
+    return float(_said(material, "emissive_strength", "emissiveStrength"))
 
 
 def index_of_refraction(material: dict[str, Any]) -> float:
     """1.5 where the material says none, or none that a surface has. 0 is glTF's infinite one: it
     reflects all. Where a specular colour limits what an index would reflect, as converters write
     them together, the index by itself says nothing."""
-    ior = float(_extension(material, "ior").get("ior", 1.5))
-    known = (ior == 0 or 1 <= ior < np.inf) and not _extension(material, "specular")
+    ior = float(_said(material, "ior", "ior"))
+    known = (ior == 0 or ior >= 1) and not _extension(material, "specular")
     return ior if known else 1.5
 
 
