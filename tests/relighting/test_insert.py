@@ -121,9 +121,8 @@ def test_colours_of_corners_stand_in_place_of_the_map(given: dict[str, float]) -
     """Whoever multiplies the two, and whoever takes the corners' alone, has the same."""
     plain = cube(_metal())
     colours = np.tile(_GOLD / 2, (len(plain.triangles), 3, 1))
-    found = with_material(
-        with_corner_colours(plain, colours, 1.0), Insert(model=Path("a.glb"), **given)
-    )
+    coloured = with_corner_colours(plain, colours, 1.0, constant_map(0.04))
+    found = with_material(coloured, Insert(model=Path("a.glb"), **given))
     assert found.material.diffuse.ravel() == pytest.approx([1, 1, 1])
     assert found.corner_colour is not None
     assert found.corner_colour == pytest.approx(colours * (1 - given.get("metallic", 0)))

@@ -408,6 +408,50 @@ def test_extensions_of_a_glb_material(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("specular", "ior", "f0"),
+    [
+        ({"specularFactor": 0.5}, 1.5, [0.02, 0.02, 0.02]),
+        ({"specularColorFactor": [1, 0.5, 0]}, 2.0, [1 / 9, 1 / 18, 0]),
+        # As converters write a colour of F0: an index that reflects nearly all, or all.
+        (
+            {"specularColorFactor": [0.3, 0.2, 0.1], "specularFactor": 1},
+            1000,
+            [0.2988, 0.1992, 0.1],
+        ),
+        ({"specularColorFactor": [0.3, 2.0, 0.1], "specularFactor": 0.5}, 0, [0.15, 0.5, 0.05]),
+    ],
+)
+def test_specular_factors_of_a_glb(
+    tmp_path: Path, specular: dict[str, Any], ior: float, f0: list[float]
+) -> None:
+    extensions = {"KHR_materials_specular": specular, "KHR_materials_ior": {"ior": ior}}
+    said = {"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", dict(said)).material
+    assert found.f0.ravel() == pytest.approx(f0, abs=1e-3)
+    # What is metal of it reflects its base colour.
+    half = {"metallicFactor": 0.5, "baseColorFactor": [0.8, 0.4, 0.2, 1]}
+    mixed = np.add(f0, [0.8, 0.4, 0.2]) / 2
+    said = {"pbrMetallicRoughness": half, "extensions": extensions}
+    found = _glb_of(tmp_path / "b.glb", dict(said)).material
+    assert found.f0.ravel() == pytest.approx(mixed, abs=1e-3)
+    coloured = _glb_of(tmp_path / "c.glb", dict(said), [1, 1, 1])
+    assert coloured.corner_f0 is not None
+    assert coloured.corner_f0[0, 0] == pytest.approx(mixed, abs=1e-3)
+
+
+def test_specular_textures_of_a_glb_are_told_and_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    specular = {"specularColorTexture": {"index": 0}, "specularFactor": 0.5}
+    extensions = {"KHR_materials_specular": specular, "KHR_materials_ior": {"ior": 1000}}
+    said = {"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", said | {"name": "tiles"})
+    assert found.material.f0.ravel() == pytest.approx([0.02] * 3)
+    told = capsys.readouterr().err
+    assert "a.glb: material 'tiles': textures of KHR_materials_specular are not read" in told
+
+
+@pytest.mark.parametrize(
     "strength", [-1, "bright", None, [1], 1e39, float("nan"), pytest.param(10**400, id="huge")]
 )
 def test_a_false_strength_of_emission_is_not_said_of_the_mesh(

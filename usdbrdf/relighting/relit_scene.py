@@ -20,6 +20,7 @@ from usdbrdf.model.material import (
     Surface,
     constant_map,
     corner_base_colours,
+    normal_reflectance,
     preview_material,
     turned_up,
     with_corner_colours,
@@ -178,12 +179,13 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
             material = replace(material, diffuse=base)
         return replace(surface, material=material)
     ior = 1.5 if insert.ior is None else insert.ior
+    dielectric = constant_map(float(normal_reflectance(ior)))
     mixed = preview_material(
         diffuse=base,
         metallic=metallic,
         roughness=material.roughness,
         emission=material.emission,
-        ior=ior,
+        dielectric=dielectric,
     )
     colours = corner_base_colours(surface)
     mixed = replace(mixed, wrap=material.wrap, lobe=material.lobe)
@@ -191,7 +193,7 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
     if colours is None:
         return surface
     # Which stand in place of the map, also of a metal's.
-    return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), ior)
+    return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), dielectric)
 
 
 def placed(

@@ -7,7 +7,8 @@ import errno
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +22,7 @@ from trimesh.exchange.ply import load_ply
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.paths import contained
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.material import (
     Material,
@@ -32,9 +34,10 @@ from usdbrdf.model.material import (
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
-    index_of_refraction,
+    normal_reflectance_of,
     refuse_false,
     taken_colours,
+    unread,
     with_numbered_materials,
 )
 from usdbrdf.untrusted.mesh_text import binary_ply_of_polygons, obj_counted_forwards
@@ -49,7 +52,7 @@ _MIN_DIAGONAL = 1e-4
 # Faces with broken corners below this share are removed; above it the file is not what it says.
 _MAX_BROKEN_SHARE = 0.01
 # UsdPreviewSurface's own, where a file has no material.
-_GREY, _ROUGHNESS, _IOR = 0.18, 0.5, 1.5
+_GREY, _ROUGHNESS = 0.18, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,16 +91,21 @@ def model_from_file(path: Path) -> tuple[Surface, ...]:
     """The meshes of a file with their materials, in the file's own axes and units.
 
     Base colour, its texture, vertex colours, metalness, roughness, emission and a GLB's index of
-    refraction are read. Images are sRGB, and so are vertex colours but a GLB's, which are linear;
-    beside maps the mean of these counts. What an OBJ or GLB names must lie in its folder. Corner
-    normals are NaN where the file brings none.
+    refraction and specular factors are read; of its specular textures a warning says that they are
+    not. Images are sRGB, and so are vertex colours but a GLB's, which are linear; beside maps the
+    mean of these counts. What an OBJ or GLB names must lie in its folder. Corner normals are NaN
+    where the file brings none.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
             f"{path}: models are read from USD, {', '.join(SUFFIXES)}. Convert it. [relight.model]"
         )
-    parts = (Surface, Material)
-    return read_in_child("mesh", f"{__name__}:read_model_here", path, tuple, parts=parts)
+    reader = f"{__name__}:read_model_here"
+    surfaces, sentences = read_in_child("mesh", reader, path, tuple, parts=(Surface, Material))
+    for sentence in sentences:
+        warn(sentence)
+    found: tuple[Surface, ...] = surfaces
+    return found
 
 
 def read_mesh_here(path: Path) -> FileMesh:
@@ -281,18 +289,19 @@ def _no_faces(vertices: int) -> FileMesh:
 _READERS = {".ply": _mesh_from_ply, ".obj": _mesh_from_obj, ".glb": _mesh_from_glb}
 
 
-def read_model_here(path: Path) -> tuple[Surface, ...]:
-    """``model_from_file`` in this process, which is to be a child."""
+def read_model_here(path: Path) -> tuple[list[Surface], list[str]]:
+    """``model_from_file`` in this process, which is to be a child, and its warnings."""
     # Its checks first: whatever is damaged is refused there, in one sentence.
     if read_mesh_here(path).kept is not None:
         raise InputRefused(
             f"{path}: faces of it have NaN corners or vertices that do not exist. Export it again. "
             "[relight.model]"
         )
-    return tuple(_parsed(path, lambda file: _surfaces(path, file)))
+    found: tuple[list[Surface], list[str]] = _parsed(path, lambda file: _surfaces(path, file))
+    return found
 
 
-def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
+def _surfaces(path: Path, file: BinaryIO) -> tuple[list[Surface], list[str]]:
     beside = _FilesBeside(path)
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
     if path.suffix.lower() == ".obj":
@@ -320,7 +329,7 @@ def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
             own_normals, own_colours = given[name]
             surface = _surface(f"{path.name}:{node}", mesh, own_normals, own_colours, gltf)
             found.append(surface.moved(np.asarray(world_from_node)))
-    return found
+    return found, unread(gltf or (), path)
 
 
 class _FilesBeside:
@@ -389,7 +398,7 @@ class _Inputs:
     metallic: Float
     roughness: Float
     emission: Float
-    ior: float = _IOR
+    dielectric: Float = field(default_factory=partial(normal_reflectance_of, {}))
 
     @property
     def material(self) -> Material:
@@ -402,7 +411,7 @@ def _coloured(surface: Surface, inputs: _Inputs, colours: Float) -> Surface:
     corners or a map; beside maps their mean counts."""
     if inputs.diffuse.shape[:2] == inputs.metallic.shape[:2] == (1, 1):
         metallic = float(inputs.metallic[0, 0, 0])
-        return with_corner_colours(surface, inputs.diffuse * colours, metallic, inputs.ior)
+        return with_corner_colours(surface, inputs.diffuse * colours, metallic, inputs.dielectric)
     mean = colours.mean(axis=(0, 1), dtype=np.float32)
     return replace(surface, material=replace(inputs, diffuse=inputs.diffuse * mean).material)
 
@@ -442,7 +451,7 @@ def _inputs(visual: Any, gltf: list[dict[str, Any]] | None, *, textured: bool) -
         return found
     said = gltf[int(stored.name)]
     strength = np.float32(emissive_strength(said))
-    return replace(found, emission=emission * strength, ior=index_of_refraction(said))
+    return replace(found, emission=emission * strength, dielectric=normal_reflectance_of(said))
 
 
 def _factor(value: Any, channels: int, fallback: float) -> Float:

@@ -13,13 +13,17 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Float
+from usdbrdf.model.material import normal_reflectance
 
 _HEAD = 12  # bytes before the first part; each part begins with 8 more
+_IOR = 1.5
 _MOST = float(np.finfo(np.float32).max)
 # What is read of extensions, and what it is where a material does not say it.
 _EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
     ("emissive_strength", "emissiveStrength"): 1.0,
-    ("ior", "ior"): 1.5,
+    ("ior", "ior"): _IOR,
+    ("specular", "specularFactor"): 1.0,
+    ("specular", "specularColorFactor"): (1.0, 1.0, 1.0),
 }
 
 
@@ -53,11 +57,11 @@ def refuse_false(materials: Sequence[dict[str, Any]], path: Path) -> None:
             except (TypeError, ValueError, OverflowError):
                 sound = False
             if not sound:
-                called = str(material.get("name", i))[:80]
+                wanted = "finite numbers" if np.shape(fallback) else "a finite number"
                 raise InputRefused(
-                    f"{path}: material {called!r} has {key} {str(said)[:80]}, where "
-                    f"KHR_materials_{name} has a finite number of at least 0. Correct it, or "
-                    "remove the extension. [relight.material]"
+                    f"{path}: material {_name(material, i)} has {key} {str(said)[:80]}, where "
+                    f"KHR_materials_{name} has {wanted} of at least 0. Correct it, or remove the "
+                    "extension. [relight.material]"
                 )
 
 
@@ -71,13 +75,38 @@ def emissive_strength(material: dict[str, Any]) -> float:
     return float(_said(material, "emissive_strength", "emissiveStrength"))
 
 
-def index_of_refraction(material: dict[str, Any]) -> float:
-    """1.5 where the material says none, or none that a surface has. 0 is glTF's infinite one: it
-    reflects all. Where a specular colour limits what an index would reflect, as converters write
-    them together, the index by itself says nothing."""
-    ior = float(_said(material, "ior", "ior"))
-    known = (ior == 0 or ior >= 1) and not _extension(material, "specular")
-    return ior if known else 1.5
+def normal_reflectance_of(material: dict[str, Any]) -> Float:
+    """(1, 1, 3) float32: F0 of what is not metal of it, as KHR_materials_ior and _specular say; the
+    second also dims what is reflected at the edge, which no material here can have.
+
+    An index of 0 is glTF's infinite one: it reflects all; one that no surface has is not believed.
+    """
+    ior = _said(material, "ior", "ior")
+    if _has_specular_textures(material) or 0 < ior < 1:
+        # Converters write an index that reflects nearly all, and textures that limit it.
+        ior = _IOR
+    colour = np.array(_said(material, "specular", "specularColorFactor"))
+    strength = min(_said(material, "specular", "specularFactor"), 1)
+    f0 = np.minimum(normal_reflectance(ior) * colour, 1) * strength
+    return np.asarray(f0, np.float32).reshape(1, 1, 3)
+
+
+def _has_specular_textures(material: dict[str, Any]) -> bool:
+    return any(key.endswith("Texture") for key in _extension(material, "specular"))
+
+
+def unread(materials: Sequence[dict[str, Any]], path: Path) -> list[str]:
+    """A sentence each on what the materials say and is not shown."""
+    return [
+        f"{path}: material {_name(material, i)}: textures of KHR_materials_specular are not read; "
+        f"it reflects by an index of refraction of {_IOR} and the factors beside them."
+        for i, material in enumerate(materials)
+        if _has_specular_textures(material)
+    ]
+
+
+def _name(material: dict[str, Any], number: int) -> str:
+    return repr(str(material.get("name", number))[:80])
 
 
 def _extension(material: dict[str, Any], name: str) -> dict[str, Any]:
