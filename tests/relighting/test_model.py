@@ -452,6 +452,39 @@ def test_specular_textures_of_a_glb_are_told_and_left(
 
 
 @pytest.mark.parametrize(
+    ("transmission", "metallic", "clear", "told"),
+    [
+        ({"transmissionFactor": 1.0}, 0, True, "glass is not rendered"),
+        ({"transmissionFactor": 0.9}, 0, True, "glass is not rendered"),
+        ({"transmissionFactor": 0.2}, 0, False, "taken as opaque"),
+        ({"transmissionFactor": 1, "transmissionTexture": {"index": 0}}, 0, False, "as opaque"),
+        ({"transmissionFactor": 1.0}, 1, False, ""),  # which metal holds
+        ({}, 0, False, ""),
+    ],
+)
+def test_glass_of_a_glb_is_clear(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    transmission: dict[str, Any],
+    metallic: int,
+    clear: bool,
+    told: str,
+) -> None:
+    extensions = {"KHR_materials_transmission": transmission}
+    inner = {"metallicFactor": metallic}
+    said = {"name": "glass", "pbrMetallicRoughness": inner, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", said)
+    assert found.material.clear == clear
+    sentences = capsys.readouterr().err
+    assert told in sentences
+    assert ("material 'glass'" in sentences) == bool(told)
+    # Which an index of refraction does not change, but being metal does.
+    model = tmp_path / "a.glb"
+    assert with_material(found, Insert(model=model, ior=1.6)).material.clear == clear
+    assert not with_material(found, Insert(model=model, metallic=1.0)).material.clear
+
+
+@pytest.mark.parametrize(
     "strength", [-1, "bright", None, [1], 1e39, float("nan"), pytest.param(10**400, id="huge")]
 )
 def test_a_false_strength_of_emission_is_not_said_of_the_mesh(

@@ -188,7 +188,8 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
         dielectric=dielectric,
     )
     colours = corner_base_colours(surface)
-    mixed = replace(mixed, wrap=material.wrap, lobe=material.lobe)
+    clear = material.clear and not metallic.any()
+    mixed = replace(mixed, wrap=material.wrap, lobe=material.lobe, clear=clear)
     surface = replace(surface, material=mixed)
     if colours is None:
         return surface

@@ -34,6 +34,7 @@ from usdbrdf.model.material import (
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
+    is_clear,
     normal_reflectance_of,
     refuse_false,
     taken_colours,
@@ -91,8 +92,8 @@ def model_from_file(path: Path) -> tuple[Surface, ...]:
     """The meshes of a file with their materials, in the file's own axes and units.
 
     Base colour, its texture, vertex colours, metalness, roughness, emission and a GLB's index of
-    refraction and specular factors are read; of its specular textures a warning says that they are
-    not. Images are sRGB, and so are vertex colours but a GLB's, which are linear; beside maps the
+    refraction, specular factors and transmission are read; warnings say what of these is not shown.
+    Images are sRGB, and so are vertex colours but a GLB's, which are linear; beside maps the
     mean of these counts. What an OBJ or GLB names must lie in its folder. Corner normals are NaN
     where the file brings none.
     """
@@ -392,18 +393,20 @@ def _surface(
 
 @dataclass(frozen=True, kw_only=True)
 class _Inputs:
-    """Those of ``preview_material``."""
+    """Those of ``preview_material``, and what is ``clear`` of a Material."""
 
     diffuse: Float
     metallic: Float
     roughness: Float
     emission: Float
     dielectric: Float = field(default_factory=partial(normal_reflectance_of, {}))
+    clear: bool = False
 
     @property
     def material(self) -> Material:
         # The default of OBJ and of glTF, whose samplers the reader does not keep.
-        return replace(preview_material(**vars(self)), wrap="repeat")
+        inputs = {name: value for name, value in vars(self).items() if name != "clear"}
+        return replace(preview_material(**inputs), wrap="repeat", clear=self.clear)
 
 
 def _coloured(surface: Surface, inputs: _Inputs, colours: Float) -> Surface:
@@ -450,8 +453,12 @@ def _inputs(visual: Any, gltf: list[dict[str, Any]] | None, *, textured: bool) -
     if not gltf:
         return found
     said = gltf[int(stored.name)]
-    strength = np.float32(emissive_strength(said))
-    return replace(found, emission=emission * strength, dielectric=normal_reflectance_of(said))
+    return replace(
+        found,
+        emission=emission * np.float32(emissive_strength(said)),
+        dielectric=normal_reflectance_of(said),
+        clear=is_clear(said),
+    )
 
 
 def _factor(value: Any, channels: int, fallback: float) -> Float:

@@ -24,6 +24,7 @@ _EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
     ("ior", "ior"): _IOR,
     ("specular", "specularFactor"): 1.0,
     ("specular", "specularColorFactor"): (1.0, 1.0, 1.0),
+    ("transmission", "transmissionFactor"): 0.0,
 }
 
 
@@ -82,7 +83,7 @@ def normal_reflectance_of(material: dict[str, Any]) -> Float:
     An index of 0 is glTF's infinite one: it reflects all; one that no surface has is not believed.
     """
     ior = _said(material, "ior", "ior")
-    if _has_specular_textures(material) or 0 < ior < 1:
+    if _has_texture_of(material, "specular") or 0 < ior < 1:
         # Converters write an index that reflects nearly all, and textures that limit it.
         ior = _IOR
     colour = np.array(_said(material, "specular", "specularColorFactor"))
@@ -91,18 +92,44 @@ def normal_reflectance_of(material: dict[str, Any]) -> Float:
     return np.asarray(f0, np.float32).reshape(1, 1, 3)
 
 
-def _has_specular_textures(material: dict[str, Any]) -> bool:
-    return any(key.endswith("Texture") for key in _extension(material, "specular"))
+def _has_texture_of(material: dict[str, Any], extension: str) -> bool:
+    return any(key.endswith("Texture") for key in _extension(material, extension))
+
+
+def is_clear(material: dict[str, Any]) -> bool:
+    """Whether more light passes than not: what is shown is nothing, or an opaque surface."""
+    return _transmission(material) >= 0.5 and not _has_texture_of(material, "transmission")
+
+
+def _transmission(material: dict[str, Any]) -> float:
+    """The share of the light that is not reflected at the surface, and passes; metal holds it."""
+    inner = material.get("pbrMetallicRoughness", {})
+    # Beside a texture of it, which says where there is metal, the factor is 1.
+    metallic = 0.0 if "metallicRoughnessTexture" in inner else float(inner.get("metallicFactor", 1))
+    share = _said(material, "transmission", "transmissionFactor") * (1 - metallic)
+    return float(np.clip(share, 0, 1))
 
 
 def unread(materials: Sequence[dict[str, Any]], path: Path) -> list[str]:
     """A sentence each on what the materials say and is not shown."""
-    return [
-        f"{path}: material {_name(material, i)}: textures of KHR_materials_specular are not read; "
-        f"it reflects by an index of refraction of {_IOR} and the factors beside them."
-        for i, material in enumerate(materials)
-        if _has_specular_textures(material)
-    ]
+    sentences = []
+    for i, material in enumerate(materials):
+        said, passes = f"{path}: material {_name(material, i)}", _transmission(material)
+        if _has_texture_of(material, "specular"):
+            sentences.append(
+                f"{said}: textures of KHR_materials_specular are not read; it reflects by an index "
+                f"of refraction of {_IOR} and the factors beside them."
+            )
+        if is_clear(material):
+            sentences.append(
+                f"{said}: glass is not rendered; light passes through as if nothing was there."
+            )
+        elif passes > 0:
+            sentences.append(
+                f"{said}: light that passes in part, or by a texture, is not rendered; the surface "
+                "is taken as opaque."
+            )
+    return sentences
 
 
 def _name(material: dict[str, Any], number: int) -> str:
