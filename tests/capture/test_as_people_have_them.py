@@ -13,6 +13,7 @@ import pytest
 
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.formats.named_pictures import Pictures
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr, white_of_mask
@@ -193,6 +194,26 @@ def test_what_a_camera_wrote_need_not_be_there_but_may(made):
         _read(made, assume_srgb=True)
     _rename(made, "photographs/{:04d}.dng", files="photographs/{:04d}.exr")
     assert _read(made).frames.radiometric
+
+
+@pytest.mark.parametrize("depths", [".exr", ".png", ".tif"])
+def test_depths_beside_a_picture_are_not_what_is_meant(made, depths):
+    """By a camera's file, of which a JPEG was made, or by a name or a number alone."""
+    _as_photographs(made, ".jpg")
+    for i in range(12):
+        pixels = 1000 * read_exr(made.image(i))[..., :1]
+        whole = pixels if depths == ".exr" else pixels.astype(np.uint16)
+        _write_bytes(made.folder / f"photographs/{i:04d}{depths}", whole)
+    _rename(made, "photographs/{:04d}.HEIC")
+    for options in ({}, {"frames": made.folder / "photographs"}):
+        paths = _read(made, assume_srgb=True, **options).frames.image_paths
+        assert {path.suffix for path in paths} == {".jpg"}
+    paths = tuple(sorted((made.folder / "photographs").iterdir()))
+    assert len(paths) == 24
+    pictures = Pictures(folder=made.folder, paths=paths)
+    assert {path.suffix for path in pictures.numbered().values()} == {".jpg"}
+    photograph = made.folder / "photographs/0004.jpg"
+    assert pictures.named("0004.HEIC") == pictures.named("0004") == photograph
 
 
 def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):

@@ -171,6 +171,7 @@ def test_glass_is_there_and_lets_all_light_pass(tmp_path):
     assert "KHR_materials_transmission" in tree["extensionsUsed"]
     assert opaque["extensions"].keys() == {"KHR_materials_ior"}
     assert "alphaMode" not in opaque
+    assert [s.material.clear for s in surfaces_from_model(tmp_path / "pane.glb")] == [True, False]
 
 
 @pytest.mark.parametrize("ior", [1.0, 1.33, 1.789])

@@ -168,6 +168,31 @@ def test_computing_without_end_is_told_from_waiting(child):
         end()
 
 
+@pytest.mark.fault("R4")
+@pytest.mark.parametrize(("most", "who"), [(None, "limit"), (600, "limit"), (3, "endless")])
+def test_a_limit_of_the_shell_on_computing_is_the_environment(child, tmp_path, most, who):
+    """In a shell of its own: its limit also holds for who starts the child."""
+    code = (
+        "import sys\n"
+        "from resource import RLIMIT_CPU, getrlimit, setrlimit\n"
+        "from usdbrdf.job.child import child\n"
+        "setrlimit(RLIMIT_CPU, (4, getrlimit(RLIMIT_CPU)[1]))\n"
+        f"with child('toy_children:spin', {{}}, {{}}, 600, 'x', cpu_limit_s={most}) as end:\n"
+        "    try:\n        end()\n"
+        "    except Exception as error:\n        sys.exit(f'{error.exit_code}: {error}')\n"
+    )
+    search = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2]), *sys.path])
+    said = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": search},
+        capture_output=True,
+        text=True,
+    ).stderr
+    assert said.startswith("4: " if who == "limit" else "3: "), said
+    assert f"[child.{who}]" in said
+    assert ("(4 s)" in said and "ulimit -t" in said) == (who == "limit")
+
+
 def test_a_child_beside_is_ended_with_the_block(child, tmp_path):
     note = tmp_path / "note"
     with module.child("toy_children:note", {}, {"note": str(note)}, 600, "beside"):

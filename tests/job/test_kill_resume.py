@@ -99,6 +99,27 @@ def test_what_ran_before_a_stopped_publish_and_what_was_stopped_both_end_it(
     assert hashes(tmp_path / "again") == undisturbed
 
 
+@pytest.mark.fault("R2")
+def test_what_two_stopped_publishes_put_there_goes(tmp_path, toy, hashes, monkeypatch):
+    """The first moved one output beside the finished ones, and the second none, nor what lies in
+    the place of another, which is not this task's."""
+    asset = tmp_path / "room"
+    toy.run_toy(asset, textures=1)
+    (asset / "textures/box2.lit.exr").write_text("of another task")
+    before = hashes(asset)
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    for stop, seed, textures in (("_retire", 1, 2), ("move", 2, 3)):
+        monkeypatch.setattr(task_module, stop, stopped)
+        with pytest.raises(KeyboardInterrupt):
+            toy.run_toy(asset, seed, textures=textures)
+        monkeypatch.undo()
+    assert not toy.run_toy(asset, textures=1).reran
+    assert hashes(asset) == before
+
+
 def test_file_edited_after_a_killed_publish_is_regenerated(tmp_path, toy, toy_process, hashes):
     asset = tmp_path / "room"
     assert toy_process(asset, fault="kill@toy:mid_publish:1").returncode == -9

@@ -13,7 +13,7 @@ from tests.relighting.scenes import MATTE, cube, looking, material, photograph, 
 from usdbrdf.asset.readers.render_scene import RenderScene
 from usdbrdf.errors import UsageError
 from usdbrdf.model.light import SkyLight
-from usdbrdf.model.material import constant_map, preview_material
+from usdbrdf.model.material import constant_map, preview_material, with_corner_colours
 from usdbrdf.options import Insert
 from usdbrdf.relighting.relit_scene import placed, with_material
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
@@ -114,6 +114,18 @@ def test_an_ior_alone_makes_a_dielectric_of_a_metal() -> None:
     found = with_material(cube(_metal()), Insert(model=Path("a.glb"), ior=1.5)).material
     assert found.diffuse.ravel() == pytest.approx(_GOLD)
     assert found.f0.ravel() == pytest.approx([0.04] * 3)
+
+
+@pytest.mark.parametrize("given", [{"ior": 1.5}, {"metallic": 1.0}, {"metallic": 0.25}])
+def test_colours_of_corners_stand_in_place_of_the_map(given: dict[str, float]) -> None:
+    """Whoever multiplies the two, and whoever takes the corners' alone, has the same."""
+    plain = cube(_metal())
+    colours = np.tile(_GOLD / 2, (len(plain.triangles), 3, 1))
+    coloured = with_corner_colours(plain, colours, 1.0, constant_map(0.04))
+    found = with_material(coloured, Insert(model=Path("a.glb"), **given))
+    assert found.material.diffuse.ravel() == pytest.approx([1, 1, 1])
+    assert found.corner_colour is not None
+    assert found.corner_colour == pytest.approx(colours * (1 - given.get("metallic", 0)))
 
 
 def test_a_colour_alone_leaves_a_metal_a_metal() -> None:

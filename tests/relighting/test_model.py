@@ -405,9 +405,98 @@ def test_extensions_of_a_glb_material(tmp_path: Path) -> None:
     found = _glb_of(tmp_path / "a.glb", said).material
     assert found.emission.ravel() == pytest.approx([40, 20, 0])
     assert found.f0.ravel() == pytest.approx([1 / 9] * 3)
-    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": -1}}
-    with pytest.raises(InputRefused, match=r"b\.glb: .*emissiveStrength -1.*\[mesh\.read\]$"):
-        _glb_of(tmp_path / "b.glb", {"extensions": strength})
+
+
+@pytest.mark.parametrize(
+    ("specular", "ior", "f0"),
+    [
+        ({"specularFactor": 0.5}, 1.5, [0.02, 0.02, 0.02]),
+        ({"specularColorFactor": [1, 0.5, 0]}, 2.0, [1 / 9, 1 / 18, 0]),
+        # As converters write a colour of F0: an index that reflects nearly all, or all.
+        (
+            {"specularColorFactor": [0.3, 0.2, 0.1], "specularFactor": 1},
+            1000,
+            [0.2988, 0.1992, 0.1],
+        ),
+        ({"specularColorFactor": [0.3, 2.0, 0.1], "specularFactor": 0.5}, 0, [0.15, 0.5, 0.05]),
+    ],
+)
+def test_specular_factors_of_a_glb(
+    tmp_path: Path, specular: dict[str, Any], ior: float, f0: list[float]
+) -> None:
+    extensions = {"KHR_materials_specular": specular, "KHR_materials_ior": {"ior": ior}}
+    said = {"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", dict(said)).material
+    assert found.f0.ravel() == pytest.approx(f0, abs=1e-3)
+    # What is metal of it reflects its base colour.
+    half = {"metallicFactor": 0.5, "baseColorFactor": [0.8, 0.4, 0.2, 1]}
+    mixed = np.add(f0, [0.8, 0.4, 0.2]) / 2
+    said = {"pbrMetallicRoughness": half, "extensions": extensions}
+    found = _glb_of(tmp_path / "b.glb", dict(said)).material
+    assert found.f0.ravel() == pytest.approx(mixed, abs=1e-3)
+    coloured = _glb_of(tmp_path / "c.glb", dict(said), [1, 1, 1])
+    assert coloured.corner_f0 is not None
+    assert coloured.corner_f0[0, 0] == pytest.approx(mixed, abs=1e-3)
+
+
+def test_specular_textures_of_a_glb_are_told_and_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    specular = {"specularColorTexture": {"index": 0}, "specularFactor": 0.5}
+    extensions = {"KHR_materials_specular": specular, "KHR_materials_ior": {"ior": 1000}}
+    said = {"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", said | {"name": "tiles"})
+    assert found.material.f0.ravel() == pytest.approx([0.02] * 3)
+    told = capsys.readouterr().err
+    assert "a.glb: material 'tiles': textures of KHR_materials_specular are not read" in told
+
+
+@pytest.mark.parametrize(
+    ("transmission", "metallic", "clear", "told"),
+    [
+        ({"transmissionFactor": 1.0}, 0, True, "glass is not rendered"),
+        ({"transmissionFactor": 0.9}, 0, True, "glass is not rendered"),
+        ({"transmissionFactor": 0.2}, 0, False, "taken as opaque"),
+        ({"transmissionFactor": 1, "transmissionTexture": {"index": 0}}, 0, False, "as opaque"),
+        ({"transmissionFactor": 1.0}, 1, False, ""),  # which metal holds
+        ({}, 0, False, ""),
+    ],
+)
+def test_glass_of_a_glb_is_clear(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    transmission: dict[str, Any],
+    metallic: int,
+    clear: bool,
+    told: str,
+) -> None:
+    extensions = {"KHR_materials_transmission": transmission}
+    inner = {"metallicFactor": metallic}
+    said = {"name": "glass", "pbrMetallicRoughness": inner, "extensions": extensions}
+    found = _glb_of(tmp_path / "a.glb", said)
+    assert found.material.clear == clear
+    sentences = capsys.readouterr().err
+    assert told in sentences
+    assert ("material 'glass'" in sentences) == bool(told)
+    # Which an index of refraction does not change, but being metal does.
+    model = tmp_path / "a.glb"
+    assert with_material(found, Insert(model=model, ior=1.6)).material.clear == clear
+    assert not with_material(found, Insert(model=model, metallic=1.0)).material.clear
+
+
+@pytest.mark.parametrize(
+    "strength", [-1, "bright", None, [1], 1e39, float("nan"), pytest.param(10**400, id="huge")]
+)
+def test_a_false_strength_of_emission_is_not_said_of_the_mesh(
+    tmp_path: Path, strength: Any
+) -> None:
+    said = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
+    with pytest.raises(InputRefused) as refused:
+        _glb_of(tmp_path / "a.glb", {"extensions": said})
+    sentence = str(refused.value)
+    assert "a.glb: material '0' has emissiveStrength" in sentence
+    assert "KHR_materials_emissive_strength has a finite number of at least 0." in sentence
+    assert not any(word in sentence for word in ("mesh", "face", "corners"))
 
 
 def test_vertex_colours_of_a_glb_are_linear_and_multiply_its_base_colour(tmp_path: Path) -> None:

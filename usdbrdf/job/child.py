@@ -83,9 +83,9 @@ def child(
                          else is at work on the machine; unlimited if None
 
     A UsdBrdfError raised there is raised by the waiting, with its class. Death by a signal is a
-    CrashedChild, an InputRefused, and so is computing for too long; running out of wall time a
-    LateChild, an EnvironmentFailure as running out of memory, SIGKILL and what cannot be imported
-    there are.
+    CrashedChild, an InputRefused, and so is computing for longer than ``cpu_limit_s``; running out
+    of wall time a LateChild, an EnvironmentFailure as running out of memory, or of what the shell
+    lets a program compute, SIGKILL and what cannot be imported there are.
     """
     with scratch_folder() as folder:
         with environment_failures(label):
@@ -166,6 +166,13 @@ def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
         )
     how = signal.Signals(-status).name
     if -status == signal.SIGXCPU:
+        most = json.loads((folder / "task.json").read_text("utf-8"))["cpu_limit_s"]
+        shell, _ = resource.getrlimit(resource.RLIMIT_CPU)
+        if shell != resource.RLIM_INFINITY and (most is None or shell < most):
+            return EnvironmentFailure(
+                f"{label} computed for longer than this shell allows ({shell} s) and was stopped. "
+                "Raise its limit (ulimit -t) and run the same command again. [child.limit]"
+            )
         return CrashedChild(
             f"{label} computed for longer than it may and was stopped. Simplify the input. "
             "[child.endless]"

@@ -285,14 +285,13 @@ def run_task(
         for place in (stamp.parent, work_folder):
             place.mkdir(parents=True, exist_ok=True)
         reason = why_rerun(asset, order, wanted)
-        noted = read_stamp(journal)
+        noted, done = read_stamp(journal), read_stamp(stamp)
         interrupted = noted is not None and noted.fingerprint == wanted.fingerprint
         for path in work_folder.iterdir():  # this task's work for other parameters
             if re.fullmatch(rf"{re.escape(name)}-[0-9a-f]{{12}}", path.name) and path != folder:
                 workers.forget(path / _FOR_WORKERS)
                 shutil.rmtree(path, ignore_errors=True)
         if reason is None:
-            done = read_stamp(stamp)
             if noted and done and not interrupted:
                 _undo(asset, noted, done)
             journal.unlink(missing_ok=True)
@@ -309,9 +308,11 @@ def run_task(
             summary = json.loads(json_text(work(run)))
         workers.forget(folder / _FOR_WORKERS)
         outputs = run.hashes()
+        if noted and done:  # of two stopped publishes the second journal does not tell of the first
+            _undo(asset, noted, done)
         # The hashes of this task's files as they may lie there now, and of what is about to be
         # replaced, such as an empty layer that another task put there.
-        earlier = hashes_in([read_stamp(stamp), noted])
+        earlier = hashes_in([done, noted])
         for relative in outputs:
             if (asset / relative).is_file():
                 earlier.setdefault(relative, set()).add(sha256_of(asset / relative))
@@ -403,7 +404,7 @@ def _publish(asset: Path, folder: Path, journal: Stamp, order: int) -> None:
 
 def _undo(asset: Path, journal: Stamp, done: Stamp) -> None:
     """Delete what a publish for other parameters put beside the outputs of the finished task before
-    it was stopped; of those it had replaced none, or the task would not count as finished."""
+    it was stopped. What it had replaced of these stays, for the next publish to replace."""
     moved = {relative: [sha256] for relative, sha256 in journal.outputs.items()}
     for changed in _retire(asset, replace(done, earlier=moved)):
         flush_folder(changed)

@@ -66,7 +66,8 @@ class Surface:
     triangles       (F, 3) int32, counter-clockwise seen from the front
     corner_normals  (F, 3, 3) float32 unit vectors
     corner_uv       (F, 3, 2) float32, v up; None where the material has no maps
-    corner_colour   (F, 3, 3) float32 to be multiplied on the diffuse map; None where it has none
+    corner_colour   (F, 3, 3) float32, reflectance of the diffuse term in place of the diffuse map,
+                    which is 1 then; None where that holds
     corner_f0       (F, 3, 3) float32 in place of the map of f0; None where that holds
     two_sided       False if the back is black
     """
@@ -148,14 +149,18 @@ def preview_material(
     emission: Float,
     ior: float = 1.5,
     specular: Float | None = None,
+    dielectric: Float | None = None,
 ) -> Material:
     """The material of UsdPreviewSurface's inputs (its specification, "Core Nodes").
 
     Metallic workflow: F0 = mix(((1 - ior) / (1 + ior))^2, diffuse, metallic), and metal has no
     diffuse term. Specular workflow, where ``specular`` (H, W, 3) is given: F0 is that colour.
+
+    dielectric  (1, 1, 3), in place of what ``ior`` says
     """
-    dielectric = normal_reflectance(ior)
-    f0 = constant_map(float(dielectric)) if specular is None else specular
+    if dielectric is None:
+        dielectric = constant_map(float(normal_reflectance(ior)))
+    f0 = dielectric if specular is None else specular
     plain = Material(diffuse=diffuse, f0=f0, roughness=roughness, emission=emission)
     # The usual case, and the diffuse map may be large.
     if specular is not None or not metallic.any():
@@ -168,14 +173,14 @@ def preview_material(
 
 
 def with_corner_colours(
-    surface: Surface, colours: Float, metallic: float, ior: float = 1.5
+    surface: Surface, colours: Float, metallic: float, dielectric: Float
 ) -> Surface:
-    """The surface in base colours (F, 3, 3) of its corners, in place of its maps'; what is metal
-    of it reflects them in its lobe."""
+    """The surface in base colours (F, 3, 3) of its corners, in place of its map of them; what is
+    metal of it, a share ``metallic``, reflects them in its lobe, and the rest diffusely, of which
+    ``dielectric`` (1, 1, 3) is F0."""
     material = replace(surface.material, diffuse=constant_map(1.0))
     if not metallic:
         return replace(surface, material=material, corner_colour=colours, corner_f0=None)
-    dielectric = normal_reflectance(ior)
     f0 = np.asarray(dielectric + np.float32(metallic) * (colours - dielectric), np.float32)
     mean = constant_map(*(float(value) for value in f0.reshape(-1, 3).mean(axis=0)))
     return replace(

@@ -20,6 +20,7 @@ from usdbrdf.model.material import (
     Surface,
     constant_map,
     corner_base_colours,
+    normal_reflectance,
     preview_material,
     turned_up,
     with_corner_colours,
@@ -178,24 +179,22 @@ def with_material(surface: Surface, insert: Insert) -> Surface:
             material = replace(material, diffuse=base)
         return replace(surface, material=material)
     ior = 1.5 if insert.ior is None else insert.ior
+    dielectric = constant_map(float(normal_reflectance(ior)))
     mixed = preview_material(
         diffuse=base,
         metallic=metallic,
         roughness=material.roughness,
         emission=material.emission,
-        ior=ior,
+        dielectric=dielectric,
     )
     colours = corner_base_colours(surface)
-    surface = replace(
-        surface,
-        material=replace(mixed, wrap=material.wrap, lobe=material.lobe),
-        corner_colour=colours,
-        corner_f0=None,
-    )
-    if colours is None or not metallic.any():
+    clear = material.clear and not metallic.any()
+    mixed = replace(mixed, wrap=material.wrap, lobe=material.lobe, clear=clear)
+    surface = replace(surface, material=mixed)
+    if colours is None:
         return surface
-    # A metal takes the colours of the corners.
-    return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), ior)
+    # Which stand in place of the map, also of a metal's.
+    return with_corner_colours(surface, colours, float(metallic[0, 0, 0]), dielectric)
 
 
 def placed(

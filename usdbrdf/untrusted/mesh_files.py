@@ -7,7 +7,8 @@ import errno
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +22,7 @@ from trimesh.exchange.ply import load_ply
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.paths import contained
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Float, Int
 from usdbrdf.model.material import (
     Material,
@@ -32,8 +34,11 @@ from usdbrdf.model.material import (
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
-    index_of_refraction,
+    is_clear,
+    normal_reflectance_of,
+    refuse_false,
     taken_colours,
+    unread,
     with_numbered_materials,
 )
 from usdbrdf.untrusted.mesh_text import binary_ply_of_polygons, obj_counted_forwards
@@ -48,7 +53,7 @@ _MIN_DIAGONAL = 1e-4
 # Faces with broken corners below this share are removed; above it the file is not what it says.
 _MAX_BROKEN_SHARE = 0.01
 # UsdPreviewSurface's own, where a file has no material.
-_GREY, _ROUGHNESS, _IOR = 0.18, 0.5, 1.5
+_GREY, _ROUGHNESS = 0.18, 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,16 +92,21 @@ def model_from_file(path: Path) -> tuple[Surface, ...]:
     """The meshes of a file with their materials, in the file's own axes and units.
 
     Base colour, its texture, vertex colours, metalness, roughness, emission and a GLB's index of
-    refraction are read. Images are sRGB, and so are vertex colours but a GLB's, which are linear;
-    beside maps the mean of these counts. What an OBJ or GLB names must lie in its folder. Corner
-    normals are NaN where the file brings none.
+    refraction, specular factors and transmission are read; warnings say what of these is not shown.
+    Images are sRGB, and so are vertex colours but a GLB's, which are linear; beside maps the
+    mean of these counts. What an OBJ or GLB names must lie in its folder. Corner normals are NaN
+    where the file brings none.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
             f"{path}: models are read from USD, {', '.join(SUFFIXES)}. Convert it. [relight.model]"
         )
-    parts = (Surface, Material)
-    return read_in_child("mesh", f"{__name__}:read_model_here", path, tuple, parts=parts)
+    reader = f"{__name__}:read_model_here"
+    surfaces, sentences = read_in_child("mesh", reader, path, tuple, parts=(Surface, Material))
+    for sentence in sentences:
+        warn(sentence)
+    found: tuple[Surface, ...] = surfaces
+    return found
 
 
 def read_mesh_here(path: Path) -> FileMesh:
@@ -280,18 +290,19 @@ def _no_faces(vertices: int) -> FileMesh:
 _READERS = {".ply": _mesh_from_ply, ".obj": _mesh_from_obj, ".glb": _mesh_from_glb}
 
 
-def read_model_here(path: Path) -> tuple[Surface, ...]:
-    """``model_from_file`` in this process, which is to be a child."""
+def read_model_here(path: Path) -> tuple[list[Surface], list[str]]:
+    """``model_from_file`` in this process, which is to be a child, and its warnings."""
     # Its checks first: whatever is damaged is refused there, in one sentence.
     if read_mesh_here(path).kept is not None:
         raise InputRefused(
             f"{path}: faces of it have NaN corners or vertices that do not exist. Export it again. "
             "[relight.model]"
         )
-    return tuple(_parsed(path, lambda file: _surfaces(path, file)))
+    found: tuple[list[Surface], list[str]] = _parsed(path, lambda file: _surfaces(path, file))
+    return found
 
 
-def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
+def _surfaces(path: Path, file: BinaryIO) -> tuple[list[Surface], list[str]]:
     beside = _FilesBeside(path)
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
     if path.suffix.lower() == ".obj":
@@ -299,6 +310,7 @@ def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
     gltf = None
     if path.suffix.lower() == ".glb":
         file, gltf = with_numbered_materials(file)
+        refuse_false(gltf, path)
     stored = load(file, resolver=beside)
     if beside.refused:
         raise beside.refused[0]
@@ -318,7 +330,7 @@ def _surfaces(path: Path, file: BinaryIO) -> list[Surface]:
             own_normals, own_colours = given[name]
             surface = _surface(f"{path.name}:{node}", mesh, own_normals, own_colours, gltf)
             found.append(surface.moved(np.asarray(world_from_node)))
-    return found
+    return found, unread(gltf or (), path)
 
 
 class _FilesBeside:
@@ -381,18 +393,20 @@ def _surface(
 
 @dataclass(frozen=True, kw_only=True)
 class _Inputs:
-    """Those of ``preview_material``."""
+    """Those of ``preview_material``, and what is ``clear`` of a Material."""
 
     diffuse: Float
     metallic: Float
     roughness: Float
     emission: Float
-    ior: float = _IOR
+    dielectric: Float = field(default_factory=partial(normal_reflectance_of, {}))
+    clear: bool = False
 
     @property
     def material(self) -> Material:
         # The default of OBJ and of glTF, whose samplers the reader does not keep.
-        return replace(preview_material(**vars(self)), wrap="repeat")
+        inputs = {name: value for name, value in vars(self).items() if name != "clear"}
+        return replace(preview_material(**inputs), wrap="repeat", clear=self.clear)
 
 
 def _coloured(surface: Surface, inputs: _Inputs, colours: Float) -> Surface:
@@ -400,7 +414,7 @@ def _coloured(surface: Surface, inputs: _Inputs, colours: Float) -> Surface:
     corners or a map; beside maps their mean counts."""
     if inputs.diffuse.shape[:2] == inputs.metallic.shape[:2] == (1, 1):
         metallic = float(inputs.metallic[0, 0, 0])
-        return with_corner_colours(surface, inputs.diffuse * colours, metallic, inputs.ior)
+        return with_corner_colours(surface, inputs.diffuse * colours, metallic, inputs.dielectric)
     mean = colours.mean(axis=(0, 1), dtype=np.float32)
     return replace(surface, material=replace(inputs, diffuse=inputs.diffuse * mean).material)
 
@@ -439,8 +453,12 @@ def _inputs(visual: Any, gltf: list[dict[str, Any]] | None, *, textured: bool) -
     if not gltf:
         return found
     said = gltf[int(stored.name)]
-    strength = np.float32(emissive_strength(said))
-    return replace(found, emission=emission * strength, ior=index_of_refraction(said))
+    return replace(
+        found,
+        emission=emission * np.float32(emissive_strength(said)),
+        dielectric=normal_reflectance_of(said),
+        clear=is_clear(said),
+    )
 
 
 def _factor(value: Any, channels: int, fallback: float) -> Float:

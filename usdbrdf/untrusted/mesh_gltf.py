@@ -4,14 +4,28 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from io import BytesIO
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Float
+from usdbrdf.model.material import normal_reflectance
 
 _HEAD = 12  # bytes before the first part; each part begins with 8 more
+_IOR = 1.5
+_MOST = float(np.finfo(np.float32).max)
+# What is read of extensions, and what it is where a material does not say it.
+_EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
+    ("emissive_strength", "emissiveStrength"): 1.0,
+    ("ior", "ior"): _IOR,
+    ("specular", "specularFactor"): 1.0,
+    ("specular", "specularColorFactor"): (1.0, 1.0, 1.0),
+    ("transmission", "transmissionFactor"): 0.0,
+}
 
 
 def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, Any]]]:
@@ -31,21 +45,95 @@ def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, An
     return BytesIO(head + text + content[end:]), materials
 
 
+def refuse_false(materials: Sequence[dict[str, Any]], path: Path) -> None:
+    """InputRefused where an extension of a material has a value that is no finite number, or less
+    than 0."""
+    for i, material in enumerate(materials):
+        for (name, key), fallback in _EXTENSIONS.items():
+            said = _extension(material, name).get(key, fallback)
+            try:
+                numbers = np.asarray(said, np.float64)
+                sound = numbers.shape == np.shape(fallback)
+                sound = sound and bool(((numbers >= 0) & (numbers < _MOST)).all())
+            except (TypeError, ValueError, OverflowError):
+                sound = False
+            if not sound:
+                wanted = "finite numbers" if np.shape(fallback) else "a finite number"
+                raise InputRefused(
+                    f"{path}: material {_name(material, i)} has {key} {str(said)[:80]}, where "
+                    f"KHR_materials_{name} has {wanted} of at least 0. Correct it, or remove the "
+                    "extension. [relight.material]"
+                )
+
+
+def _said(material: dict[str, Any], extension: str, key: str) -> Any:
+    """The value, once it is known to be sound, or what it is where the material says none."""
+    return _extension(material, extension).get(key, _EXTENSIONS[extension, key])
+
+
 def emissive_strength(material: dict[str, Any]) -> float:
     """The factor on the emission, 1 where the material says none."""
-    strength = float(_extension(material, "emissive_strength").get("emissiveStrength", 1))
-    if not 0 <= strength < np.inf:
-        raise ValueError(f"emissiveStrength {strength:g}")
-    return strength
+    return float(_said(material, "emissive_strength", "emissiveStrength"))
 
 
-def index_of_refraction(material: dict[str, Any]) -> float:
-    """1.5 where the material says none, or none that a surface has. 0 is glTF's infinite one: it
-    reflects all. Where a specular colour limits what an index would reflect, as converters write
-    them together, the index by itself says nothing."""
-    ior = float(_extension(material, "ior").get("ior", 1.5))
-    known = (ior == 0 or 1 <= ior < np.inf) and not _extension(material, "specular")
-    return ior if known else 1.5
+def normal_reflectance_of(material: dict[str, Any]) -> Float:
+    """(1, 1, 3) float32: F0 of what is not metal of it, as KHR_materials_ior and _specular say; the
+    second also dims what is reflected at the edge, which no material here can have.
+
+    An index of 0 is glTF's infinite one: it reflects all; one that no surface has is not believed.
+    """
+    ior = _said(material, "ior", "ior")
+    if _has_texture_of(material, "specular") or 0 < ior < 1:
+        # Converters write an index that reflects nearly all, and textures that limit it.
+        ior = _IOR
+    colour = np.array(_said(material, "specular", "specularColorFactor"))
+    strength = min(_said(material, "specular", "specularFactor"), 1)
+    f0 = np.minimum(normal_reflectance(ior) * colour, 1) * strength
+    return np.asarray(f0, np.float32).reshape(1, 1, 3)
+
+
+def _has_texture_of(material: dict[str, Any], extension: str) -> bool:
+    return any(key.endswith("Texture") for key in _extension(material, extension))
+
+
+def is_clear(material: dict[str, Any]) -> bool:
+    """Whether more light passes than not: what is shown is nothing, or an opaque surface."""
+    return _transmission(material) >= 0.5 and not _has_texture_of(material, "transmission")
+
+
+def _transmission(material: dict[str, Any]) -> float:
+    """The share of the light that is not reflected at the surface, and passes; metal holds it."""
+    inner = material.get("pbrMetallicRoughness", {})
+    # Beside a texture of it, which says where there is metal, the factor is 1.
+    metallic = 0.0 if "metallicRoughnessTexture" in inner else float(inner.get("metallicFactor", 1))
+    share = _said(material, "transmission", "transmissionFactor") * (1 - metallic)
+    return float(np.clip(share, 0, 1))
+
+
+def unread(materials: Sequence[dict[str, Any]], path: Path) -> list[str]:
+    """A sentence each on what the materials say and is not shown."""
+    sentences = []
+    for i, material in enumerate(materials):
+        said, passes = f"{path}: material {_name(material, i)}", _transmission(material)
+        if _has_texture_of(material, "specular"):
+            sentences.append(
+                f"{said}: textures of KHR_materials_specular are not read; it reflects by an index "
+                f"of refraction of {_IOR} and the factors beside them."
+            )
+        if is_clear(material):
+            sentences.append(
+                f"{said}: glass is not rendered; light passes through as if nothing was there."
+            )
+        elif passes > 0:
+            sentences.append(
+                f"{said}: light that passes in part, or by a texture, is not rendered; the surface "
+                "is taken as opaque."
+            )
+    return sentences
+
+
+def _name(material: dict[str, Any], number: int) -> str:
+    return repr(str(material.get("name", number))[:80])
 
 
 def _extension(material: dict[str, Any], name: str) -> dict[str, Any]:

@@ -131,12 +131,11 @@ class Pictures:
     def numbered(self) -> dict[int, Path]:
         """The pictures by the number at the end of their names, those without left out; of two of
         one number the one that is nearer to radiance."""
-        found: dict[int, Path] = {}
-        for path in sorted(self.paths, key=_nearness, reverse=True):
-            digits = re.search(r"(\d+)$", path.stem)
-            if digits:
-                found[int(digits.group(1))] = path
-        return found
+        found: dict[int, list[Path]] = {}
+        for path in self.paths:
+            if digits := re.search(r"(\d+)$", path.stem):
+                found.setdefault(int(digits.group(1)), []).insert(0, path)
+        return {i: min(_in_colours(alike), key=_nearness) for i, alike in found.items()}
 
 
 def _nearness(path: Path) -> int:
@@ -145,6 +144,7 @@ def _nearness(path: Path) -> int:
 
 def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
     """Of pictures that may be the one that is meant; None where several of one kind are."""
+    found = _in_colours(found)
     best = min(map(_nearness, found), default=0)
     nearest = [path for path in found if _nearness(path) == best]
     return nearest[0] if len(nearest) == 1 else None
@@ -163,8 +163,16 @@ def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -
 
 def _is_radiance(path: Path) -> bool:
     """Whether a picture beside a photograph is its radiance: without colours it is its depths."""
-    if path.suffix.lower() not in _RADIANCE:
-        return False
+    return path.suffix.lower() in _RADIANCE and _has_colours(path)
+
+
+def _in_colours(found: Sequence[Path]) -> Sequence[Path]:
+    """Of several pictures of one name those with colours, as far as there are any: the others are
+    its depths or its mask, of whatever kind of file, and no frame can be read from them."""
+    return (len(found) > 1 and [path for path in found if _has_colours(path)]) or found
+
+
+def _has_colours(path: Path) -> bool:
     try:
         return {"r", "g", "b"} <= {name.lower() for name in image_size(path)[2]}
     except ImageRefused:  # of which the reader of its pixels will tell
