@@ -25,7 +25,7 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.base_color import Reflection, base_color_of
-from usdbrdf.shading.hidden_light import LEAK, beside_seen
+from usdbrdf.shading.hidden_light import MOST_LEAK, beside_seen
 from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import frames_in_view, samples_from_frames, spread_order
@@ -175,7 +175,7 @@ def refined_light(
         for one, beside in zip(shown, besides, strict=True):
             hidden = base_color * one.irradiance / np.pi
             # As in ``light_of_hidden``.
-            leaks = beside & (hidden.mean(axis=1) > LEAK * one.radiance.mean(axis=1))
+            leaks = beside & (hidden.mean(axis=1) > MOST_LEAK * one.radiance.mean(axis=1))
             hidden = np.where(leaks[:, None], one.radiance, hidden)
             told = one.measured | one.emissive
             light.append(np.where(told[:, None], one.radiance, hidden))

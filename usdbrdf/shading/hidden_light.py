@@ -26,14 +26,13 @@ from usdbrdf.transport.lit_scene import TexturedScene
 
 # Texels at which S is traced, of those that are seen and of those that are not, in all; of one
 # object no fewer than these.
-_TRACED, _OF_OBJECT = 1 << 15, 48
-# Their means are asked for, not what each of them receives.
-_ROUGHLY = Sampling(standard_error=0, max_rays=64)
+_TRACED, _LEAST_OF_OBJECT = 1 << 15, 48
+# From each: their means are asked for, not what each of them receives.
+_RAYS = 64
 _ROUNDS = 2
 _SEED = 0x41D
-_MOSTLY = 0.5
 # Texels around what was seen that are no more than so many times as bright as their fill.
-_RIM, LEAK = 3, 2.0
+_RIM, MOST_LEAK = 3, 2.0
 
 
 def with_hidden_light(
@@ -81,13 +80,18 @@ def light_of_hidden(
     for number in range(_ROUNDS):
         shining = Shining.of(surface, light, environment)
         traced = irradiance_of_texels(
-            surface, shining, environment, both, (seed ^ _SEED) + number, _ROUGHLY
+            surface,
+            shining,
+            environment,
+            both,
+            (seed ^ _SEED) + number,
+            Sampling(standard_error=0, max_rays=_RAYS),
         )
         albedo, lamp = _albedo(texels, seen, lit[seen], traced[: len(seen)])
         sent = albedo * _spread_out(texels, hidden, traced[len(seen) :], whole) / np.pi
         # Beyond the foot of a wall it may lie in the sun, and is read together with what was seen
         # before it.
-        leaks = beside & (sent.mean(axis=1) > LEAK * lit.mean(axis=1))
+        leaks = beside & (sent.mean(axis=1) > MOST_LEAK * lit.mean(axis=1))
         light = np.where((shown | leaks | lamp)[:, None], lit, sent).astype(np.float32)
     return light
 
@@ -106,7 +110,7 @@ def _albedo(texels: Texels, seen: Long, lit: Float, irradiance: Float) -> tuple[
         np.bincount(owner[seen], kind, count) for kind in (known, reflects)
     )
     albedo[(num_reflecting == 0)[owner]] = NEUTRAL
-    return albedo, (num_reflecting < _MOSTLY * num_known)[owner]
+    return albedo, (2 * num_reflecting < num_known)[owner]
 
 
 def beside_seen(texels: Texels, shown: Bool) -> Bool:
@@ -127,7 +131,7 @@ def _spread(texels: Texels, which: Bool) -> Long:
         own = texels.of_object(i)
         some = own.start + np.flatnonzero(which[own])
         share = float(texels.area[some].sum()) / max(total, 1e-30)
-        number = min(len(some), max(_OF_OBJECT, round(_TRACED * share)))
+        number = min(len(some), max(_LEAST_OF_OBJECT, round(_TRACED * share)))
         chosen.append(some[np.linspace(0, len(some) - 1, number).astype(np.int64)])
     return np.concatenate(chosen) if chosen else np.zeros(0, np.int64)
 

@@ -212,6 +212,7 @@ _MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY = 0.05, 0.5, 0.2
 class Shaded:
     """What is known of all texels.
 
+    observed        (T,): a frame shows it
     light           L_d (T, 3) with the estimated radiance of lamps that clipped, and with what
                     hidden surfaces reflect
     unseen          lamps that no frame shows
@@ -225,6 +226,7 @@ class Shaded:
     outside         the light from outside; None for none
     """
 
+    observed: Bool
     light: ClippedLight
     unseen: UnseenLamps
     traced: Irradiance
@@ -240,6 +242,13 @@ class Shaded:
     def emission(self) -> Float:
         """(T, 3) W/(m^2 sr): what shines by itself, zero elsewhere."""
         return np.where(self.emitters.emissive[:, None], self.light.lit, np.float32(0))
+
+    @property
+    def hidden(self) -> Float:
+        """(T, 3) W/(m^2 sr): what texels that no frame shows are taken to reflect, zero on all
+        else."""
+        shown = self.observed | self.emitters.emissive
+        return np.where(shown[:, None], np.float32(0), self.light.lit)
 
     def radiance_status(self, index: int) -> str:
         """How the radiance of what shines on an object is known: "measured"; where no frame
@@ -380,7 +389,8 @@ def shade_surface(
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
     return Shaded(
-        light=light, traced=traced, relative_error=relative, irradiance=irradiance,
-        unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over, outside=outside,
+        observed=coverage.observed, light=light, traced=traced, relative_error=relative,
+        irradiance=irradiance, unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over,
+        outside=outside,
         over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),
     )  # fmt: skip

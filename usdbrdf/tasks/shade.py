@@ -18,7 +18,6 @@ from usdbrdf.asset.properties import ShadedObject, colour
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.job.units import HERE, Workers
-from usdbrdf.model.arrays import Bool
 from usdbrdf.model.mesh import LAMP, OF_SHADE
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
@@ -55,7 +54,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = [
             replace(item, directive=asked.get(item.identifier, ""))
-            for item in _write_maps(writer, shaded, maps.coverage.observed)
+            for item in _write_maps(writer, shaded)
         ]
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
@@ -75,15 +74,14 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         view.write(run.output(asset.preview("albedo")), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output(asset.preview("irradiance")), maps.texels, shaded.irradiance)
         doubts = warned(shaded.doubts(identifiers := [item.identifier for item in objects]))
-        found = {"denoise": lightmap_filter, "warnings": doubts}
-        summary = shaded.summary(identifiers) | found
+        summary = shaded.summary(identifiers) | {"denoise": lightmap_filter, "warnings": doubts}
         return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work, workers)
 
 
-def _write_maps(writer: MapWriter, shaded: Shaded, observed: Bool) -> list[ShadedObject]:
-    """Every object's pictures, and the record that names them. observed (T,): frames show it."""
+def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
+    """Every object's pictures, and the record that names them."""
     traced = shaded.traced
     maps = {
         "irradiance": TexelMap(shaded.irradiance, 1 / np.pi, "W/m^2"),
@@ -95,11 +93,9 @@ def _write_maps(writer: MapWriter, shaded: Shaded, observed: Bool) -> list[Shade
     if shaded.unexplained.any():
         unexplained = shaded.unexplained.astype(np.float32)
         maps["unexplained"] = TexelMap(unexplained, 1.0, "1", colour=False)
-    emission = {"emission": TexelMap(shaded.emission, 1.0, "W/(m^2 sr)")}
+    radiances = {"emission": shaded.emission, "hidden": shaded.hidden}
+    of_some = {name: TexelMap(values, 1.0, "W/(m^2 sr)") for name, values in radiances.items()}
     emitters, objects = shaded.emitters, []
-    hidden = ~observed & ~emitters.emissive
-    light = np.where(hidden[:, None], shaded.light.lit, np.float32(0))
-    of_hidden = {"hidden": TexelMap(light, 1.0, "W/(m^2 sr)")}
     for i, obj in enumerate(writer.scene.objects):
         own = writer.texels.of_object(i)
         mean = partial(writer.texels.mean_of_object, i)
@@ -108,10 +104,7 @@ def _write_maps(writer: MapWriter, shaded: Shaded, observed: Bool) -> list[Shade
                 prim_path=obj.prim_path,
                 identifier=obj.identifier,
                 aovs=writer.write(
-                    i,
-                    maps
-                    | (emission if emitters.emissive[own].any() else {})
-                    | (of_hidden if hidden[own].any() else {}),
+                    i, maps | {k: v for k, v in of_some.items() if v.values[own].any()}
                 ),
                 emitter=bool(emitters.is_lamp[i]),
                 radiance=colour(emitters.radiance[i]),
