@@ -97,15 +97,15 @@ def light_of_hidden(
 
 
 def _albedo(texels: Texels, seen: Long, lit: Float, irradiance: Float) -> tuple[Float, Bool]:
-    """Albedo (T, 3), in units of the known light, by that of the texels ``seen`` (N,), and the
-    texels (T,) of objects most of which shines."""
+    """Albedo (T, 3) by that of the texels ``seen`` (N,), and the texels (T,) of objects most of
+    which shines."""
     owner, count = texels.object_index(), len(texels.resolution)
     ratio, known = albedo_where_lit(lit, irradiance, np.ones(len(seen), np.bool_))
-    # Where lamps are not known yet, all reflects more than it receives, seen and hidden alike.
+    # Where lamps are not known yet, what they shine on seems to reflect more than it receives.
     usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
-    most = max(1.0, usual / NEUTRAL)
-    reflects = known & (ratio.mean(axis=1) <= EMITTER_RATIO * most)
-    albedo = _spread_out(texels, seen, np.minimum(ratio, most), reflects)
+    ratio /= max(1.0, usual)
+    reflects = known & (ratio.mean(axis=1) <= EMITTER_RATIO)
+    albedo = _spread_out(texels, seen, np.minimum(ratio, 1), reflects)
     num_known, num_reflecting = (
         np.bincount(owner[seen], kind, count) for kind in (known, reflects)
     )

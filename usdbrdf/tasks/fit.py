@@ -28,7 +28,9 @@ from usdbrdf.transport.brdf import PAPER
 from usdbrdf.transport.denoise import AUTO, NONE, OIDN, chosen_filter
 
 # The maps that the fit reads; and which lightings are weighed by.
-_READ = ("lit", "samples", "coverage", "irradiance", "irradiance_raw", "emission", "sky")
+_READ = (
+    "lit", "samples", "coverage", "irradiance", "irradiance_raw", "emission", "hidden", "sky",
+)  # fmt: skip
 _WEIGHED = ("stderr",)
 
 
