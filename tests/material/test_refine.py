@@ -33,6 +33,7 @@ from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import shaded
+from usdbrdf.shading.hidden_light import beside_seen
 from usdbrdf.texturing.robust_mean import RobustMean
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
 from usdbrdf.transport.environment import black_environment
@@ -268,12 +269,18 @@ def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Pat
     assert off[1][1] < 0.02
 
 
+def _beside(texels, before) -> np.ndarray:
+    """(T,): what no frame shows of what is read together with what one shows."""
+    shown = before.coverage.observed | before.emissive
+    return beside_seen(texels, shown) & ~shown
+
+
 def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
     atlas = _atlas(fitted)
     unseen = ~atlas.coverage.observed
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
     reflects = atlas.map("base_color") * atlas.map("refined_irradiance") / np.pi
-    rim = refine._beside_seen(atlas.texels, atlas)
+    rim = _beside(atlas.texels, atlas)
     assert rim.sum() > 5
     lit, kept = atlas.map("diffuse")[rim].mean(axis=1), reflects[rim].mean(axis=1)
     filled = np.abs(lit / kept - 1) > 0.05
@@ -295,9 +302,9 @@ def test_what_no_frame_shows_is_beside_what_one_shows(room: Room):
         coverage = CoverageMap.of(seen, np.zeros_like(seen))
         emissive = np.zeros_like(seen)
 
-    assert 9 <= np.count_nonzero(refine._beside_seen(texels, Before())) < 49
+    assert 9 <= np.count_nonzero(_beside(texels, Before())) < 49
     Before.emissive = ~seen
-    assert not refine._beside_seen(texels, Before()).any()
+    assert not _beside(texels, Before()).any()
 
 
 def _refined(room: Room, folder: Path) -> np.ndarray:
@@ -314,7 +321,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     given = []
 
     def spied(run, lit, traced, change, *others):
-        given.append(atlas.lit + change)
+        given.append(atlas.light + change)
         return refined_irradiance(run, lit, traced, change, *others)
 
     monkeypatch.setattr(refine, "refined_irradiance", spied)
@@ -322,7 +329,7 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     found = _refined_light(run, atlas, lit, frames)
     unseen = ~atlas.coverage.observed
     unseen &= (atlas.map_where_present("emission", 3) == 0).all(axis=1)
-    unseen &= ~refine._beside_seen(atlas.texels, atlas)
+    unseen &= ~_beside(atlas.texels, atlas)
     # The base colour is filled in alike, whichever irradiance it is made with.
     share = given[0][unseen] / found.diffuse[unseen]
     change = atlas.map("irradiance")[unseen] / found.irradiance[unseen]

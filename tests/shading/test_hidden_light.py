@@ -138,8 +138,8 @@ def test_nothing_hidden_or_nothing_seen_changes_nothing(by_lamp):
 
 
 def test_a_patch_in_the_sun_that_clips_is_no_lamp():
-    """A part of the table lies in the sun and clips; the panel over the floor shines as brightly, in
-    the shadow, and is one."""
+    """A part of the table lies in the sun and clips; the panel over the floor shines as brightly,
+    in the shadow, and is one."""
     world = _world(1.25)
     texels, owner = world.texels, world.texels.object_index()
     sky = Environment(np.full((8, 16, 3), 0.3, np.float32), True).under(SUN)
