@@ -176,10 +176,12 @@ def test_light_from_outside_is_a_dome_and_a_sun(tmp_path, synthetic, up_axis, un
     assert [str(found) for found in validate(built.asset.root_layer)] == []
 
 
-def test_where_nothing_else_shines_the_light_from_outside_is_on(built):
+@pytest.mark.parametrize("with_lamp", [False, True])
+def test_the_light_from_outside_is_on(built, with_lamp):
     built.outside = sky_of(built.asset)
+    lamps = [ball_lamp(built)] if with_lamp else []
     write_lights_layer(
-        built.asset.lights_layer, built.draft("shading"), [], built.outside, np.eye(4)
+        built.asset.lights_layer, built.draft("shading"), lamps, built.outside, np.eye(4)
     )
     layer = Sdf.Layer.FindOrOpen(str(built.asset.lights_layer))
     assert layer.GetPrimAtPath("/room").variantSelections[LIGHTS] == USDLUX

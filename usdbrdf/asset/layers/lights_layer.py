@@ -1,11 +1,11 @@
 """Emitters once more, as UsdLux lights: lights.usda and its variant set ``lights``. A lighter wants
 lights: something to dim, to link, to sample well. The measured emission is in the materials, and a
 renderer that honoured both would count every lamp twice. So the default prim has a variant set:
-``emissive``, the default where anything shines, has no lights; ``usdlux`` has them, and scales the
-emission of the lamps they stand for to nothing. A shot that references the asset chooses by one
-opinion of its own, which neither a muted layer nor invisible lights in the root would allow: mutes
-are a session's, not a file's, and visibility would leave the glowing surfaces on. A layer may still
-be muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
+``emissive``, the default unless light comes from outside, has no lights; ``usdlux`` has them, and
+scales the emission of the lamps they stand for to nothing. A shot that references the asset chooses
+by one opinion of its own, which neither a muted layer nor invisible lights in the root would allow:
+mutes are a session's, not a file's, and visibility would leave the glowing surfaces on. A layer may
+still be muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
 
 The light from outside is a DomeLight with its picture, and a DistantLight where there is a sun: in
 ``usdlux`` alone, too.
@@ -59,7 +59,8 @@ def write_lights_layer(
     world_from_root: Double,
 ) -> None:
     """Write lights.usda to ``path``; without a lamp that has shapes, and without light from
-    outside, it holds nothing. Where nothing in the scan shines, the lights are on.
+    outside, it holds nothing. Where there is light from outside, the lights are on: without them
+    a room with a lamp would stand in the night.
 
     world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
     """
@@ -71,7 +72,7 @@ def write_lights_layer(
             for name in (EMISSIVE, USDLUX)
         )
         over(layer, str(emissive))
-        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = EMISSIVE if lamps else USDLUX
+        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = USDLUX if outside else EMISSIVE
         define(layer, inside(usdlux, scopes.path("lights")), "Scope")
         if outside:
             _author_outside(layer, inside(usdlux, scopes.path("lights")), outside, draft.header,
