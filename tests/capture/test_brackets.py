@@ -300,6 +300,18 @@ def test_photographs_of_a_folder_are_one_bracket(tmp_path):
     assert np.nanmedian(np.abs(ratio - 1)) < 0.02
 
 
+@pytest.mark.parametrize("profile", ["Adobe RGB (1998)", "ProPhoto RGB", "sRGB IEC61966-2.1"])
+def test_a_profile_that_is_not_known_is_told(tmp_path, monkeypatch, capsys, profile):
+    pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
+    folder = tmp_path / "stack"
+    _folder_of_photographs(folder, 4.0 ** -np.arange(6.0))
+    monkeypatch.setattr("usdbrdf.capture.bracketed.colour_tag", lambda path: (profile, ()))
+    assert main(["merge-brackets", str(folder), "-o", str(tmp_path / "merged")]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "brackets.encoding" in line]
+    assert len(told) == ("IEC61966" not in profile)
+    assert all(profile in line and "IMG_0.png" in line for line in told)
+
+
 @pytest.mark.parametrize(
     ("times", "said"),
     [
