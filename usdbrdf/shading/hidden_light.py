@@ -11,6 +11,8 @@ S is traced at some of the texels with all other light; twice, for hidden surfac
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import binary_dilation
 
@@ -72,45 +74,45 @@ def light_of_hidden(
     shown, tells = coverage.observed, coverage.measured
     if lamps is not None:
         shown, tells = shown | lamps, tells & ~lamps
+    every = np.flatnonzero(~shown)
     seen, hidden = _spread(texels, tells), _spread(texels, ~shown)
     if not len(hidden) or not len(seen):
         return lit
-    both, whole = np.concatenate([seen, hidden]), np.ones(len(hidden), np.bool_)
-    beside, light = beside_seen(texels, shown) & ~shown, lit
+    beside = beside_seen(texels, shown)[every]
+    filled, light, both = lit[every], lit.copy(), np.concatenate([seen, hidden])
     for number in range(_ROUNDS):
         shining = Shining.of(surface, light, environment)
+        sampling = Sampling(standard_error=0, max_rays=_RAYS)
         traced = irradiance_of_texels(
-            surface,
-            shining,
-            environment,
-            both,
-            (seed ^ _SEED) + number,
-            Sampling(standard_error=0, max_rays=_RAYS),
+            surface, shining, environment, both, (seed ^ _SEED) + number, sampling
         )
-        albedo, lamp = _albedo(texels, seen, lit[seen], traced[: len(seen)])
-        sent = albedo * _spread_out(texels, hidden, traced[len(seen) :], whole) / np.pi
+        receives, reaches = traced[: len(seen)], traced[len(seen) :]
+        albedo, lamp = _albedo(texels, seen, lit[seen], receives, every)
+        sent = albedo * _spread_out(texels, hidden, reaches, every) / np.pi
         # Beyond the foot of a wall it may lie in the sun, and is read together with what was seen
         # before it.
-        leaks = beside & (sent.mean(axis=1) > MOST_LEAK * lit.mean(axis=1))
-        light = np.where((shown | leaks | lamp)[:, None], lit, sent).astype(np.float32)
+        leaks = beside & (sent.mean(axis=1) > MOST_LEAK * filled.mean(axis=1))
+        light[every] = np.where((leaks | lamp)[:, None], filled, sent)
     return light
 
 
-def _albedo(texels: Texels, seen: Long, lit: Float, irradiance: Float) -> tuple[Float, Bool]:
-    """Albedo (T, 3) by that of the texels ``seen`` (N,), and the texels (T,) of objects most of
-    which shines."""
+def _albedo(
+    texels: Texels, seen: Long, lit: Float, irradiance: Float, every: Long
+) -> tuple[Float, Bool]:
+    """Albedo (M, 3) of the texels ``every`` (M,) by that of those that are ``seen`` (N,), and which
+    of them are of objects most of which shines."""
     owner, count = texels.object_index(), len(texels.resolution)
     ratio, known = albedo_where_lit(lit, irradiance, np.ones(len(seen), np.bool_))
     # Where lamps are not known yet, what they shine on seems to reflect more than it receives.
     usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
     ratio /= max(1.0, usual)
     reflects = known & (ratio.mean(axis=1) <= EMITTER_RATIO)
-    albedo = _spread_out(texels, seen, np.minimum(ratio, 1), reflects)
+    albedo = _spread_out(texels, seen[reflects], np.minimum(ratio, 1)[reflects], every)
     num_known, num_reflecting = (
         np.bincount(owner[seen], kind, count) for kind in (known, reflects)
     )
-    albedo[(num_reflecting == 0)[owner]] = NEUTRAL
-    return albedo, (2 * num_reflecting < num_known)[owner]
+    albedo[(num_reflecting == 0)[owner[every]]] = NEUTRAL
+    return albedo, (2 * num_reflecting < num_known)[owner[every]]
 
 
 def beside_seen(texels: Texels, shown: Bool) -> Bool:
@@ -136,10 +138,12 @@ def _spread(texels: Texels, which: Bool) -> Long:
     return np.concatenate(chosen) if chosen else np.zeros(0, np.int64)
 
 
-def _spread_out(texels: Texels, index: Long, values: Float, known: Bool) -> Float:
-    """(T, 3) of the values (N, 3) at texels ``index`` (N,), as far as they are ``known`` (N,)."""
-    told = np.zeros(len(texels), np.bool_)
-    told[index[known]] = True
-    whole = np.zeros((len(texels), 3), np.float32)
-    whole[index] = values
-    return inpaint(texels, whole, told)
+def _spread_out(texels: Texels, index: Long, values: Float, every: Long) -> Float:
+    """(M, 3) at texels ``every`` (M,) of the values (N, 3) at texels ``index`` (N,)."""
+    # Of the table the rows that matter: a large scene's has many more.
+    rows = np.union1d(index, every)
+    table = replace(texels.take(rows), first_texel=np.searchsorted(rows, texels.first_texel))
+    whole, told = np.zeros((len(rows), 3), np.float32), np.zeros(len(rows), np.bool_)
+    place = np.searchsorted(rows, index)
+    whole[place], told[place] = values, True
+    return inpaint(table, whole, told)[np.searchsorted(rows, every)]
