@@ -50,6 +50,21 @@ def test_poses_are_read(capture, room):
     assert (scan.adapter, len(scan.objects)) == ("llff", len(room.names))
 
 
+def test_radiance_beside_the_photographs_is_taken(capture, room):
+    for i, image in enumerate(room.images):
+        write_image(capture / "images" / f"IMG_{i:04d}.exr", image)
+    scan = read_scan(capture, IngestOptions())
+    assert {path.suffix for path in scan.frames.image_paths} == {".exr"}
+    assert len(scan.frames) == len(room.images)
+    assert any("radiance beside" in warning for warning in scan.warnings)
+
+
+def test_one_picture_too_many_is_still_refused(capture, room):
+    write_image(capture / "images" / "extra.jpg", room.images[0])
+    with pytest.raises(InputRefused, match=r"poses for .* pictures"):
+        read_scan(capture, OPTIONS)
+
+
 @pytest.mark.parametrize("name", ["IMG_0004.png", "IMG_0004.jpg.png", "IMG_0004_mask.png"])
 def test_masks_are_found_by_the_pictures_names(capture, name):
     hidden = np.ones((HEIGHT, WIDTH, 3))

@@ -20,6 +20,7 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     rigid_pose,
     scan_of,
+    warn_of_radiance,
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
@@ -50,14 +51,17 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         )
     pictures = pictures_of(folder, options)
     refuse_without_pictures(pictures, source)
-    if len(pictures.paths) != len(rows):
+    paths = pictures.paths
+    if len(paths) != len(rows):  # photographs and their radiance, or depths, beside each other?
+        paths = pictures.of_each_name()
+    if len(paths) != len(rows):
         raise InputRefused(
             f"{source}: {len(rows)} poses for {len(pictures.paths)} pictures in "
             f"{pictures.folder.name}. They belong together by their order: bring the pictures that "
             "the poses were made of, all of them and no others. [capture.frames]"
         )
     records = []
-    for row, image in zip(rows.astype(np.float64), pictures.paths, strict=True):
+    for row, image in zip(rows.astype(np.float64), paths, strict=True):
         down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
         sound = np.isfinite(row[:15]).all() and min(width, height) >= 1
         if not sound or (width, height) != (round(width), round(height)):
@@ -73,6 +77,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 mask_path=pictures.mask_of(image, folder, options),
             )
         )
+    warn_of_radiance(pictures.instead, findings, source)
     mesh = partial(
         mesh_beside,
         folder,

@@ -109,6 +109,24 @@ class Pictures:
                 return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
         return None
 
+    def of_each_name(self) -> tuple[Path, ...]:
+        """One picture of each name: of a photograph with radiance beside it that. All of them where
+        two of one name are of one kind."""
+        alike: dict[Path, list[Path]] = {}
+        for path in self.paths:
+            alike.setdefault(path.with_suffix(""), []).append(path)
+        chosen = [(nearest_to_radiance(some), some) for some in alike.values()]
+        if any(best is None for best, _ in chosen):
+            return self.paths
+        found = tuple(best for best, _ in chosen if best)
+        self.instead.update(
+            (path, best)
+            for best, some in chosen
+            for path in some
+            if best and path != best and path.suffix.lower() in _PHOTOGRAPHS and _is_radiance(best)
+        )
+        return found
+
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
         pictures' folder, else by its name alone, where no other folder has a picture of it."""
