@@ -7,7 +7,14 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from tests.synthetic_asset import SUN_DIRECTION, SUN_IRRADIANCE, sky_of
-from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS, USDLUX, Lamp, write_lights_layer
+from usdbrdf.asset.layers.lights_layer import (
+    DAYLIGHT,
+    EMISSIVE,
+    LIGHTS,
+    USDLUX,
+    Lamp,
+    write_lights_layer,
+)
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.render_scene import render_scene_from_stage, sky_of_picture
@@ -184,7 +191,16 @@ def test_the_light_from_outside_is_on(built, with_lamp):
         built.asset.lights_layer, built.draft("shading"), lamps, built.outside, np.eye(4)
     )
     layer = Sdf.Layer.FindOrOpen(str(built.asset.lights_layer))
-    assert layer.GetPrimAtPath("/room").variantSelections[LIGHTS] == USDLUX
+    shown = DAYLIGHT if with_lamp else USDLUX
+    assert layer.GetPrimAtPath("/room").variantSelections[LIGHTS] == shown
+    assert _kinds(opened(built, shown)) == {"DomeLight", "DistantLight"}
+    # The lamp glows beside it, and is a light in the third variant.
+    assert ("SphereLight" in _kinds(opened(built, USDLUX))) == with_lamp
+    assert not _kinds(opened(built, EMISSIVE))
+
+
+def _kinds(stage: Usd.Stage) -> set[str]:
+    return {prim.GetTypeName() for prim in stage.TraverseAll() if prim.HasAPI(UsdLux.LightAPI)}
 
 
 def test_a_ball_is_hidden_inside_its_light(built):

@@ -485,7 +485,8 @@ def test_glass_of_a_glb_is_clear(
 
 
 @pytest.mark.parametrize(
-    "strength", [-1, "bright", None, [1], 1e39, float("nan"), pytest.param(10**400, id="huge")]
+    "strength",
+    [-1, "bright", "2", True, None, [1], 1e39, float("nan"), pytest.param(10**400, id="huge")],
 )
 def test_a_false_strength_of_emission_is_not_said_of_the_mesh(
     tmp_path: Path, strength: Any

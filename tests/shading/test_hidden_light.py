@@ -8,10 +8,11 @@ import pytest
 
 from tests.physics.surfaces import Part, World, quad, room, world_of
 from tests.scenes import frames_at, look_at
+from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import clipped_groups, reflects_daylight
-from usdbrdf.shading.hidden_light import light_of_hidden
+from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light, reflects_daylight
+from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -95,10 +96,16 @@ def by_lamp():
     return world, true, filled, hidden
 
 
-def _estimated(world: World, lit: np.ndarray, hidden: np.ndarray, **more) -> np.ndarray:
-    surface = TexturedScene(world.scene, world.texels, world.rays)
-    coverage = CoverageMap.of(~hidden, np.zeros(len(hidden), np.bool_))
-    return light_of_hidden(surface, lit, coverage, black_environment(), 3, **more)
+def _estimated(
+    world: World, lit: np.ndarray, hidden: np.ndarray, lamps=None, said=()
+) -> np.ndarray:
+    surface, none = (
+        TexturedScene(world.scene, world.texels, world.rays),
+        np.zeros(len(hidden), bool),
+    )
+    known = KnownLamps(none if lamps is None else lamps, dict(said))
+    coverage = CoverageMap.of(~hidden, none)
+    return light_of_hidden(surface, lit, coverage, black_environment(), 3, known)
 
 
 def test_an_underside_reflects_what_it_receives(by_lamp):
@@ -131,6 +138,36 @@ def test_a_lamp_of_unknown_strength_makes_no_underside_bright(by_lamp):
     assert 0.5 < found[under].mean() / true[under].mean() < 2
 
 
+def test_what_a_person_says_of_lamps_holds(by_lamp):
+    world, _, filled, hidden = by_lamp
+    owner = world.texels.object_index()
+    under, back = (hidden & (owner == i) for i in (TABLE, LAMP))
+    found = _estimated(world, filled, hidden, said={TABLE: True, LAMP: False})
+    np.testing.assert_array_equal(found[under], filled[under])
+    assert found[back].max() < 0.5 * filled[back].min()
+
+
+def test_what_stands_in_a_sun_that_is_not_known_yet_is_no_lamp():
+    """Most of what is seen of the table is its top in the sun, and some of it in the shade."""
+    world = _world(1.6)
+    owner, hidden = world.texels.object_index(), _hidden(world)
+    hidden |= owner == LAMP
+    sky = Environment(np.full((8, 16, 3), 0.3, np.float32), True)
+    true = _shone(world, np.zeros((len(hidden), 3), np.float32), sky.under(SUN))
+    filled, top = true.copy(), (owner == TABLE) & ~hidden
+    filled[(owner == TABLE) & hidden] = np.median(true[top], axis=0)
+    surface, none = (
+        TexturedScene(world.scene, world.texels, world.rays),
+        np.zeros(len(hidden), bool),
+    )
+    found = light_of_hidden(
+        surface, filled, CoverageMap.of(~hidden, none), sky, 3, KnownLamps.unknown(len(hidden))
+    )
+    under = (owner == TABLE) & hidden
+    assert filled[under].mean() > 2.5 * true[under].mean()
+    assert found[under].mean() < 1.5 * true[under].mean()
+
+
 def test_nothing_hidden_or_nothing_seen_changes_nothing(by_lamp):
     world, _, filled, hidden = by_lamp
     for none in (np.zeros_like(hidden), np.ones_like(hidden)):
@@ -153,10 +190,33 @@ def test_a_patch_in_the_sun_that_clips_is_no_lamp():
     surface = TexturedScene(world.scene, texels, world.rays)
     groups = clipped_groups(texels, lit, coverage)
     assert set(groups.object[groups.lamp]) == {TABLE, LAMP}
-    found = reflects_daylight(surface, lit, coverage, frames, groups, sky, 0)
+    given = surface, lit, coverage, frames, groups
+    found = reflects_daylight(*given, groups.lamp, sky, 0)
     assert {int(i) for i in groups.object[found]} == {TABLE}
     walls = groups.with_walls(found)
     assert set(walls.object[walls.lamp]) == {LAMP}
     np.testing.assert_array_equal(walls.wall, clips & (owner == TABLE))
     # Without the sun nothing explains it.
-    assert not reflects_daylight(surface, lit, coverage, frames, groups, sky.under(NO_SUN), 0).any()
+    assert not reflects_daylight(*given, groups.lamp, sky.under(NO_SUN), 0).any()
+    # Nor is what is no doubt a lamp asked.
+    assert not reflects_daylight(*given, np.zeros(len(groups), np.bool_), sky, 0).any()
+
+
+def test_a_lamp_that_faces_the_sky_stays_one(tmp_path):
+    """It is as bright as frames can show, where a white thing would be half of that; what it casts
+    tells that it is ten times as bright."""
+    world = _world(2.0)
+    owner = world.texels.object_index()
+    sky, shines = Environment(np.full((8, 16, 3), 1.0, np.float32), True), 20.0
+    emitted = np.where((owner == LAMP)[:, None], np.float32(shines), np.float32(0))
+    true = _shone(world, emitted, sky)
+    clips, bound = owner == LAMP, np.float32(1.5)
+    lit = np.where(clips[:, None], bound, true).astype(np.float32)
+    lit *= np.exp(0.03 * np.random.default_rng(2).standard_normal((len(lit), 1))) ** ~clips[:, None]
+    frames = frames_at([look_at(np.array([0.5, 0.5, 1.9]), np.array([2, 1.5, 0.8]))])
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    coverage, run = CoverageMap.of(~clips, clips), TaskRun(tmp_path, "shade", tmp_path / "work")
+    found = estimate_clipped_light(run, surface, lit.astype(np.float32), coverage, frames, sky, 0)
+    assert found.groups.lamp.all()
+    assert found.estimate.determined.all()
+    np.testing.assert_allclose(found.lit[clips].mean(), shines, rtol=0.2)

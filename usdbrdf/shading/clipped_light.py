@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import Shining, asked_texels, first_of_segments, irradiance_of_texels
@@ -63,7 +63,7 @@ class ClippedGroups:
     group  (T,) int32, -1 for a texel of none
     object (K,) int32, whose texels they are
     bound  (K,) float32, the largest radiance at which one of its texels clipped
-    lamp   (K,) bool: no measured texel around is nearly as bright
+    lamp   (K,) bool: no measured texel around is nearly as bright, nor does daylight explain it
     wall   (T,) bool: the texels of those that are no lamps, of fainter ones than the K too
     """
 
@@ -84,6 +84,10 @@ class ClippedGroups:
         """The same where those of the groups (K,) are no lamps."""
         wall = self.wall | self.texels_of(which)
         return replace(self, lamp=self.lamp & ~which, wall=wall)
+
+    def priors(self) -> Double:
+        """(K, 2): of the logarithms of what multiplies their bounds, before the evidence."""
+        return np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in self.lamp])
 
     def as_lamps(self, which: Long) -> Lamps:
         """The groups with the numbers ``which`` (N,), as what is known of lamps that clip."""
@@ -203,33 +207,33 @@ def estimate_clipped_light(
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known."""
     groups = clipped_groups(surface.texels, lit, coverage, said)
-    if groups.lamp.any() and (environment.sun.shines or environment.image.any()):
-
-        def reflecting() -> dict[str, Array]:
-            of_object = np.array([said.get(int(i), False) for i in groups.object])
-            told = reflects_daylight(surface, lit, coverage, frames, groups, environment, seed)
-            return {"wall": told & ~of_object}
-
-        groups = groups.with_walls(run.checkpoint("sunlit", reflecting)["wall"])
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
+        none, wall = nothing_known(len(groups)), np.zeros(len(groups), np.bool_)
         chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
         if not len(chosen):
-            return dict(vars(nothing_known(len(groups))))
+            return {**vars(none), "wall": wall}
         evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
         first = estimate_clipped_emitters(evidence)
-        return dict(
-            vars(
-                _told_by_even_light(
-                    surface, lit, coverage, frames, environment, groups, first, seed
-                )
+        if environment.sun.shines or environment.image.any():
+            by_hand = [said.get(int(i), False) for i in groups.object]
+            doubtful = groups.lamp & ~first.exceeds_bounds() & ~np.array(by_hand)
+            given = surface, lit, coverage, frames, groups, doubtful, environment, seed
+            wall = reflects_daylight(*given)
+        left = groups.with_walls(wall)
+        if wall.any():
+            first = estimate_clipped_emitters(
+                replace(evidence, prior=left.priors(), shines=left.lamp)
             )
-        )
+        told = _told_by_even_light(surface, lit, coverage, frames, environment, left, first, seed)
+        return {**vars(told), "wall": wall}
 
-    estimate = EstimatedRadiance(**run.checkpoint("clipped", compute))
+    found = dict(run.checkpoint("clipped", compute))
+    groups = groups.with_walls(found.pop("wall"))
+    estimate = EstimatedRadiance(**found)
     return ClippedLight(
         lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
     )
@@ -241,13 +245,16 @@ def reflects_daylight(
     coverage: CoverageMap,
     frames: Frames,
     groups: ClippedGroups,
+    doubtful: Bool,
     environment: Environment,
     seed: int,
 ) -> Bool:
-    """(K,): of the groups that look like lamps those that clip because daylight falls on them: by
-    the albedo of what was measured of the object, and what a usual dielectric mirrors, some of
-    their texels would be as bright as they are bounded. The lamps' own light is left out."""
-    texels, lamps = surface.texels, np.flatnonzero(groups.lamp)
+    """(K,): of the groups that are ``doubtful`` lamps those that clip because of the light that
+    falls on them: by the albedo of what was measured of the object, and what a usual dielectric
+    mirrors, some of their texels would be about as bright as they are bounded; of an object of
+    which nothing was measured, if it were white, as bright as that. The light of all groups that
+    look like lamps is left out."""
+    texels, lamps = surface.texels, np.flatnonzero(groups.lamp & doubtful)
     owner = texels.object_index()
 
     def some(which: Bool) -> Long:
@@ -256,6 +263,8 @@ def reflects_daylight(
 
     own = [some(coverage.clipped & (groups.group == k)) for k in lamps]
     others = [some(coverage.measured & (owner == groups.object[k])) for k in lamps]
+    if not len(lamps):
+        return np.zeros(len(groups), np.bool_)
     texel = np.concatenate([*own, *others])
     rest = np.where(groups.texels_of(groups.lamp)[:, None], np.float32(0), lit)
     shining = Shining.of(surface, rest, environment)
@@ -266,13 +275,13 @@ def reflects_daylight(
     for k, one, other in zip(lamps, own, others, strict=True):
         near, far = np.s_[at : at + len(one)], np.s_[beside : beside + len(other)]
         at, beside = at + len(one), beside + len(other)
-        # Nothing measured of it: it may be as white as anything.
-        albedo = np.ones(3)
+        albedo, least = np.ones(3), 1.0
         if len(other):
+            least = _EXPLAINED
             albedo = np.median(lit[other] / np.maximum(reflected[far], 1e-30), axis=0)
         most = np.minimum(albedo, 1) * reflected[near] + mirrored[near]
         ratio = most.max(axis=1) / lit[one].max(axis=1)
-        explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > _EXPLAINED
+        explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > least
     return explained
 
 
@@ -386,6 +395,6 @@ def _evidence(
         position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
         segment=segment,
         object=texels.object_index()[chosen].astype(np.int32),
-        prior=np.array([LAMP_PRIOR if lamp else _WALL_PRIOR for lamp in groups.lamp]),
+        prior=groups.priors(),
         shines=groups.lamp,
     )

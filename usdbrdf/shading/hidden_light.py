@@ -6,12 +6,15 @@ albedo, and what receives S sends out
 
     L = albedo S / pi
 
-S is traced at some of the texels with all other light; twice, for hidden surfaces see each other.
+S is traced at some of the texels with all other light; in two rounds, for hidden surfaces see each
+other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -33,8 +36,26 @@ _TRACED, _LEAST_OF_OBJECT = 1 << 15, 48
 _RAYS = 64
 _ROUNDS = 2
 _SEED = 0x41D
+# Of an object that shines as a whole hardly a texel does not.
+_ALL_BUT_NOISE = 0.9
 # Texels around what was seen that are no more than so many times as bright as their fill.
 _RIM, MOST_LEAK = 3, 2.0
+
+
+class KnownLamps(NamedTuple):
+    """What shines for certain, ``texel`` (T,), keeps its radiance; so do objects more than a part
+    ``most`` of whose seen texels send out more than they can reflect, but for those of ``said``,
+    by number, whose lamps a person knows."""
+
+    texel: Bool
+    said: Mapping[int, bool]
+    most: float = 0.5
+
+    @classmethod
+    def unknown(cls, count: int) -> KnownLamps:
+        """Of ``count`` texels nothing is known, nor where the sun shines: what stands in it is told
+        from a lamp by its sides, which are in the shade."""
+        return cls(np.zeros(count, np.bool_), {}, _ALL_BUT_NOISE)
 
 
 def with_hidden_light(
@@ -45,12 +66,13 @@ def with_hidden_light(
     coverage: CoverageMap,
     environment: Environment,
     seed: int,
-    lamps: Bool | None = None,
+    lamps: KnownLamps,
+    start: Float | None = None,
 ) -> Float:
     """``light_of_hidden``, of which what it changes is kept under ``name``."""
 
     def compute() -> dict[str, Array]:
-        light = light_of_hidden(surface, lit, coverage, environment, seed, lamps)
+        light = light_of_hidden(surface, lit, coverage, environment, seed, lamps, start)
         changed = np.flatnonzero((light != lit).any(axis=1))
         return {"texel": changed, "light": light[changed]}
 
@@ -65,21 +87,21 @@ def light_of_hidden(
     coverage: CoverageMap,
     environment: Environment,
     seed: int,
-    lamps: Bool | None = None,
+    lamps: KnownLamps,
+    start: Float | None = None,
 ) -> Float:
     """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame shows what they reflect of it
-    and of the ``environment``. What shines keeps its radiance: ``lamps`` (T,), and objects of which
-    most that was seen is too bright to reflect."""
+    and of the ``environment``, but for ``lamps``. start (T, 3): what is known of that before."""
     texels = surface.texels
-    shown, tells = coverage.observed, coverage.measured
-    if lamps is not None:
-        shown, tells = shown | lamps, tells & ~lamps
+    shown, tells = coverage.observed | lamps.texel, coverage.measured & ~lamps.texel
     every = np.flatnonzero(~shown)
     seen, hidden = _spread(texels, tells), _spread(texels, ~shown)
     if not len(hidden) or not len(seen):
         return lit
     beside = beside_seen(texels, shown)[every]
     filled, light, both = lit[every], lit.copy(), np.concatenate([seen, hidden])
+    if start is not None:
+        light[every] = start[every]
     for number in range(_ROUNDS):
         shining = Shining.of(surface, light, environment)
         sampling = Sampling(standard_error=0, max_rays=_RAYS)
@@ -87,7 +109,7 @@ def light_of_hidden(
             surface, shining, environment, both, (seed ^ _SEED) + number, sampling
         )
         receives, reaches = traced[: len(seen)], traced[len(seen) :]
-        albedo, lamp = _albedo(texels, seen, lit[seen], receives, every)
+        albedo, lamp = _albedo(texels, seen, lit[seen], receives, every, lamps)
         sent = albedo * _spread_out(texels, hidden, reaches, every) / np.pi
         # Beyond the foot of a wall it may lie in the sun, and is read together with what was seen
         # before it.
@@ -97,22 +119,25 @@ def light_of_hidden(
 
 
 def _albedo(
-    texels: Texels, seen: Long, lit: Float, irradiance: Float, every: Long
+    texels: Texels, seen: Long, lit: Float, irradiance: Float, every: Long, lamps: KnownLamps
 ) -> tuple[Float, Bool]:
     """Albedo (M, 3) of the texels ``every`` (M,) by that of those that are ``seen`` (N,), and which
-    of them are of objects most of which shines."""
+    of them are of objects that shine."""
     owner, count = texels.object_index(), len(texels.resolution)
     ratio, known = albedo_where_lit(lit, irradiance, np.ones(len(seen), np.bool_))
     # Where lamps are not known yet, what they shine on seems to reflect more than it receives.
     usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
     ratio /= max(1.0, usual)
-    reflects = known & (ratio.mean(axis=1) <= EMITTER_RATIO)
+    shines = known & (ratio.mean(axis=1) > EMITTER_RATIO)
+    num_known, num_shining = (np.bincount(owner[seen], kind, count) for kind in (known, shines))
+    lamp = num_shining > lamps.most * num_known
+    for number, is_lamp in lamps.said.items():
+        lamp[number] = is_lamp
+    # What the sun shines on is as white as anything until it is known.
+    reflects = known & (~shines | (num_shining == num_known)[owner[seen]])
     albedo = _spread_out(texels, seen[reflects], np.minimum(ratio, 1)[reflects], every)
-    num_known, num_reflecting = (
-        np.bincount(owner[seen], kind, count) for kind in (known, reflects)
-    )
-    albedo[(num_reflecting == 0)[owner[every]]] = NEUTRAL
-    return albedo, (2 * num_reflecting < num_known)[owner[every]]
+    albedo[(num_known == 0)[owner[every]]] = NEUTRAL
+    return albedo, lamp[owner[every]]
 
 
 def beside_seen(texels: Texels, shown: Bool) -> Bool:

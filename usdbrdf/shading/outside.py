@@ -29,7 +29,7 @@ from usdbrdf.shading.asked import (
     irradiance_of_texels,
     looked_around,
 )
-from usdbrdf.shading.hidden_light import light_of_hidden
+from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -137,7 +137,8 @@ def estimated_outside(
     def compute() -> dict[str, Array]:
         seen = surroundings_from_frames(surface.rays, frames, z_up)
         # What hides in a room would shine like what stands in the sun beside it.
-        light = light_of_hidden(surface, lit, coverage, _of_measured(seen, z_up), seed)
+        lamps, known = KnownLamps.unknown(len(lit)), _of_measured(seen, z_up)
+        light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
         found = light_from_outside(surface, light, coverage, seen, z_up, seed)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 

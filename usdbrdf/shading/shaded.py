@@ -22,8 +22,8 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import EMITTER_RATIO, albedo_map
-from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
-from usdbrdf.shading.hidden_light import with_hidden_light
+from usdbrdf.shading.clipped_light import ClippedLight, clipped_groups, estimate_clipped_light
+from usdbrdf.shading.hidden_light import KnownLamps, with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import telling
@@ -338,20 +338,24 @@ def _light(
 ) -> tuple[ClippedLight, UnseenLamps]:
     """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
     environment = outside.environment if outside else black_environment()
-    lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed)
+    texels, filled = surface.texels, lit
+    owner = texels.object_index()
+    groups = clipped_groups(texels, lit, coverage, said)
+    told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
+    known = KnownLamps(told | groups.texels_of(groups.lamp), said)
+    lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
     unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, outside, seed, said)
-    lit = unseen.with_light(surface.texels, lit)
+    lit = unseen.with_light(texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
-    lamps = light.groups.texels_of(light.groups.lamp)
-    lamps |= np.isin(surface.texels.object_index(), unseen.object)
-    if not (light.lit[lamps] != lit[lamps]).any() and not len(unseen.object):
+    lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)
+    if (light.lit[lamps] == filled[lamps]).all() and not (known.texel & ~told & ~lamps).any():
         return light, unseen
-    # Hidden surfaces send on the light of these as well.
-    lit = with_hidden_light(
-        run, "hidden-lit", surface, light.lit, coverage, environment, seed, lamps
-    )
-    return replace(light, lit=lit), unseen
+    # Hidden surfaces send on the light of these as well, and none of what is no lamp after all.
+    known = KnownLamps(told | lamps, said)
+    lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
+    given = lamplit, coverage, environment, seed, known, light.lit
+    return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
 
 
 def shade_surface(

@@ -3,9 +3,9 @@
 Objects of which frames show nothing are sources of unknown strength. As for light from outside,
 what texels reflect tells it: pi L_d = albedo (S_seen + sum_k g_k B_k), by least squares on the
 logarithms with one albedo for each facing of an object. What comes out much brighter than anything
-that only reflects could be where it is shines by itself; the others keep what was filled in. Lamps
-that clip are unknown as well meanwhile. Light from outside that is inferred likewise is not told
-from lamps that no frame shows.
+that only reflects could be where it is shines by itself; the others reflect what they receive.
+Lamps that clip are unknown as well meanwhile. Light from outside that is inferred likewise is not
+told from lamps that no frame shows.
 """
 
 from __future__ import annotations

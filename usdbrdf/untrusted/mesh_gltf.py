@@ -53,7 +53,9 @@ def refuse_false(materials: Sequence[dict[str, Any]], path: Path) -> None:
             said = _extension(material, name).get(key, fallback)
             try:
                 numbers = np.asarray(said, np.float64)
-                sound = numbers.shape == np.shape(fallback)
+                # Texts of numbers, true and false are none; whole numbers may be of any length.
+                sound = np.asarray(said).dtype.kind in "iufO"
+                sound = sound and numbers.shape == np.shape(fallback)
                 sound = sound and bool(((numbers >= 0) & (numbers < _MOST)).all())
             except (TypeError, ValueError, OverflowError):
                 sound = False

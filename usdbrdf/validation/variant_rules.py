@@ -99,7 +99,7 @@ def lights_selection(scene: AssetStage) -> Iterator[Fault]:
     """The variant of the set lights that is selected on the default prim exists. USD takes any name
     and says nothing; there are then no UsdLux lights, and the lamps glow by their materials.
 
-    Select emissive or usdlux."""
+    Select emissive, usdlux, or daylight where the asset has it."""
     problem = "the selected lights are {!r}, which is none of the variants: the lamps glow as in "
     return _unknown_selection(scene, LIGHTS, f"{problem}{EMISSIVE}.")
 

@@ -8,7 +8,7 @@ mutes are a session's, not a file's, and visibility would leave the glowing surf
 still be muted: all of it is in lights.usda, a sublayer of shading.usda; without it the lamps glow.
 
 The light from outside is a DomeLight with its picture, and a DistantLight where there is a sun: in
-``usdlux`` alone, too.
+``usdlux``, and where there are lamps in ``daylight``, the default then, where these glow beside it.
 
 Rectangles and discs become RectLight and DiskLight, one per flat side, balls SphereLight (see
 ``usdbrdf.shading.lamp_shapes`` for the tolerances). All other emitters, and what glows on a part of
@@ -38,7 +38,7 @@ from usdbrdf.transport.warps import axes_across
 
 Types = Sdf.ValueTypeNames
 LIGHTS = "lights"
-EMISSIVE, USDLUX = "emissive", "usdlux"
+EMISSIVE, DAYLIGHT, USDLUX = "emissive", "daylight", "usdlux"
 _TYPES = {"rectangle": "RectLight", "disk": "DiskLight", "sphere": "SphereLight"}
 
 
@@ -59,8 +59,8 @@ def write_lights_layer(
     world_from_root: Double,
 ) -> None:
     """Write lights.usda to ``path``; without a lamp that has shapes, and without light from
-    outside, it holds nothing. Where there is light from outside, the lights are on: without them
-    a room with a lamp would stand in the night.
+    outside, it holds nothing. Light from outside is on, without which a room with a lamp would
+    stand in the night.
 
     world_from_root  (4, 4) of column vectors, of the default prim, in units of the stage
     """
@@ -72,11 +72,18 @@ def write_lights_layer(
             for name in (EMISSIVE, USDLUX)
         )
         over(layer, str(emissive))
-        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = USDLUX if outside else EMISSIVE
+        of_outside = [usdlux]
+        shown = USDLUX if outside else EMISSIVE
+        if outside and lamps:
+            shown = DAYLIGHT
+            of_outside.append(Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, DAYLIGHT))
+        layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = shown
         define(layer, inside(usdlux, scopes.path("lights")), "Scope")
         if outside:
-            _author_outside(layer, inside(usdlux, scopes.path("lights")), outside, draft.header,
-                            world_from_root)  # fmt: skip
+            for variant in of_outside:
+                place = inside(variant, scopes.path("lights"))
+                define(layer, place, "Scope")
+                _author_outside(layer, place, outside, draft.header, world_from_root)
         for lamp in shaped:
             lights = inside(usdlux, scopes.path("lights", lamp.identifier))
             define(layer, lights, "Scope")
