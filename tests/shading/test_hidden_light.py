@@ -190,16 +190,16 @@ def test_a_patch_in_the_sun_that_clips_is_no_lamp():
     surface = TexturedScene(world.scene, texels, world.rays)
     groups = clipped_groups(texels, lit, coverage)
     assert set(groups.object[groups.lamp]) == {TABLE, LAMP}
-    given = surface, lit, coverage, frames, groups
-    found = reflects_daylight(*given, groups.lamp, sky, 0)
+    given, once = (surface, lit, coverage, frames, groups), np.ones(len(groups))
+    found = reflects_daylight(*given, once, sky, 0)
     assert {int(i) for i in groups.object[found]} == {TABLE}
     walls = groups.with_walls(found)
     assert set(walls.object[walls.lamp]) == {LAMP}
     np.testing.assert_array_equal(walls.wall, clips & (owner == TABLE))
     # Without the sun nothing explains it.
-    assert not reflects_daylight(*given, groups.lamp, sky.under(NO_SUN), 0).any()
-    # Nor is what is no doubt a lamp asked.
-    assert not reflects_daylight(*given, np.zeros(len(groups), np.bool_), sky, 0).any()
+    assert not reflects_daylight(*given, once, sky.under(NO_SUN), 0).any()
+    # Nor does it what is much brighter, by the light that it casts.
+    assert not reflects_daylight(*given, 5 * once, sky, 0).any()
 
 
 def test_a_lamp_that_faces_the_sky_stays_one(tmp_path):

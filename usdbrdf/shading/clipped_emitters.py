@@ -242,10 +242,6 @@ class EstimatedRadiance:
     standard_error: Double
     determined: Bool
 
-    def exceeds_bounds(self) -> Bool:
-        """(K,): determined, and its brightest channel above the bound by two standard errors."""
-        return np.asarray(self.determined & (self.least() > 1).any(axis=1), np.bool_)
-
     def least(self) -> Double:
         """(K, 3): a multiplier that each lamp exceeds by all likelihood, two standard errors below
         the estimate; 1, its bound, where the evidence says no more."""

@@ -220,8 +220,9 @@ def estimate_clipped_light(
         first = estimate_clipped_emitters(evidence)
         if environment.sun.shines or environment.image.any():
             by_hand = [said.get(int(i), False) for i in groups.object]
-            doubtful = groups.lamp & ~first.exceeds_bounds() & ~np.array(by_hand)
-            given = surface, lit, coverage, frames, groups, doubtful, environment, seed
+            least = np.where(first.determined, first.least().max(axis=1), 1.0)
+            least = np.where(by_hand, np.inf, least)
+            given = surface, lit, coverage, frames, groups, least, environment, seed
             wall = reflects_daylight(*given)
         left = groups.with_walls(wall)
         if wall.any():
@@ -245,16 +246,16 @@ def reflects_daylight(
     coverage: CoverageMap,
     frames: Frames,
     groups: ClippedGroups,
-    doubtful: Bool,
+    least: Double,
     environment: Environment,
     seed: int,
 ) -> Bool:
-    """(K,): of the groups that are ``doubtful`` lamps those that clip because of the light that
-    falls on them: by the albedo of what was measured of the object, and what a usual dielectric
-    mirrors, some of their texels would be about as bright as they are bounded; of an object of
-    which nothing was measured, if it were white, as bright as that. The light of all groups that
-    look like lamps is left out."""
-    texels, lamps = surface.texels, np.flatnonzero(groups.lamp & doubtful)
+    """(K,): of the groups that look like lamps those that clip because of the light that falls on
+    them: by the albedo of what was measured of the object, and what a usual dielectric mirrors,
+    some of their texels would be about as bright as they are at least, ``least`` (K,) times their
+    bounds; of an object of which nothing was measured, if it were white, as bright as that. The
+    light of all these groups is left out."""
+    texels, lamps = surface.texels, np.flatnonzero(groups.lamp & np.isfinite(least))
     owner = texels.object_index()
 
     def some(which: Bool) -> Long:
@@ -275,13 +276,13 @@ def reflects_daylight(
     for k, one, other in zip(lamps, own, others, strict=True):
         near, far = np.s_[at : at + len(one)], np.s_[beside : beside + len(other)]
         at, beside = at + len(one), beside + len(other)
-        albedo, least = np.ones(3), 1.0
+        albedo, share = np.ones(3), 1.0
         if len(other):
-            least = _EXPLAINED
+            share = _EXPLAINED
             albedo = np.median(lit[other] / np.maximum(reflected[far], 1e-30), axis=0)
         most = np.minimum(albedo, 1) * reflected[near] + mirrored[near]
         ratio = most.max(axis=1) / lit[one].max(axis=1)
-        explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > least
+        explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > share * least[k]
     return explained
 
 

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from usdbrdf import calibration
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Float, Long
 from usdbrdf.model.texels import CoverageMap, Texels
@@ -36,8 +37,7 @@ _TRACED, _LEAST_OF_OBJECT = 1 << 15, 48
 _RAYS = 64
 _ROUNDS = 2
 _SEED = 0x41D
-# Of an object that shines as a whole hardly a texel does not.
-_ALL_BUT_NOISE = 0.9
+_AS_A_WHOLE = calibration.number("hidden.shines_as_a_whole")
 # Texels around what was seen that are no more than so many times as bright as their fill.
 _RIM, MOST_LEAK = 3, 2.0
 
@@ -55,7 +55,7 @@ class KnownLamps(NamedTuple):
     def unknown(cls, count: int) -> KnownLamps:
         """Of ``count`` texels nothing is known, nor where the sun shines: what stands in it is told
         from a lamp by its sides, which are in the shade."""
-        return cls(np.zeros(count, np.bool_), {}, _ALL_BUT_NOISE)
+        return cls(np.zeros(count, np.bool_), {}, _AS_A_WHOLE)
 
 
 def with_hidden_light(
