@@ -183,3 +183,21 @@ def test_of_next_to_nothing_seen_no_trend_is_told():
     coverage = CoverageMap.of(one[:, 0] > 0, one[:, 0] < 0)
     seen = Surroundings(radiance=one, coverage=coverage, dark=coverage.clipped)
     np.testing.assert_allclose(seen.trend(True), 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_ground_that_frames_show_tells_of_the_rest_of_it(dark):
+    """Down to 30 degrees below the horizon a tenth as bright as the sky; or nothing at all."""
+    directions = directions_of_pixels(HEIGHT, WIDTH, True).reshape(-1, 3)
+    up, ahead = directions[:, 2], directions[:, 0] > 0.3
+    ground = (up < 0) & (up > -0.5) & ahead
+    shown = ground | ((up > 0) & ahead)
+    radiance = np.where((up > 0)[:, None], 2.0, 0.0 if dark else 0.2) * np.ones(3)
+    seen = Surroundings(
+        radiance=np.where(shown[:, None], radiance, 0).astype(np.float32),
+        coverage=CoverageMap.of(shown, np.zeros_like(shown)),
+        dark=ground & dark,
+    )
+    found = seen.trend(True)
+    np.testing.assert_allclose(found[up < 0], 0.0 if dark else 0.2, rtol=1e-5)
+    np.testing.assert_allclose(found[up > 0], 2.0, rtol=0.05)

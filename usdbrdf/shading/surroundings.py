@@ -60,9 +60,10 @@ class Surroundings:
     def trend(self, z_up: bool) -> Double:
         """(D, 3): what the other directions are likely to show: of what was measured above the
         horizon, the plane through the logarithms of its radiance over the direction's three
-        coordinates, as skies darken away from the sun and from the horizon. Below the horizon it
-        goes on as at it. The steeper it is for what little was measured, the less it is believed;
-        where nothing was, and by night, it is the median of all."""
+        coordinates, as skies darken away from the sun and from the horizon. Below the horizon it is
+        the median of what was measured there, or goes on as at the horizon. The steeper it is for
+        what little was measured, the less it is believed; where nothing was, and by night, it is
+        the median of all."""
         directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
         up = 2 if z_up else 1
         usual = self.median()
@@ -87,7 +88,12 @@ class Surroundings:
             for c in range(3):
                 noise = max(float(scatter[c]), _SCATTER**2) / places
                 slope[:, c] = np.linalg.solve(spread + noise * np.diag(steep**-2), both[:, c])
-        return np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
+        found = np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
+        below = directions[:, up] < 0
+        ground = self.coverage.measured & below
+        if np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[ground].sum() >= _LEAST_SKY:
+            found[below] = np.median(self.radiance[ground].astype(np.float64), axis=0)
+        return found
 
     def is_night(self) -> bool:
         """Whether next to nothing shines of what was measured."""
