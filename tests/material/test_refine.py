@@ -32,7 +32,9 @@ from usdbrdf.material.refine import Lighting, Refined, refined_light
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
+from usdbrdf.options import Sampling
 from usdbrdf.shading import shaded
+from usdbrdf.shading.asked import Shining, irradiance_of_texels
 from usdbrdf.shading.hidden_light import beside_seen
 from usdbrdf.texturing.robust_mean import RobustMean
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
@@ -336,6 +338,26 @@ def test_the_light_of_unseen_places_is_what_they_reflect(room: Room, tmp_path: P
     assert np.median(np.abs(share / change - 1)) < 0.05
     lit_there = atlas.map("lit")[unseen]
     assert np.median(np.abs(given[0][unseen] / lit_there - 1)) > 0.1
+
+
+def test_irradiance_is_of_the_light_that_the_maps_hold(room: Room):
+    """With what hidden surfaces were taken to reflect, and not with what was filled in."""
+    atlas = AssetMaps(open_measured(room.glossy))
+    hidden = ~(atlas.coverage.observed | atlas.emissive)
+    assert (atlas.map_where_present("hidden", 3)[~hidden] == 0).all()
+    assert np.median(np.abs(atlas.light / atlas.lit - 1)[hidden]) > 0.1
+    seen = ~(hidden | atlas.emissive)
+    np.testing.assert_array_equal(atlas.light[seen], atlas.lit[seen])
+    some = np.flatnonzero(atlas.coverage.measured)[::9]
+    closely = Sampling(standard_error=0.005, max_rays=2048)
+
+    def off(light: np.ndarray) -> float:
+        shining, dark = Shining.of(atlas.surface, light), black_environment()
+        again = irradiance_of_texels(atlas.surface, shining, dark, some, 5, closely)
+        return float(np.abs(again.mean(axis=1) / atlas.irradiance[some].mean(axis=1) - 1).mean())
+
+    filled = np.where(atlas.emissive[:, None], atlas.emission, atlas.lit)
+    assert off(atlas.light) < 0.7 * off(filled)
 
 
 def test_what_is_too_dark_for_a_sample_stays_dark(room: Room):
