@@ -122,7 +122,7 @@ def diffuse_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str,
 def irradiance_error(atlas: AssetMaps, scored: np.ndarray, share: int) -> dict[str, float]:
     """S against a converged S from the same L_d."""
     scene, texels = atlas.scene, atlas.texels
-    lit = atlas.map("lit")
+    lit = atlas.light
     order, tile = some_tiles(atlas, share)
     reference = irradiance_at(
         RayScene(scene.points, scene.triangles),

@@ -69,7 +69,7 @@ def optimised(
     diffuse  name of the map (T, 3) that stands for the diffuse radiance, "lit" or "diffuse"
     """
     targets = targets_of(mi, asset, lit, labels)
-    scene = scene_of(mi, lit, lit.atlas.map("lit"))
+    scene = scene_of(mi, lit, lit.atlas.light)
     cameras = Cameras(mi, targets, settings.frames_per_step)
     if diffuse != "lit":
         other = scene_of(mi, lit, lit.atlas.map(diffuse))
