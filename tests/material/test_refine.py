@@ -273,8 +273,7 @@ def test_with_the_right_light_the_irradiance_comes_out(room: Room, tmp_path: Pat
 
 def _beside(texels, before) -> np.ndarray:
     """(T,): what no frame shows of what is read together with what one shows."""
-    shown = before.coverage.observed | before.emissive
-    return beside_seen(texels, shown) & ~shown
+    return beside_seen(texels, before.coverage.observed | before.emissive)
 
 
 def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):

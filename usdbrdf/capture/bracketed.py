@@ -204,8 +204,9 @@ def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:
 def _linear_space(source: Path, document: Any, photograph: Path) -> str:
     """The space of what is merged, linear in the primaries of the photographs."""
     stated, tag = document.get("encoding"), colour_tag(photograph)
-    said = stated or encoding_of_tag(*tag) or PHOTOGRAPH_ENCODING
-    if not stated and tag[0] and encoding_of_tag(*tag) is None:
+    known = encoding_of_tag(*tag)
+    said = stated or known or PHOTOGRAPH_ENCODING
+    if not stated and tag[0] and known is None:
         warn(
             f"{photograph}: it says that its colour space is {tag[0]!r}, which is not known; the "
             f"photographs are merged as {said}. Convert them to sRGB or Display P3, or state the "

@@ -25,7 +25,7 @@ from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.base_color import Reflection, base_color_of
-from usdbrdf.shading.hidden_light import MOST_LEAK, beside_seen
+from usdbrdf.shading.hidden_light import beside_seen, without_leaks
 from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.texturing.observe import frames_in_view, samples_from_frames, spread_order
@@ -151,8 +151,9 @@ def refined_light(
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
         found.append((diffuse, error))
-    looked_at = [one.before.coverage.observed | one.before.emissive for one in lightings]
-    besides = [beside_seen(texels, one) & ~one for one in looked_at]
+    besides = [
+        beside_seen(texels, one.before.coverage.observed | one.before.emissive) for one in lightings
+    ]
 
     def reflected(irradiance: Sequence[Float]) -> tuple[Float, list[Float]]:
         """Base colour, and of each lighting L_d with what it reflects where nobody looked or all
@@ -174,9 +175,7 @@ def refined_light(
         light = []
         for one, beside in zip(shown, besides, strict=True):
             hidden = base_color * one.irradiance / np.pi
-            # As in ``light_of_hidden``.
-            leaks = beside & (hidden.mean(axis=1) > MOST_LEAK * one.radiance.mean(axis=1))
-            hidden = np.where(leaks[:, None], one.radiance, hidden)
+            hidden = without_leaks(hidden, one.radiance, beside)
             told = one.measured | one.emissive
             light.append(np.where(told[:, None], one.radiance, hidden))
         return base_color, light

@@ -39,7 +39,7 @@ _ROUNDS = 2
 _SEED = 0x41D
 _AS_A_WHOLE = calibration.number("hidden.shines_as_a_whole")
 # Texels around what was seen that are no more than so many times as bright as their fill.
-_RIM, MOST_LEAK = 3, 2.0
+_RIM, _LEAK = 3, 2.0
 
 
 class KnownLamps(NamedTuple):
@@ -111,10 +111,7 @@ def light_of_hidden(
         receives, reaches = traced[: len(seen)], traced[len(seen) :]
         albedo, lamp = _albedo(texels, seen, lit[seen], receives, every, lamps)
         sent = albedo * _spread_out(texels, hidden, reaches, every) / np.pi
-        # Beyond the foot of a wall it may lie in the sun, and is read together with what was seen
-        # before it.
-        leaks = beside & (sent.mean(axis=1) > MOST_LEAK * filled.mean(axis=1))
-        light[every] = np.where((leaks | lamp)[:, None], filled, sent)
+        light[every] = np.where(lamp[:, None], filled, without_leaks(sent, filled, beside))
     return light
 
 
@@ -141,13 +138,21 @@ def _albedo(
 
 
 def beside_seen(texels: Texels, shown: Bool) -> Bool:
-    """Texels (T,) within reach of the ``shown`` ones, with which they are read, or which lie before
-    them: the last ones before a wall few frames show."""
+    """Texels (T,) that are not ``shown`` and are read together with shown ones, or lie before
+    those: the last ones before a wall few frames show."""
     found = np.zeros(len(texels), np.bool_)
     for i in range(len(texels.resolution)):
         near = binary_dilation(texels.image(i, shown), np.ones((3, 3)), iterations=_RIM)
         found[texels.of_object(i)] = texels.from_image(i, near)
-    return found
+    return found & ~shown
+
+
+def without_leaks(sent: Float, filled: Float, beside: Bool) -> Float:
+    """What texels (N,) send, (N, 3), but what was filled in, (N, 3), where they lie ``beside`` seen
+    ones and would be much brighter than that: beyond the foot of a wall they may lie in the sun,
+    and are read together with what was seen before it."""
+    leaks = beside & (sent.mean(axis=1) > _LEAK * filled.mean(axis=1))
+    return np.where(leaks[:, None], filled, sent)
 
 
 def _spread(texels: Texels, which: Bool) -> Long:

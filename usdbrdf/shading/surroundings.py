@@ -71,7 +71,8 @@ class Surroundings:
         flat[:, up] = np.maximum(flat[:, up], 0)
         sky = self.coverage.measured & ~self.dark & (directions[:, up] > 0)
         sky &= (self.radiance > 0).all(axis=1)
-        solid = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[sky]
+        solid_of_each = np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)
+        solid = solid_of_each[sky]
         if self.is_night() or solid.sum() < _LEAST_SKY:
             return np.tile(usual, (len(sky), 1))
         log = np.log(self.radiance[sky].astype(np.float64))
@@ -91,7 +92,7 @@ class Surroundings:
         found = np.asarray(np.exp(level + (flat - centre) @ slope), np.float64)
         below = directions[:, up] < 0
         ground = self.coverage.measured & below
-        if np.repeat(solid_angles(HEIGHT, WIDTH), WIDTH)[ground].sum() >= _LEAST_SKY:
+        if solid_of_each[ground].sum() >= _LEAST_SKY:
             found[below] = np.median(self.radiance[ground].astype(np.float64), axis=0)
         return found
 

@@ -67,20 +67,16 @@ def write_lights_layer(
     scopes, layer = draft.scopes, draft.new_layer()
     shaped = [lamp for lamp in lamps if lamp.shapes]
     if shaped or outside:
-        emissive, usdlux = (
+        emissive, daylight, usdlux = (
             Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, name)
-            for name in (EMISSIVE, USDLUX)
+            for name in (EMISSIVE, DAYLIGHT, USDLUX)
         )
         over(layer, str(emissive))
-        of_outside = [usdlux]
-        shown = USDLUX if outside else EMISSIVE
-        if outside and lamps:
-            shown = DAYLIGHT
-            of_outside.append(Sdf.Path(scopes.root).AppendVariantSelection(LIGHTS, DAYLIGHT))
+        shown = EMISSIVE if not outside else DAYLIGHT if lamps else USDLUX
         layer.GetPrimAtPath(scopes.root).variantSelections[LIGHTS] = shown
         define(layer, inside(usdlux, scopes.path("lights")), "Scope")
         if outside:
-            for variant in of_outside:
+            for variant in (usdlux, daylight) if lamps else (usdlux,):
                 place = inside(variant, scopes.path("lights"))
                 define(layer, place, "Scope")
                 _author_outside(layer, place, outside, draft.header, world_from_root)

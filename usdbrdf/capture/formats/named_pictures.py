@@ -115,17 +115,16 @@ class Pictures:
         alike: dict[Path, list[Path]] = {}
         for path in self.paths:
             alike.setdefault(path.with_suffix(""), []).append(path)
-        chosen = [(nearest_to_radiance(some), some) for some in alike.values()]
-        if any(best is None for best, _ in chosen):
-            return self.paths
-        found = tuple(best for best, _ in chosen if best)
-        self.instead.update(
-            (path, best)
-            for best, some in chosen
-            for path in some
-            if best and path != best and path.suffix.lower() in _PHOTOGRAPHS and _is_radiance(best)
-        )
-        return found
+        chosen: list[Path] = []
+        instead: dict[Path, Path] = {}
+        for some in alike.values():
+            if (best := nearest_to_radiance(some)) is None:
+                return self.paths
+            chosen.append(best)
+            if _is_radiance(best):
+                instead.update((p, best) for p in some if p.suffix.lower() in _PHOTOGRAPHS)
+        self.instead.update(instead)
+        return tuple(chosen)
 
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
