@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from tests.physics.surfaces import quad, sphere, world_of
 from usdbrdf.errors import CrashedChild, InputRefused, LateChild
@@ -20,8 +21,10 @@ from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.geometry.unwrap import (
     PADDING,
     TexelSizes,
+    atlas_side,
     beside_neighbours,
     pack_triangles_singly,
+    parts_of,
     unwrap,
 )
 from usdbrdf.model.scene import Scene, SceneObject
@@ -162,16 +165,7 @@ def test_each_chart_has_the_density_that_its_pixels_ask_for():
     points = np.float32([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = np.int32([[a, b, c] for a, b, c, d in sides for a, b, c in ((a, b, c), (a, c, d))])
-    box = SceneObject(
-        prim_path="/box", identifier="box", label="", class_name="", first_face=0, num_faces=12
-    )
-    scene = Scene(
-        objects=(box,),
-        points=points,
-        triangles=triangles,
-        corner_normals=np.zeros((12, 3, 3), np.float32),
-        face_object=np.zeros(12, np.int32),
-    )
+    scene = _of_one_object(points, triangles)
     side, pixels = np.full(12, 0.04, np.float32), np.zeros(12, np.float32)
     side[10:], pixels[10:] = 0.01, 100
     side[4:6], pixels[4:6] = 0.02, 100
@@ -182,6 +176,48 @@ def test_each_chart_has_the_density_that_its_pixels_ask_for():
     np.testing.assert_allclose(np.sqrt(0.5 / texels), side, rtol=0.06)
     assert uv.min() >= 0
     assert uv.max() <= 1
+
+
+def test_charts_of_many_triangles_are_made_by_parts():
+    """As a whole, xatlas crashes on a smooth closed surface of so many, and its time grows with the
+    square of their number where they have noise."""
+    sphere_of_many = trimesh.creation.icosphere(subdivisions=6)
+    triangles = np.asarray(sphere_of_many.faces, np.int32)
+    scene = _of_one_object(np.asarray(sphere_of_many.vertices, np.float32), triangles)
+    halves = np.where(np.arange(len(triangles)) % 2 == 0, 0.008, 0.016).astype(np.float32)
+    for sizes in (TexelSizes.even(scene, 0.01), TexelSizes(halves, np.ones_like(halves))):
+        uv, resolution = unwrap(scene, sizes)
+        # Texels that nothing needs are those beside charts: each triangle alone would take 150.
+        assert resolution.prod() < 3 * 4 * np.pi / 0.01**2
+        assert atlas_side(uv, scene.points[triangles], 0.0113) is not None
+
+
+def test_parts_hold_every_triangle_once(monkeypatch):
+    monkeypatch.setattr(module, "_WHOLE", 100)
+    monkeypatch.setattr(module, "_FACES_OF_PART", 30)
+    centres = np.random.default_rng(12345).random((1000, 3)).astype(np.float32)
+    parts = parts_of(centres)
+    assert sorted(np.concatenate(parts)) == list(range(1000))
+    assert max(map(len, parts)) <= 30
+    assert min(map(len, parts)) >= 14
+    # Near each other: within a box of about the share of the volume that their number is.
+    extents = np.array([np.ptp(centres[part], axis=0) for part in parts])
+    assert extents.prod(axis=1).mean() < 2 * 30 / 1000
+    assert len(parts_of(centres[:100])) == 1
+
+
+def _of_one_object(points: np.ndarray, triangles: np.ndarray) -> Scene:
+    count = len(triangles)
+    whole = SceneObject(
+        prim_path="/one", identifier="one", label="", class_name="", first_face=0, num_faces=count
+    )
+    return Scene(
+        objects=(whole,),
+        points=points,
+        triangles=triangles,
+        corner_normals=np.zeros((count, 3, 3), np.float32),
+        face_object=np.zeros(count, np.int32),
+    )
 
 
 def _two_squares() -> Scene:

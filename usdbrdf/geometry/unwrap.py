@@ -19,7 +19,7 @@ from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused
 from usdbrdf.job.child import child
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
-from usdbrdf.model.arrays import Array, Double, Float, Int
+from usdbrdf.model.arrays import Array, Double, Float, Int, Long
 from usdbrdf.model.mesh import compact, doubled_areas
 from usdbrdf.model.scene import Scene, SceneObject
 
@@ -28,11 +28,13 @@ from usdbrdf.model.scene import Scene, SceneObject
 _GAP, PADDING = 2, 4
 MAX_SIDE = 16384
 # What charts may take of computing: at least, and for each triangle. It lies far beyond what ends,
-# or the atlas would tell of the machine's speed: 40,000 triangles of a surface with noise take 22 s
-# on a slow one, twice as many four times as long. And how many times that of wall time, where
-# others are at work.
-_SECONDS, _SECONDS_OF_FACE, _BUSY = 600.0, 1e-2, 10
-# Children at work: xatlas takes one core, and each holds all the geometry.
+# or the atlas would tell of the machine's speed: 80,000 triangles of a surface with noise take 10 s
+# on a slow one. And how many times that of wall time, where others are at work.
+_SECONDS, _SECONDS_OF_FACE, _BUSY = 600.0, 5e-3, 10
+# An object with more triangles gets its charts by parts of at most so many: on surfaces with noise
+# xatlas' time grows with the square of their number, and on smooth closed ones it crashes.
+_WHOLE, _FACES_OF_PART = 20_000, 2000
+# Children at work: each holds all the geometry. Of an object in one part xatlas takes one core.
 _AT_ONCE = min(4, os.cpu_count() or 1)
 # Triangles for which another one starts: it takes most of a second to import what it needs.
 _FACES_OF_CHILD = 2000
@@ -278,23 +280,58 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
     unit = ((points - low) / max(extent, 1e-12)).astype(np.float32)
     finest = float(sizes.side.min())
     atlas = xatlas.Atlas()
-    atlas.add_mesh(unit, triangles.astype(np.uint32))
+    parts = parts_of(points[triangles].mean(axis=1))
+    for part in parts:
+        _, own, corners = compact(unit, triangles[part])
+        atlas.add_mesh(own, corners.astype(np.uint32))
     options = xatlas.PackOptions()
     options.padding = PADDING
     options.texels_per_unit = extent / finest
     options.bilinear = True
     options.rotate_charts = True
     atlas.generate(xatlas.ChartOptions(), options)
-    _, corners, uv = atlas[0]
-    if corners.shape == triangles.shape and (sizes.side != finest).any():
-        atlas, corners, uv = _at_own_densities(atlas, points, triangles, sizes, options)
+    laid_out = _laid_out(atlas, parts)
+    if laid_out and (sizes.side != finest).any():
+        atlas = _at_own_densities(atlas, parts, *laid_out, points, triangles, sizes, options)
+        laid_out = _laid_out(atlas, [np.arange(len(triangles))])
     width, height = int(atlas.width), int(atlas.height)
-    if corners.shape == triangles.shape and min(width, height) > 0:
-        corner_uv = beside_neighbours(uv[corners], points, triangles, sizes.side)
+    if laid_out and min(width, height) > 0:
+        uv, places = laid_out
+        corner_uv = beside_neighbours(uv[places], points, triangles, sizes.side)
         if corner_uv is not None:
             corner_uv[..., 1] = 1 - corner_uv[..., 1]
             return corner_uv, (width, height)
     return pack_triangles_singly(points[triangles], finest)
+
+
+def parts_of(centres: Float) -> list[Long]:
+    """Triangles at ``centres`` (F, 3) in parts that are near each other and about equally many:
+    all in one, or of many triangles at most _FACES_OF_PART each."""
+    if len(centres) <= _WHOLE:
+        return [np.arange(len(centres))]
+    parts = [np.arange(len(centres))]
+    while len(parts[0]) > _FACES_OF_PART:
+        halves = []
+        for part in parts:
+            along = centres[part, np.ptp(centres[part], axis=0).argmax()]
+            order, middle = part[np.argsort(along, kind="stable")], (len(part) + 1) // 2
+            halves += [np.sort(order[:middle]), np.sort(order[middle:])]
+        parts = halves
+    return parts
+
+
+def _laid_out(atlas: Any, parts: Sequence[Long]) -> tuple[Float, Long] | None:
+    """uv (N, 2) of an atlas with a mesh for each part, and each triangle's corners there, (F, 3);
+    None where it lost triangles."""
+    corners = np.zeros((sum(map(len, parts)), 3), np.int64)
+    every: list[Float] = []
+    for i, part in enumerate(parts):
+        _, own, uv = atlas[i]
+        if own.shape != (len(part), 3):
+            return None
+        corners[part] = own.astype(np.int64) + sum(map(len, every))
+        every.append(uv)
+    return np.concatenate(every), corners
 
 
 def beside_neighbours(corner_uv: Float, points: Float, triangles: Int, side: Float) -> Float | None:
@@ -321,23 +358,29 @@ def beside_neighbours(corner_uv: Float, points: Float, triangles: Int, side: Flo
 
 
 def _at_own_densities(
-    atlas: Any, points: Float, triangles: Int, sizes: TexelSizes, options: Any
-) -> tuple[Any, Int, Float]:
-    """The charts of an atlas packed again, each at the texel size that its triangles agree on:
-    atlas, corners and uv as xatlas gives them."""
+    atlas: Any,
+    parts: Sequence[Long],
+    uv: Float,
+    corners: Long,
+    points: Float,
+    triangles: Int,
+    sizes: TexelSizes,
+    options: Any,
+) -> Any:
+    """An atlas in which the charts of another, laid out as given, are packed again, each at the
+    texel size that its triangles agree on."""
     import xatlas
 
-    _, corners, uv = atlas[0]
-    chart = np.zeros(len(triangles), np.int64)
     area = doubled_areas(points, triangles)
-    count = atlas.get_mesh_chart_count(0)
-    scale = np.ones(count)
-    for k in range(count):
-        faces = np.asarray(atlas.get_mesh_chart(0, k).faces)
-        chart[faces] = k
-        scale[k] = sizes.side.min() / _agreed(sizes.side[faces], sizes.pixels[faces], area[faces])
     of_vertex = np.zeros(len(uv), np.int64)
-    of_vertex[corners.reshape(-1)] = np.repeat(chart, 3)
+    scales: list[float] = []
+    for i, part in enumerate(parts):
+        for k in range(atlas.get_mesh_chart_count(i)):
+            faces = part[np.asarray(atlas.get_mesh_chart(i, k).faces)]
+            agreed = _agreed(sizes.side[faces], sizes.pixels[faces], area[faces])
+            of_vertex[corners[faces]] = len(scales)
+            scales.append(sizes.side.min() / agreed)
+    scale, count = np.array(scales), len(scales)
     texels = uv * np.array([atlas.width, atlas.height], np.float64)
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, of_vertex, texels)
@@ -348,11 +391,10 @@ def _at_own_densities(
     placed = (texels - low[of_vertex]) * scale[of_vertex, None]
     placed[:, 0] += start[of_vertex]
     packed = xatlas.Atlas()
-    packed.add_uv_mesh(placed.astype(np.float32), corners)
+    packed.add_uv_mesh(placed.astype(np.float32), corners.astype(np.uint32))
     options.texels_per_unit = 1.0
     packed.generate(xatlas.ChartOptions(), options)
-    _, corners, uv = packed[0]
-    return packed, corners, uv
+    return packed
 
 
 def pack_triangles_singly(corners: Float, texel_size: float) -> tuple[Float, tuple[int, int]]:
